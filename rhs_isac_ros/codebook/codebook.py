@@ -1,0 +1,251 @@
+"""The codebook: what the surface and the base station apply in a positioning phase."""
+
+import dataclasses
+import functools
+import hashlib
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.shapes import check_shape
+
+# Node that owns the parameters of a codebook file, in any namespace.
+PARAMETER_NODE = '/**/optimizer'
+# The power constraint holds to this relative accuracy.
+_POWER_TOLERANCE = 1e-6
+
+
+class CodebookError(ValueError):
+    """A codebook is malformed or does not fit its scenario."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Codebook:
+    """Analog and digital beamforming of a positioning phase.
+
+    Attributes
+    ----------
+    analog
+        Configurations C, float64 [N_B, F, N_E], each entry in [0, 1].
+    digital
+        Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
+    average_crlb_m2
+        Average bound that was measured for it [m^2]; NaN if none was.
+    provenance
+        How it was made, for people.
+
+    Raises
+    ------
+    CodebookError
+        If an array has the wrong number of dimensions, sizes that contradict each other, entries
+        that are not finite, or configurations outside [0, 1].
+    """
+
+    analog: np.ndarray
+    digital: np.ndarray
+    average_crlb_m2: float = math.nan
+    provenance: str = ''
+
+    def __post_init__(self) -> None:
+        """Copy the arrays, check them, and make them read-only."""
+        for name, kind, dims in (('analog', float, 'N_B, F, N_E'),
+                                 ('digital', complex, 'N_B, N_SB, F, K')):
+            try:
+                array = np.array(getattr(self, name), dtype=kind, order='C')
+            except (TypeError, ValueError) as error:
+                raise CodebookError(f'{name}: {error}, expected numbers [{dims}]') from None
+            if array.ndim != len(dims.split(',')) or 0 in array.shape:
+                raise CodebookError(f'{name}: shape {array.shape}, expected [{dims}]')
+            if not np.isfinite(array).all():
+                raise CodebookError(f'{name}: not finite, expected finite numbers')
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if self.analog.min() < 0 or self.analog.max() > 1:
+            raise CodebookError(
+                f'analog: {self.analog.min():g} to {self.analog.max():g}, expected 0 to 1')
+        n_bands, _, n_frames, _ = self.digital.shape
+        if self.analog.shape[:2] != (n_bands, n_frames):
+            raise CodebookError(
+                f'analog: [N_B, F] = {self.analog.shape[:2]}, expected {(n_bands, n_frames)} '
+                'as in digital')
+
+    @property
+    def shape(self) -> tuple[int, int, int, int, int]:
+        """Sizes (N_B, N_SB, F, K, N_E)."""
+        return (*self.digital.shape, self.analog.shape[2])
+
+    @functools.cached_property
+    def id(self) -> str:
+        """Hash of the content: ``cb``, so that YAML takes it for no number, and 16 hex digits."""
+        digest = hashlib.sha256(repr(self.shape).encode())
+        digest.update(self.analog.astype('<f8').tobytes())
+        digest.update(self.digital.astype('<c16').tobytes())
+        return f'cb{digest.hexdigest()[:16]}'
+
+    def check(self, scenario: Scenario) -> None:
+        """Check that the codebook fits a scenario.
+
+        Parameters
+        ----------
+        scenario
+            The scenario.
+
+        Raises
+        ------
+        CodebookError
+            If a size differs or a frame's power is not P_max.
+        """
+        try:
+            check_shape('analog', self.analog, 'N_B F N_E', scenario)
+            check_shape('digital', self.digital, 'N_B N_SB F K', scenario)
+        except ValueError as error:
+            raise CodebookError(str(error)) from None
+        power = np.sum(np.abs(self.digital)**2, axis=(1, 3))
+        worst = power.flat[np.abs(power - scenario.max_power_w).argmax()]
+        if abs(worst - scenario.max_power_w) > _POWER_TOLERANCE * scenario.max_power_w:
+            raise CodebookError(
+                f'digital: a frame has power {worst:g} W, expected max_power_w = '
+                f'{scenario.max_power_w:g} W')
+
+    def to_parameters(self) -> dict[str, Any]:
+        """Return the codebook as ROS parameters.
+
+        Returns
+        -------
+        dict
+            Values by names that begin with ``codebook.``: plain strings, floats and lists.
+        """
+        return {
+            'codebook.id': self.id,
+            'codebook.shape': list(self.shape),
+            'codebook.average_crlb': float(self.average_crlb_m2),
+            'codebook.provenance': self.provenance,
+            'codebook.analog': self.analog.ravel().tolist(),
+            'codebook.digital_re': self.digital.real.ravel().tolist(),
+            'codebook.digital_im': self.digital.imag.ravel().tolist(),
+        }
+
+    @classmethod
+    def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
+        """Make a codebook from the parameters that `to_parameters` returns.
+
+        Parameters
+        ----------
+        parameters
+            Values by name. ``codebook.id`` may be empty or missing; if given it must match.
+
+        Returns
+        -------
+        Codebook
+            The codebook.
+
+        Raises
+        ------
+        CodebookError
+            If a parameter is missing or malformed, or the id is not that of the content.
+        """
+        def array(name: str, expected: tuple[int, ...]) -> np.ndarray:
+            try:
+                values = np.asarray(parameters.get(f'codebook.{name}', ()), dtype=float)
+            except (TypeError, ValueError) as error:
+                raise CodebookError(f'codebook.{name}: {error}, expected numbers') from None
+            if values.size != math.prod(expected):
+                raise CodebookError(
+                    f'codebook.{name}: {values.size} values, expected {math.prod(expected)} = '
+                    f'{" x ".join(map(str, expected))} by codebook.shape')
+            return values.reshape(expected)
+
+        shape = parameters.get('codebook.shape')
+        if not isinstance(shape, Sequence) or len(shape) != 5 or not all(
+                isinstance(size, int) and size > 0 for size in shape):
+            raise CodebookError(
+                f'codebook.shape: {shape!r}, expected [N_B, N_SB, F, K, N_E], all positive')
+        n_bands, n_subbands, n_frames, n_feeds, n_elements = shape
+        digital_shape = (n_bands, n_subbands, n_frames, n_feeds)
+        real, imag = array('digital_re', digital_shape), array('digital_im', digital_shape)
+        digital = np.empty(digital_shape, complex)
+        digital.real, digital.imag = real, imag
+        average = parameters.get('codebook.average_crlb', math.nan)
+        if not isinstance(average, int | float):
+            raise CodebookError(f'codebook.average_crlb: {average!r}, expected a number')
+        codebook = cls(
+            array('analog', (n_bands, n_frames, n_elements)), digital, float(average),
+            str(parameters.get('codebook.provenance', '')))
+        wanted = parameters.get('codebook.id', '')
+        if wanted and wanted != codebook.id:
+            raise CodebookError(
+                f'codebook.id: {wanted!r}, expected {codebook.id!r}, the hash of the content')
+        return codebook
+
+    def save(self, path: str | Path) -> None:
+        """Write the codebook as a ROS 2 parameter file; an old file is replaced at the end.
+
+        Parameters
+        ----------
+        path
+            The file.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; the old one is kept.
+        """
+        values = {name.partition('.')[2]: value for name, value in self.to_parameters().items()}
+        content = {PARAMETER_NODE: {'ros__parameters': {'codebook': values}}}
+        text = yaml.safe_dump(content, sort_keys=False, width=95, default_flow_style=None)
+        path = Path(path)
+        descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+        try:
+            with os.fdopen(descriptor, 'w', encoding='utf-8') as stream:
+                stream.write(text)
+            os.chmod(aside, 0o644)
+            os.replace(aside, path)
+        except BaseException:
+            os.unlink(aside)
+            raise
+
+    @classmethod
+    def load(cls, path: str | Path) -> 'Codebook':
+        """Read a codebook from a ROS 2 parameter file.
+
+        Parameters
+        ----------
+        path
+            The file.
+
+        Returns
+        -------
+        Codebook
+            The codebook.
+
+        Raises
+        ------
+        CodebookError
+            If the file cannot be read or holds no valid codebook.
+        """
+        try:
+            content = yaml.load(Path(path).read_text(encoding='utf-8'), _YAML_LOADER)
+        # YAML's own errors, and what it raises for bytes and dates that are none.
+        except (OSError, ValueError, yaml.YAMLError) as error:
+            reason = ' '.join(str(error).split())
+            raise CodebookError(f'{path}: cannot be read: {reason}') from error
+        for node in content.values() if isinstance(content, dict) else ():
+            parameters = node.get('ros__parameters', {}) if isinstance(node, dict) else {}
+            values = parameters.get('codebook') if isinstance(parameters, dict) else None
+            if isinstance(values, dict):
+                try:
+                    return cls.from_parameters({f'codebook.{k}': v for k, v in values.items()})
+                except CodebookError as error:
+                    raise CodebookError(f'{path}: {error}') from None
+        raise CodebookError(f'{path}: expected ros__parameters with a mapping named codebook')
+
+
+# The loader in C reads a codebook ten times faster; it is not in every build of PyYAML.
+_YAML_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)

@@ -1,0 +1,124 @@
+"""The optimisation problem: its objective, its constraints and its variables."""
+
+import numpy as np
+
+from rhs_isac_ros.bounds import AverageCrlb
+from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+
+
+def sampled_objective(scenario: Scenario, positions: np.ndarray) -> AverageCrlb:
+    """Implements Eq. (18). Objective of P1 on sampled positions.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    positions
+        Samples of the user's position, float64 [N_sam, 3] [m].
+
+    Returns
+    -------
+    AverageCrlb
+        A function of the codebook: value [m^2] and gradients.
+
+    Raises
+    ------
+    ValueError
+        If `positions` is empty or not a finite [N, 3] array.
+    """
+    return AverageCrlb(scenario, positions)
+
+
+class Problem:
+    """Implements Eq. (17). Problem P1: average bound, fixed power, configurations in [0, 1].
+
+    Solvers see one real vector, the configurations followed by the real and the imaginary parts
+    of unscaled combining vectors. Scaling these to P_max takes the power constraint out of the
+    problem; the box of the configurations stays with the solver.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    objective
+        Function of a codebook that returns value, grad_analog and grad_digital.
+    """
+
+    def __init__(self, scenario: Scenario, objective: AverageCrlb) -> None:
+        self.scenario = scenario
+        self.objective = objective
+        sizes = scenario.sizes
+        self._analog_shape = tuple(sizes[s] for s in ('N_B', 'F', 'N_E'))
+        self._digital_shape = tuple(sizes[s] for s in ('N_B', 'N_SB', 'F', 'K'))
+        self.n_analog = int(np.prod(self._analog_shape))
+
+    @property
+    def bounds(self) -> list[tuple[float, float] | tuple[None, None]]:
+        """Bounds of every variable, in SciPy's form."""
+        n_digital = 2 * int(np.prod(self._digital_shape))
+        return [(0.0, 1.0)] * self.n_analog + [(None, None)] * n_digital
+
+    def pack(self, codebook: Codebook) -> np.ndarray:
+        """Return the variables of a codebook.
+
+        Parameters
+        ----------
+        codebook
+            A codebook of the scenario.
+
+        Returns
+        -------
+        numpy.ndarray
+            Float64 [N_B F N_E + 2 N_B N_SB F K].
+        """
+        digital = codebook.digital / np.sqrt(self.scenario.max_power_w)
+        return np.concatenate(
+            [codebook.analog.ravel(), digital.real.ravel(), digital.imag.ravel()])
+
+    def unpack(self, variables: np.ndarray) -> Codebook:
+        """Return the codebook of some variables.
+
+        Parameters
+        ----------
+        variables
+            Float64 vector as `pack` returns it.
+
+        Returns
+        -------
+        Codebook
+            The codebook, which meets both constraints.
+        """
+        analog, raw, norm = self._split(variables)
+        return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
+
+    def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        """Evaluate the objective and its gradient by the variables.
+
+        Parameters
+        ----------
+        variables
+            Float64 vector as `pack` returns it.
+
+        Returns
+        -------
+        value : float
+            The objective [m^2].
+        gradient : numpy.ndarray
+            Float64, as long as `variables`.
+        """
+        _, raw, norm = self._split(variables)
+        value, by_analog, by_digital = self.objective(self.unpack(variables))
+        # d(raw / norm): what points along raw does not count.
+        along = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
+        by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * along / norm**2)
+        return value, np.concatenate(
+            [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
+
+    def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Configurations, unscaled combining vectors, and their norm in every band and frame."""
+        analog = np.clip(variables[:self.n_analog], 0.0, 1.0).reshape(self._analog_shape)
+        real, imag = np.split(variables[self.n_analog:], 2)
+        raw = (real + 1j * imag).reshape(self._digital_shape)
+        norm = np.sqrt(np.sum(np.abs(raw)**2, axis=(1, 3), keepdims=True))
+        return analog, raw, norm

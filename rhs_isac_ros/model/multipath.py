@@ -1,0 +1,213 @@
+"""The multipath: spatial covariance, correlation over sub-bands and frames, random gains."""
+
+import functools
+
+import numpy as np
+from scipy.special import j0
+
+from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
+
+# Gauss-Legendre nodes on a quarter of the angular domain, where the profile is smooth.
+_ANGLE_NODES = 160
+# Nodes along each side of the region of interest, where 1 / r^2 is smooth.
+_ROI_NODES = 24
+
+
+@functools.lru_cache(maxsize=16)
+def multipath_covariance(scenario: Scenario) -> np.ndarray:
+    """Implements Eq. (2). Covariance of the multipath gains of the elements.
+
+    The power-angle profile is a product of two Laplacians of `angular_spread_deg`, normalised
+    over the half space in front of the surface and scaled by the mean line-of-sight power in the
+    region of interest. It is even in azimuth and elevation, which makes the covariance real, and
+    it depends on the elements' lattice offsets only.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+
+    Returns
+    -------
+    numpy.ndarray
+        V_i, complex128 [N_B, N_E, N_E], read-only.
+    """
+    side = scenario.elements_per_side
+    azimuth, weights = _profile_quadrature(scenario)
+    offsets = np.arange(side) * element_interval_m(scenario)
+    row, column = np.divmod(np.arange(side**2), side)
+    rows, columns = np.abs(row[:, None] - row), np.abs(column[:, None] - column)
+    covariance = np.empty((scenario.n_bands, side**2, side**2), complex)
+    for band, frequency in enumerate(scenario.center_frequencies_hz):
+        wavenumber = 2 * np.pi * frequency / SPEED_OF_LIGHT_MPS
+        # Direction (cos el cos az, cos el sin az, sin el); nodes are shared by both angles.
+        across = np.cos(azimuth)[:, None] * np.sin(azimuth)
+        along_y = np.cos(wavenumber * across[..., None] * offsets)
+        along_y = np.einsum('a,eay->ey', weights, along_y)
+        along_z = np.cos(wavenumber * np.sin(azimuth)[:, None] * offsets)
+        lattice = np.einsum('e,ey,ez->zy', weights, along_y, along_z)
+        scale = mean_los_power(scenario, band) * scenario.element_gain**2
+        covariance[band] = scale * lattice[rows, columns]
+    covariance.flags.writeable = False
+    return covariance
+
+
+def mean_los_power(scenario: Scenario, band: int) -> float:
+    """Mean power gain of the line of sight in the region of interest, for unit element gain.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    band
+        Index of the band, from 0.
+
+    Returns
+    -------
+    float
+        Mean of (v_0 g^U / (4 pi f_c,i r))^2, r being the distance from the surface's centre.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
+    low, high = scenario.roi_bounds_m
+    x, y, z = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
+    squares = x[:, None, None]**2 + y[:, None]**2 + z**2
+    mean_inverse = np.einsum('a,b,c,abc->', weights, weights, weights, 1 / squares) / 8
+    wavelength = SPEED_OF_LIGHT_MPS / scenario.center_frequencies_hz[band]
+    return float((wavelength * scenario.user_gain / (4 * np.pi))**2 * mean_inverse)
+
+
+def frequency_correlation(
+        scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Implements Eq. (3). Correlation of the multipath gains of two sub-bands.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    band
+        Index of the band, from 0.
+    first, second
+        Indices of sub-bands, from 0, of shapes that broadcast.
+
+    Returns
+    -------
+    numpy.ndarray
+        rho_f, complex128, of the broadcast shape.
+    """
+    frequencies = subband_frequencies_hz(scenario)[band]
+    difference = frequencies[first] - frequencies[second]
+    return 1 / (1 + 2j * np.pi * scenario.delay_spread_s * difference)
+
+
+def time_correlation(
+        scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Implements Eq. (4). Correlation of the multipath gains of two frames.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    band
+        Index of the band, from 0.
+    first, second
+        Indices of frames, from 0, of shapes that broadcast.
+
+    Returns
+    -------
+    numpy.ndarray
+        rho_t, float64, of the broadcast shape.
+    """
+    center_hz = scenario.center_frequencies_hz[band]
+    doppler_hz = scenario.max_user_speed_mps * center_hz / SPEED_OF_LIGHT_MPS
+    lag_s = (np.asarray(first) - np.asarray(second)) * scenario.frame_duration_s
+    return j0(2 * np.pi * doppler_hz * lag_s)
+
+
+@functools.lru_cache(maxsize=16)
+def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Square roots of the covariances, from which gains are drawn.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+
+    Returns
+    -------
+    tuple
+        For each band G [N_E, r] with G G^H = V_i, and L [N_SB F, s] with L L^H the correlation of
+        the measurements (sub-band-major); r and s are the numerical ranks.
+    """
+    subbands, frames = np.divmod(
+        np.arange(scenario.n_subbands * scenario.n_frames), scenario.n_frames)
+    factors = []
+    for band, covariance in enumerate(multipath_covariance(scenario)):
+        correlation = frequency_correlation(scenario, band, subbands[:, None], subbands)
+        correlation = correlation * time_correlation(scenario, band, frames[:, None], frames)
+        factors.append((_square_root(covariance), _square_root(correlation)))
+    return tuple(factors)
+
+
+def draw_multipath(
+        scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw multipath gains of independent positioning phases.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    band
+        Index of the band, from 0. Bands are independent.
+    n
+        Number of independent realisations.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    numpy.ndarray
+        h^MP, complex128 [n, N_SB F, N_E], rows sub-band-major.
+    """
+    spatial, row_factor = multipath_factors(scenario)[band]
+    white = complex_normal((n, row_factor.shape[1], spatial.shape[1]), rng)
+    return row_factor @ (white @ spatial.T)
+
+
+def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Draw circular complex normal numbers of unit variance.
+
+    Parameters
+    ----------
+    shape
+        Shape of the result.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    numpy.ndarray
+        Complex128 array of that shape.
+    """
+    return rng.standard_normal((*shape, 2)).view(complex)[..., 0] * np.sqrt(0.5)
+
+
+def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes on [0, pi/2] and weights of the Laplacian profile, normalised to a sum of one."""
+    nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
+    angles = (nodes + 1) * np.pi / 4
+    spread = np.deg2rad(scenario.angular_spread_deg)
+    # The cusp at zero is an end of the interval. A narrow profile gets its nodes where it lives.
+    reach = min(1.0, 30 * spread / (np.pi / 2))
+    angles = angles * reach
+    density = weights * np.exp(-np.sqrt(2) * angles / spread)
+    return angles, density / density.sum()
+
+
+def _square_root(matrix: np.ndarray) -> np.ndarray:
+    """Return R with R R^H = matrix, without the directions that rounding alone makes."""
+    values, vectors = np.linalg.eigh(matrix)
+    keep = values > values[-1] * len(values) * np.finfo(float).eps
+    root = vectors[:, keep] * np.sqrt(values[keep])
+    root.flags.writeable = False
+    return root

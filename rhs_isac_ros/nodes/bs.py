@@ -1,0 +1,54 @@
+"""The executable ``bs``: the base station."""
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import streams
+from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.bs import BaseStation
+from rhs_isac_ros.protocol.bs_table import timeouts
+from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged
+from rhs_isac_ros.protocol.roster import Roster
+from rhs_isac_ros.ros import peers
+from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.run import entry
+
+SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
+         m.ProtocolState)
+RECEIVES = (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.Beam, m.Data)
+
+
+class BsNode(RoleNode):
+    """The base station."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('bs', SENDS, **node_options)
+        values = self.values
+        timeouts_s = timeouts(values.ack_timeout_s, values.step_timeout_s, values.rest_s)
+        roster = Roster(
+            values.policy, streams.generator(values.seed, streams.BASE_STATION))
+        self.start(BaseStation(
+            self.scenario, roster, self._receive, timeouts_s, values.data_duration_s), RECEIVES)
+        self._codebook = CodebookSource(
+            self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
+        self._peers = peers.PeerWatch(
+            self, peers.OF_BASE_STATION, lambda missing: self.tell(PeersChanged(missing)))
+
+    def _receive(
+            self, codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int) -> np.ndarray:
+        rng = None
+        if self.values.receiver_noise:
+            rng = streams.generator(self.values.seed, streams.RECEIVER, user, cycle_id)
+        return receive_feeds(self.scenario, codebook, feeds, rng)
+
+
+main = entry(lambda: [BsNode()])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""The executable ``network``: all nodes composed in one process."""
+
+import sys
+
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.nodes.bs import BsNode
+from rhs_isac_ros.nodes.channel import ChannelNode
+from rhs_isac_ros.nodes.optimizer import OptimizerNode
+from rhs_isac_ros.nodes.positioner import PositionerNode
+from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
+from rhs_isac_ros.nodes.transmission import TransmissionNode
+from rhs_isac_ros.nodes.user import UserNode
+from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros.run import entry
+
+# The node ``network`` itself only has the parameter that says how many users there are.
+KINDS = (OptimizerNode, RhsControllerNode, ChannelNode, PositionerNode, TransmissionNode, BsNode)
+
+
+def make_network() -> list[Node]:
+    """Make all nodes, with users numbered from 1.
+
+    Returns
+    -------
+    list of rclpy.node.Node
+        The nodes.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is wrong.
+    """
+    head = Node('network')
+    users = parameters.declare(head, 'network').users
+    nodes = [head, *(kind() for kind in KINDS)]
+    for number in range(1, users + 1):
+        overrides = [Parameter('user_id', value=number)]
+        nodes.append(UserNode(f'user_{number}', parameter_overrides=overrides))
+    return nodes
+
+
+main = entry(make_network)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,31 @@
+"""The executable ``rhs_controller``: the controller of the surface."""
+
+import sys
+from typing import Any
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import CodebookOffered
+from rhs_isac_ros.protocol.rhs_controller import RhsController
+from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.run import entry
+
+
+class RhsControllerNode(RoleNode):
+    """The controller of the surface; it listens to commands once it has a codebook."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('rhs_controller', (m.RhsConfiguration,), **node_options)
+        self.start(RhsController(), ())
+        self._codebook = CodebookSource(self, self.scenario, self._on_codebook)
+
+    def _on_codebook(self, codebook: Any) -> None:
+        self.tell(CodebookOffered(codebook))
+        self.listen((m.RhsCommand, m.Beam))
+
+
+main = entry(lambda: [RhsControllerNode()])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""The executable ``transmission``: steers the beam and reports the capacity."""
+
+import sys
+from typing import Any
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import CodebookOffered
+from rhs_isac_ros.protocol.transmission import Transmission
+from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.run import entry
+
+RECEIVES = (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth)
+
+
+class TransmissionNode(RoleNode):
+    """The transmission phase; it listens to estimates once it has a codebook."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('transmission', (), **node_options)
+        band, n_bands = self.values.band, self.scenario.n_bands
+        if band >= n_bands:
+            raise ParameterError(f'band: {band}, expected 0 to {n_bands - 1} of the scenario')
+        self.start(Transmission(self.scenario, band), ())
+        self._codebook = CodebookSource(self, self.scenario, self._on_codebook)
+
+    def _on_codebook(self, codebook: Codebook) -> None:
+        self.tell(CodebookOffered(codebook))
+        self.advertise((m.Beam, m.Capacity))
+        self.listen(RECEIVES)
+
+
+main = entry(lambda: [TransmissionNode()])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""The executable ``user``: a user of the system."""
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from rhs_isac_ros.model import mobility, streams
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import PeersChanged
+from rhs_isac_ros.protocol.user import User, timeouts
+from rhs_isac_ros.ros import peers
+from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.ros.timers import steady_timer
+
+SENDS = (m.Ack, m.GroundTruth, m.Pilot, m.Data)
+RECEIVES = (m.Beacon, m.Grant, m.PilotRequest, m.Data)
+
+
+class UserNode(RoleNode):
+    """A user."""
+
+    def __init__(self, name: str = '', **node_options: Any) -> None:
+        super().__init__('user', SENDS, name, **node_options)
+        values = self.values
+        self._user = User(values.user_id, self._mobility(), timeouts(values.step_timeout_s))
+        self.start(self._user, RECEIVES)
+        self._peers = peers.PeerWatch(
+            self, peers.OF_USER, lambda missing: self.tell(PeersChanged(missing)))
+        steady_timer(self, values.ground_truth_period_s, self._show)
+
+    def _mobility(self) -> mobility.Mobility:
+        values = self.values
+        moves = values.mobility != 'static'
+        if moves and values.speed_mps > self.scenario.max_user_speed_mps:
+            raise ParameterError(
+                f'speed_mps: {values.speed_mps}, expected at most max_user_speed_mps = '
+                f'{self.scenario.max_user_speed_mps:g} m/s of the scenario')
+        rng = streams.generator(values.seed, streams.USER, values.user_id)
+        start = self._points('position_m')
+        if len(start) > 1:
+            raise ParameterError(f'position_m: {len(start)} points, expected one or none')
+        if values.mobility == 'waypoints':
+            way = self._points('waypoints_m')
+            if not len(way):
+                raise ParameterError('waypoints_m: empty, expected x, y, z of the first point')
+            if len(start):
+                raise ParameterError('position_m: given, expected none with mobility waypoints')
+            return mobility.Waypoints(way, values.speed_mps)
+        place = start[0] if len(start) else None
+        if values.mobility == 'random_walk':
+            return mobility.RandomWalk(self.scenario, values.speed_mps, rng, place)
+        return mobility.Static(
+            self.scenario.sample_positions(1, rng)[0] if place is None else place)
+
+    def _points(self, name: str) -> np.ndarray:
+        """Points of a parameter, [N, 3], all in the region of interest."""
+        numbers = np.array(getattr(self.values, name))
+        if numbers.size % 3:
+            raise ParameterError(f'{name}: {numbers.size} numbers, expected three for each point')
+        points = numbers.reshape(-1, 3)
+        low, high = self.scenario.roi_bounds_m
+        if not ((points >= low) & (points <= high)).all():
+            raise ParameterError(
+                f'{name}: {points.tolist()}, expected points in the region of interest, '
+                f'{low.tolist()} to {high.tolist()}')
+        return points
+
+    def _show(self) -> None:
+        self.publish(self._user.whereabouts(self.now_s()))
+
+
+main = entry(lambda: [UserNode()])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

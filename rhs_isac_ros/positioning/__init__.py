@@ -1,0 +1,47 @@
+"""Estimators of the user's position from the received signals."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning.bayes import BayesEstimator
+from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError
+
+ESTIMATORS: Mapping[str, type] = {BayesEstimator.name: BayesEstimator}
+
+__all__ = [
+    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'SignalError', 'make_estimator',
+]
+
+
+def make_estimator(
+        name: str, scenario: Scenario, codebook: Codebook, **options: Any) -> Estimator:
+    """Make an estimator by its name.
+
+    Parameters
+    ----------
+    name
+        One of `ESTIMATORS`.
+    scenario
+        The scenario.
+    codebook
+        The codebook with which the signals are taken.
+    **options
+        Options of that estimator.
+
+    Returns
+    -------
+    Estimator
+        The estimator, with its tables built.
+
+    Raises
+    ------
+    ValueError
+        If there is no estimator of that name.
+    CodebookError
+        If the codebook does not fit the scenario.
+    """
+    if name not in ESTIMATORS:
+        raise ValueError(f'estimator: {name!r}, expected one of {sorted(ESTIMATORS)}')
+    return ESTIMATORS[name](scenario, codebook, **options)

@@ -1,0 +1,1 @@
+"""The position-then-transmit protocol, without any input or output of its own."""

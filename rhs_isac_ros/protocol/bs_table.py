@@ -1,0 +1,117 @@
+"""States, inputs and transitions of the base station."""
+
+import enum
+from collections.abc import Mapping
+
+from rhs_isac_ros.protocol.machine import ANY, SAME, Step
+
+
+class State(enum.Enum):
+    """States of the base station."""
+
+    WAITING = 'waiting'            # for a codebook and for the other roles
+    RESTING = 'resting'            # between cycles
+    BEACONING = 'beaconing'        # for acks
+    CONFIGURING = 'configuring'    # for the surface to take a band's configurations
+    SOUNDING = 'sounding'          # for the feed signals of a band
+    ESTIMATING = 'estimating'      # for the position
+    STEERING = 'steering'          # for the beam, and the surface to take it
+    TRANSMITTING = 'transmitting'  # for the uplink data
+
+
+class Input(enum.Enum):
+    """Names of what can happen to the base station."""
+
+    READY = 'ready'
+    NOT_READY = 'not_ready'
+    CODEBOOK = 'codebook'
+    PEERS = 'peers'
+    TIMEOUT = 'timeout'
+    WINDOW_OVER = 'window_over'
+    ACK = 'ack'
+    LAST_ACK = 'last_ack'
+    LATE_ACK = 'late_ack'
+    CONFIGURED = 'configured'
+    FRAME = 'frame'
+    LAST_FRAME_OF_BAND = 'last_frame_of_band'
+    LAST_FRAME = 'last_frame'
+    ESTIMATE = 'estimate'
+    BEAM = 'beam'
+    BEAM_APPLIED = 'beam_applied'
+    BEAM_READY = 'beam_ready'
+    DELIVERED = 'delivered'
+    OTHER_DATA = 'other_data'
+    DUPLICATE = 'duplicate'
+    WRONG_CYCLE = 'wrong_cycle'
+    WRONG_USER = 'wrong_user'
+    WRONG_BAND = 'wrong_band'
+    WRONG_CODEBOOK = 'wrong_codebook'
+
+
+def timeouts(ack_s: float, step_s: float, rest_s: float) -> dict[State, float]:
+    """Return the time-outs of the base station.
+
+    Parameters
+    ----------
+    ack_s
+        How long to wait for acks [s].
+    step_s
+        How long to wait for the next message of a cycle [s].
+    rest_s
+        Pause between cycles [s].
+
+    Returns
+    -------
+    dict
+        Time-outs by state [s].
+    """
+    steps = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
+             State.TRANSMITTING)
+    return {State.RESTING: rest_s, State.BEACONING: ack_s, **dict.fromkeys(steps, step_s)}
+
+
+S, I = State, Input  # noqa: E741
+
+TABLE: Mapping[tuple[State | None, Input], Step] = {
+    # Between cycles.
+    (S.WAITING, I.READY): Step(S.BEACONING, ('keep', 'begin_cycle')),
+    (S.WAITING, I.NOT_READY): Step(SAME, ('keep', 'complain')),
+    (S.RESTING, I.TIMEOUT): Step(S.BEACONING, ('begin_cycle',)),
+    (S.RESTING, I.NOT_READY): Step(S.WAITING, ('complain',)),
+    (ANY, I.CODEBOOK): Step(SAME, ('keep',)),
+    (ANY, I.PEERS): Step(SAME, ('keep',)),
+    # Beaconing.
+    (S.BEACONING, I.ACK): Step(SAME, ('note_ack',)),
+    (S.BEACONING, I.LAST_ACK): Step(
+        S.CONFIGURING, ('note_ack', 'grant', 'command_band', 'announce_positioning')),
+    (S.BEACONING, I.WINDOW_OVER): Step(
+        S.CONFIGURING, ('grant', 'command_band', 'announce_positioning')),
+    (S.BEACONING, I.TIMEOUT): Step(SAME, ('beacon_again',), counts='unanswered', rearm=True),
+    (ANY, I.LATE_ACK): Step(SAME, ('welcome',), counts='late_ack'),
+    # Positioning.
+    (S.CONFIGURING, I.CONFIGURED): Step(S.SOUNDING, ('request_pilots',)),
+    (S.CONFIGURING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='rhs_silent'),
+    (S.SOUNDING, I.FRAME): Step(SAME, ('keep_frame',)),
+    (S.SOUNDING, I.LAST_FRAME_OF_BAND): Step(S.CONFIGURING, ('keep_frame', 'command_band')),
+    (S.SOUNDING, I.LAST_FRAME): Step(S.ESTIMATING, ('keep_frame', 'deliver')),
+    (S.SOUNDING, I.TIMEOUT): Step(S.RESTING, ('forget_user', 'abandon'), counts='user_gone'),
+    (S.ESTIMATING, I.ESTIMATE): Step(S.STEERING),
+    (S.ESTIMATING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='positioner_silent'),
+    # Transmission. Beam and configuration come from two nodes, in either order.
+    (S.ESTIMATING, I.BEAM): Step(S.STEERING, ('keep_beam',)),
+    (S.STEERING, I.ESTIMATE): Step(SAME),
+    (S.STEERING, I.BEAM): Step(SAME, ('keep_beam',)),
+    (S.ESTIMATING, I.BEAM_APPLIED): Step(S.STEERING, ('keep_applied',)),
+    (S.STEERING, I.BEAM_APPLIED): Step(SAME, ('keep_applied',)),
+    (S.STEERING, I.BEAM_READY): Step(S.TRANSMITTING, ('keep_beam', 'offer_data')),
+    (S.STEERING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='transmission_silent'),
+    (S.TRANSMITTING, I.DELIVERED): Step(S.RESTING, ('finish',)),
+    (S.TRANSMITTING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='data_lost'),
+    (ANY, I.OTHER_DATA): Step(SAME),
+    # What belongs to no step is dropped.
+    (ANY, I.DUPLICATE): Step(SAME, counts='duplicate'),
+    (ANY, I.WRONG_CYCLE): Step(SAME, counts='wrong_cycle'),
+    (ANY, I.WRONG_USER): Step(SAME, counts='wrong_user'),
+    (ANY, I.WRONG_BAND): Step(SAME, counts='wrong_band'),
+    (ANY, I.WRONG_CODEBOOK): Step(SAME, counts='wrong_codebook'),
+}

@@ -1,0 +1,46 @@
+"""What a role is told, besides messages, and what it asks for."""
+
+import dataclasses
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.protocol.messages import Message
+
+
+@dataclasses.dataclass(frozen=True)
+class Tick:
+    """The deadline that a role named has passed."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CodebookOffered:
+    """A codebook is to be used from the next cycle on."""
+
+    codebook: Codebook
+
+
+@dataclasses.dataclass(frozen=True)
+class PeersChanged:
+    """The set of roles that a role needs and does not see has changed."""
+
+    missing: tuple[str, ...]
+
+
+Event = Message | Tick | CodebookOffered | PeersChanged
+
+
+@dataclasses.dataclass(frozen=True)
+class Send:
+    """Publish a message."""
+
+    message: Message
+
+
+@dataclasses.dataclass(frozen=True)
+class Note:
+    """Tell the person who watches; `warning` if something is amiss."""
+
+    text: str
+    warning: bool = False
+
+
+Action = Send | Note

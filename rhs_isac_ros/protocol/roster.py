@@ -1,0 +1,110 @@
+"""The users that a base station knows, and whom of them it serves next."""
+
+import numpy as np
+
+POLICIES = ('round_robin', 'first', 'random')
+# A user that leaves so many beacons in a row without an answer is not waited for.
+_PATIENCE = 3
+
+
+class Roster:
+    """Users that answer beacons.
+
+    Parameters
+    ----------
+    policy
+        ``round_robin``: who was served longest ago; ``first``: who answered first; ``random``.
+    rng
+        Source of randomness, for ``random``.
+
+    Raises
+    ------
+    ValueError
+        If there is no such policy.
+    """
+
+    def __init__(self, policy: str, rng: np.random.Generator) -> None:
+        if policy not in POLICIES:
+            raise ValueError(f'policy: {policy!r}, expected one of {list(POLICIES)}')
+        self._policy, self._rng = policy, rng
+        self._served: dict[int, int] = {}
+        self._missed: dict[int, int] = {}
+        self._turn = 0
+        self.answered: list[int] = []
+
+    def open(self) -> None:
+        """Begin a cycle: nobody has answered yet."""
+        self.answered = []
+
+    def welcome(self, user: int) -> None:
+        """Know a user, without counting it as answering.
+
+        Parameters
+        ----------
+        user
+            The user.
+        """
+        # A newcomer stands where the one stands that waits longest.
+        self._served.setdefault(user, min(self._served.values(), default=0))
+        self._missed[user] = 0
+
+    def answer(self, user: int) -> None:
+        """Count a user as answering in this cycle.
+
+        Parameters
+        ----------
+        user
+            The user.
+        """
+        self.welcome(user)
+        self.answered.append(user)
+
+    def forget(self, user: int) -> None:
+        """Wait for a user no longer; it is known again when it answers.
+
+        Parameters
+        ----------
+        user
+            The user.
+        """
+        self._missed.pop(user, None)
+        self._served.pop(user, None)
+
+    def complete_with(self, user: int) -> bool:
+        """Tell whether a user's answer leaves nobody to wait for.
+
+        Parameters
+        ----------
+        user
+            The user that answers.
+
+        Returns
+        -------
+        bool
+            True if the selection need not wait.
+        """
+        if self._policy == 'first':
+            return True
+        return self._missed.keys() <= {*self.answered, user}
+
+    def select(self) -> int:
+        """Choose among those that answered and close the cycle's list.
+
+        Returns
+        -------
+        int
+            The user to serve.
+        """
+        for user in self._missed.keys() - set(self.answered):
+            self._missed[user] += 1
+            if self._missed[user] >= _PATIENCE:
+                self.forget(user)
+        if self._policy == 'first':
+            chosen = self.answered[0]
+        elif self._policy == 'random':
+            chosen = int(self._rng.choice(self.answered))
+        else:
+            chosen = min(self.answered, key=lambda user: (self._served[user], user))
+        self._turn += 1
+        self._served[chosen] = self._turn
+        return chosen

@@ -1,0 +1,167 @@
+"""The user: answers beacons, sends pilots, exchanges data."""
+
+import enum
+from collections.abc import Mapping
+
+from rhs_isac_ros.model.mobility import Mobility
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import Action, Event, Note, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.machine import ANY, SAME, Machine, Step
+
+
+class State(enum.Enum):
+    """States of a user."""
+
+    ALONE = 'alone'                # base station or channel is not there
+    LISTENING = 'listening'        # for a beacon
+    ACKNOWLEDGED = 'acknowledged'  # waiting for the grant
+    GRANTED = 'granted'            # being positioned and served
+
+
+class Input(enum.Enum):
+    """Names of what can happen to a user."""
+
+    CONNECTED = 'connected'
+    CUT_OFF = 'cut_off'
+    BEACON = 'beacon'
+    STALE_BEACON = 'stale_beacon'
+    GRANT = 'grant'
+    OTHER_GRANT = 'other_grant'
+    OTHER_USER = 'other_user'
+    PILOT_REQUEST = 'pilot_request'
+    DOWNLINK = 'downlink'
+    OTHER_DATA = 'other_data'
+    WRONG_CYCLE = 'wrong_cycle'
+    TIMEOUT = 'timeout'
+
+
+S, I = State, Input  # noqa: E741
+
+TABLE: Mapping[tuple[State | None, Input], Step] = {
+    (S.ALONE, I.CONNECTED): Step(S.LISTENING, ('say_found',)),
+    (S.ALONE, I.CUT_OFF): Step(SAME, ('say_missing',)),
+    (S.ALONE, I.BEACON): Step(SAME),
+    (ANY, I.CONNECTED): Step(SAME),
+    (ANY, I.CUT_OFF): Step(S.ALONE, ('say_missing',)),
+    # The base station may take longer than this user waited.
+    (S.LISTENING, I.GRANT): Step(S.GRANTED, ('stand',)),
+    (S.LISTENING, I.BEACON): Step(S.ACKNOWLEDGED, ('acknowledge',)),
+    (S.ACKNOWLEDGED, I.BEACON): Step(SAME, ('acknowledge',), rearm=True),
+    (S.ACKNOWLEDGED, I.GRANT): Step(S.GRANTED, ('stand',)),
+    # A request that overtakes the grant says the same.
+    (S.ACKNOWLEDGED, I.PILOT_REQUEST): Step(S.GRANTED, ('stand', 'send_pilots')),
+    (S.ACKNOWLEDGED, I.OTHER_GRANT): Step(S.LISTENING),
+    (S.ACKNOWLEDGED, I.TIMEOUT): Step(S.LISTENING, counts='not_granted'),
+    (S.GRANTED, I.GRANT): Step(SAME),
+    (S.GRANTED, I.PILOT_REQUEST): Step(SAME, ('send_pilots',), rearm=True),
+    (S.GRANTED, I.DOWNLINK): Step(S.LISTENING, ('send_uplink',)),
+    (S.GRANTED, I.BEACON): Step(S.ACKNOWLEDGED, ('acknowledge',), counts='abandoned'),
+    (S.GRANTED, I.TIMEOUT): Step(S.LISTENING, counts='bs_silent'),
+    (ANY, I.STALE_BEACON): Step(SAME, counts='stale_beacon'),
+    (ANY, I.OTHER_GRANT): Step(SAME),
+    (ANY, I.OTHER_USER): Step(SAME),
+    (ANY, I.OTHER_DATA): Step(SAME),
+    (ANY, I.WRONG_CYCLE): Step(SAME, counts='wrong_cycle'),
+}
+
+
+# Steps of a cycle that the base station may wait for while its user hears nothing: the last
+# band's signals, the position, the beam, and the data.
+_SILENT_STEPS = 4
+
+
+def timeouts(step_s: float) -> dict[State, float]:
+    """Return the time-outs of a user.
+
+    Parameters
+    ----------
+    step_s
+        How long the base station waits for each step [s].
+
+    Returns
+    -------
+    dict
+        Time-outs by state [s].
+    """
+    return {State.ACKNOWLEDGED: step_s, State.GRANTED: _SILENT_STEPS * step_s}
+
+
+class User(Machine):
+    """The role of a user.
+
+    Parameters
+    ----------
+    user
+        Number of the user, from 1.
+    mobility
+        Where the user is at a time.
+    timeouts_s
+        Time-outs by state.
+    """
+
+    TABLE = TABLE
+
+    def __init__(
+            self, user: int, mobility: Mobility, timeouts_s: Mapping[State, float]) -> None:
+        super().__init__(State.ALONE, timeouts_s)
+        self.user = user
+        self._mobility = mobility
+        self._cycle_id = 0
+
+    def whereabouts(self, now_s: float, cycle_id: int = 0) -> m.GroundTruth:
+        """Return where the user is.
+
+        Parameters
+        ----------
+        now_s
+            The time, on the clock of `handle` [s].
+        cycle_id
+            The cycle for which the position holds; 0 for none.
+
+        Returns
+        -------
+        GroundTruth
+            Position and velocity.
+        """
+        return m.GroundTruth(cycle_id, self.user, *self._mobility.state(now_s))
+
+    def _classify(self, event: Event) -> Input:
+        match event:
+            case Tick():
+                return Input.TIMEOUT
+            case PeersChanged(missing):
+                return Input.CUT_OFF if missing else Input.CONNECTED
+            case m.Beacon():
+                stale = self.state is State.GRANTED and event.cycle_id == self._cycle_id
+                return Input.STALE_BEACON if stale else Input.BEACON
+            case m.Data(stage=m.Stage.OFFERED) | m.Data(direction=m.Direction.UPLINK):
+                return Input.OTHER_DATA
+        if event.user != self.user:
+            ours = isinstance(event, m.Grant) and event.cycle_id == self._cycle_id
+            return Input.OTHER_GRANT if ours else Input.OTHER_USER
+        if event.cycle_id != self._cycle_id:
+            return Input.WRONG_CYCLE
+        names = {m.Grant: Input.GRANT, m.PilotRequest: Input.PILOT_REQUEST,
+                 m.Data: Input.DOWNLINK}
+        return names[type(event)]
+
+    def _say_found(self, event: PeersChanged, now_s: float) -> list[Action]:
+        return [Note('listening for beacons')]
+
+    def _say_missing(self, event: PeersChanged, now_s: float) -> list[Action]:
+        return [Note(f'waiting for {", ".join(event.missing)}', warning=True)]
+
+    def _acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
+        self._cycle_id = event.cycle_id
+        return [Send(m.Ack(event.cycle_id, self.user))]
+
+    def _stand(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
+        return [Send(self.whereabouts(now_s, event.cycle_id))]
+
+    def _send_pilots(self, event: m.PilotRequest, now_s: float) -> list[Action]:
+        return [Send(m.Pilot(event.cycle_id, self.user, event.band, frame, 1.0, 0.0))
+                for frame in range(event.n_frames)]
+
+    def _send_uplink(self, event: m.Data, now_s: float) -> list[Action]:
+        return [Send(m.Data(event.cycle_id, self.user, m.Direction.UPLINK, m.Stage.OFFERED,
+                            event.duration_s, event.bits))]

@@ -1,0 +1,1 @@
+"""Where the protocol meets ROS 2: topics, quality of service, conversions, parameters, nodes."""

@@ -1,0 +1,93 @@
+"""Where nodes get the codebook: the parameters of the optimizer."""
+
+import functools
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros.timers import steady_timer
+
+_NAMES = ['codebook.id', 'codebook.shape', 'codebook.average_crlb', 'codebook.provenance',
+          'codebook.analog', 'codebook.digital_re', 'codebook.digital_im']
+_RETRY_S = 0.1
+_ANSWER_S = 2.0
+
+
+class CodebookSource:
+    """Fetches the codebook through the parameter services and follows its changes.
+
+    The latched topic tells of a new codebook, also after the optimizer was restarted; what counts
+    is the content of the parameters.
+
+    Parameters
+    ----------
+    node
+        The node that needs it.
+    scenario
+        The scenario that it must fit.
+    on_codebook
+        Called with each new codebook.
+    """
+
+    def __init__(
+            self, node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
+        self._node, self._scenario, self._on_codebook = node, scenario, on_codebook
+        self._client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
+        # Counts the offers; an answer that was asked for before the last one is out of date.
+        self._wanted, self._fetched, self._asked = 1, 0, 0
+        self._asked_s = -math.inf
+        self._complaint = ''
+        self._known = ''
+        node.create_subscription(
+            ros.Codebook, topics.CODEBOOK, self._on_offer, qos.LATCHED,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        self._timer = steady_timer(node, _RETRY_S, self._ask)
+
+    def _on_offer(self, message: ros.Codebook) -> None:
+        # Even if the id is known: a change that is taken back must not stay.
+        self._wanted += 1
+        self._timer.reset()
+
+    def _ask(self) -> None:
+        if self._fetched == self._wanted:
+            self._timer.cancel()
+            return
+        now_s = time.monotonic()
+        waiting = self._asked == self._wanted and now_s - self._asked_s < _ANSWER_S
+        if not waiting and self._client.services_are_ready():
+            self._asked, self._asked_s = self._wanted, now_s
+            self._client.get_parameters(
+                _NAMES, callback=functools.partial(self._on_answer, self._wanted))
+
+    def _on_answer(self, asked: int, future: Any) -> None:
+        values = future.result().values if future.exception() is None else ()
+        if asked != self._wanted or len(values) != len(_NAMES):
+            return
+        self._fetched = asked
+        try:
+            codebook = Codebook.from_parameters(
+                dict(zip(_NAMES, map(parameter_value_to_python, values), strict=True)))
+            codebook.check(self._scenario)
+        except CodebookError as error:
+            self._complain(str(error))
+            return
+        self._complaint = ''
+        if codebook.id != self._known:
+            self._known = codebook.id
+            self._on_codebook(codebook)
+
+    def _complain(self, text: str) -> None:
+        if text != self._complaint:
+            self._complaint = text
+            owner = f'{self._node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
+            self._node.get_logger().error(f'codebook of {owner} not used: {text}')

@@ -1,0 +1,217 @@
+"""Every ROS parameter, declared once; descriptors, checks and documentation come from here.
+
+``python -m rhs_isac_ros.ros.parameters`` prints the table of the README.
+"""
+
+import dataclasses
+import math
+import types
+from collections.abc import Mapping
+from typing import Any
+
+from rhs_isac_ros.model import mobility
+from rhs_isac_ros.positioning import ESTIMATORS
+from rhs_isac_ros.protocol.roster import POLICIES
+
+
+class ParameterError(ValueError):
+    """A parameter has a value that its node cannot use."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """Declaration of a parameter.
+
+    Attributes
+    ----------
+    name
+        Its name.
+    default
+        Value when none is given; its type is the parameter's.
+    text
+        What it is.
+    unit
+        Its unit, if it has one.
+    low, high
+        Range of a number, inclusive.
+    choices
+        The values that a string may have; empty if any.
+    """
+
+    name: str
+    default: bool | int | float | str | list[float]
+    text: str
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """Its ROS type."""
+        return {bool: 'bool', int: 'integer', float: 'double', str: 'string',
+                list: 'double_array'}[type(self.default)]
+
+    @property
+    def range(self) -> str:
+        """The values it may have within its type; empty if all."""
+        if self.choices:
+            return ', '.join(self.choices)
+        if self.low is None:
+            return ''
+        low, high = (format(limit, 'd' if type(self.default) is int else 'g')
+                     for limit in (self.low, self.high))
+        return f'{low} to {high} {self.unit}'.rstrip()
+
+    @property
+    def expected(self) -> str:
+        """The values it may have, in words."""
+        if self.choices:
+            return f'one of {self.range}'
+        words = {'bool': 'true or false', 'integer': 'an integer', 'string': 'a string',
+                 'double': 'a number with a decimal point',
+                 'double_array': 'a list of numbers, each with a decimal point'}[self.kind]
+        return f'{words}, {self.range}' if self.range else words
+
+
+SCENARIO = Parameter(
+    'scenario_file', '', "YAML file of the scenario; empty: the paper's Table I.")
+SEED = Parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
+STEP_TIMEOUT = Parameter(
+    'step_timeout_s', 1.0, 'How long to wait for the next message of a cycle.', 's', 0.01, 60.0)
+
+NODES: Mapping[str, tuple[Parameter, ...]] = {
+    'bs': (
+        SCENARIO, SEED,
+        Parameter('policy', 'round_robin', 'How to select among the users that answer.',
+                  choices=POLICIES),
+        Parameter('receiver_noise', True,
+                  'Add thermal noise; false where the radio has its own.'),
+        Parameter('ack_timeout_s', 0.1, 'How long to wait for acks.', 's', 0.001, 60.0),
+        STEP_TIMEOUT,
+        Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0),
+        Parameter('data_duration_s', 1e-3, 'Time that each direction transmits data.', 's',
+                  1e-6, 10.0),
+    ),
+    'user': (
+        SCENARIO, SEED,
+        Parameter('user_id', 1, 'Number of the user.', low=1, high=2**31 - 1),
+        Parameter('mobility', 'static', 'How the user moves.', choices=mobility.KINDS),
+        Parameter('position_m', [], 'Where it starts: x, y, z; empty: at random in the region.',
+                  'm', -1e6, 1e6),
+        Parameter('waypoints_m', [], 'Its way: x, y, z of one point after the other.', 'm',
+                  -1e6, 1e6),
+        Parameter('speed_mps', 1.0, 'Its speed, at most max_user_speed_mps of the scenario.',
+                  'm/s', 0.0, 1e4),
+        Parameter('ground_truth_period_s', 0.1, 'How often it tells its true position.', 's',
+                  0.01, 60.0),
+        STEP_TIMEOUT,
+    ),
+    'rhs_controller': (SCENARIO,),
+    'channel': (SCENARIO, SEED),
+    'positioner': (
+        SCENARIO,
+        Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS)),
+    ),
+    'transmission': (
+        SCENARIO,
+        Parameter('band', 0, 'Band of the transmission, from 0.', low=0, high=4095),
+    ),
+    'optimizer': (
+        SCENARIO,
+        Parameter('codebook_file', '', 'Codebook to hold; empty: the one of the package.'),
+    ),
+    'network': (
+        Parameter('users', 2, 'Number of users.', low=1, high=1000),
+    ),
+}
+
+
+def declare(node: Any, executable: str) -> types.SimpleNamespace:
+    """Declare a node's parameters and read them.
+
+    Parameters
+    ----------
+    node
+        The node, an `rclpy.node.Node`.
+    executable
+        Name of its executable, a key of `NODES`.
+
+    Returns
+    -------
+    types.SimpleNamespace
+        Values by name.
+
+    Raises
+    ------
+    ParameterError
+        If a value has the wrong type, is out of range or none of the choices.
+    """
+    return types.SimpleNamespace(
+        **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
+
+
+def _declare_one(node: Any, parameter: Parameter) -> Any:
+    # Here, so that the table can be read without ROS.
+    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+    from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+    from rclpy.parameter import Parameter as RosParameter
+
+    default = parameter.default
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    descriptor = ParameterDescriptor(
+        description=parameter.text + unit, additional_constraints=parameter.expected,
+        read_only=True)
+    if parameter.low is not None and type(default) is int:
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high))]
+    elif parameter.low is not None and type(default) is float:
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=parameter.low, to_value=parameter.high)]
+    # An empty list would not tell its type.
+    typed = RosParameter.Type.DOUBLE_ARRAY if isinstance(default, list) else default
+    try:
+        value = node.declare_parameter(parameter.name, typed, descriptor).value
+    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+        raise ParameterError(
+            f'{parameter.name}: {error}; expected {parameter.expected}') from None
+    value = default if value is None else value
+    wrong_choice = parameter.choices and value not in parameter.choices
+    if wrong_choice or not _in_range(parameter, value):
+        raise ParameterError(f'{parameter.name}: {value!r}, expected {parameter.expected}')
+    return list(value) if isinstance(default, list) else value
+
+
+def _in_range(parameter: Parameter, value: Any) -> bool:
+    """Tell whether all numbers of a value are finite and in range; ROS checks no list."""
+    if not isinstance(parameter.default, list | float):
+        return True
+    numbers = value if isinstance(parameter.default, list) else [value]
+    return all(math.isfinite(n) and parameter.low <= n <= parameter.high for n in numbers)
+
+
+def table() -> str:
+    """Write all parameters as a Markdown table.
+
+    Returns
+    -------
+    str
+        One row for each parameter and the executables that have it.
+    """
+    rows: dict[str, tuple[Parameter, list[str]]] = {}
+    for executable, parameters in NODES.items():
+        for parameter in parameters:
+            rows.setdefault(parameter.name, (parameter, []))[1].append(executable)
+    lines = ['| parameter | type | default | range | nodes | what it is |',
+             '|---|---|---|---|---|---|']
+    for name, (parameter, owners) in rows.items():
+        default = parameter.default
+        shown = str(default).lower() if isinstance(default, bool) else default or 'empty'
+        shown = default if type(default) in (int, float) else shown
+        lines.append(f'| `{name}` | {parameter.kind} | {shown} | {parameter.range} | '
+                     f'{", ".join(owners)} | {parameter.text} |')
+    return '\n'.join(lines)
+
+
+if __name__ == '__main__':
+    print(table())

@@ -1,0 +1,73 @@
+"""Which of the roles that a node needs are there."""
+
+from collections.abc import Callable, Mapping
+
+from rclpy.node import Node
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.timers import steady_timer
+
+_POLL_S = 0.1
+# Looks before the first complaint: at the start, everyone is still being discovered.
+_GRACE = 10
+
+# What must be seen of a role: topics it publishes, and topics it subscribes to.
+Signs = tuple[tuple[type[m.Message], ...], tuple[type[m.Message], ...]]
+OF_BASE_STATION: Mapping[str, Signs] = {
+    'rhs_controller': ((m.RhsConfiguration,), (m.RhsCommand,)),
+    'channel': ((m.FeedSignals,), (m.Pilot,)),
+    'positioner': ((m.PositionEstimate,), (m.ReceivedSignals,)),
+    'transmission': ((m.Beam,), ()),
+}
+OF_USER: Mapping[str, Signs] = {
+    'channel': ((m.FeedSignals,), (m.Pilot,)),
+    'bs': ((m.Beacon,), (m.Ack,)),
+}
+
+
+class PeerWatch:
+    """Watches the graph and reports changes of the missing roles.
+
+    A role counts as present once it was seen twice in a row, which gives the other side time to
+    see this node too.
+
+    Parameters
+    ----------
+    node
+        The node that needs the roles.
+    needs
+        What must be seen of each role.
+    on_change
+        Called with the names of the missing roles: when none is missing, or after a moment, and
+        then whenever they change.
+    """
+
+    def __init__(
+            self, node: Node, needs: Mapping[str, Signs],
+            on_change: Callable[[tuple[str, ...]], None]) -> None:
+        self._node, self._needs, self._on_change = node, needs, on_change
+        self._before: frozenset[str] = frozenset(needs)
+        self._reported: tuple[str, ...] | None = None
+        self._looks = 0
+        steady_timer(node, _POLL_S, self._look)
+
+    def _look(self) -> None:
+        absent = frozenset(role for role, signs in self._needs.items() if not self._seen(signs))
+        missing = tuple(role for role in self._needs if role in absent | self._before)
+        self._before = absent
+        self._looks += 1
+        if missing and self._reported is None and self._looks < _GRACE:
+            return
+        if missing != self._reported:
+            self._reported = missing
+            self._on_change(missing)
+
+    def _seen(self, signs: Signs) -> bool:
+        publishes, subscribes = signs
+        return (all(self._node.count_publishers(self._name(kind)) for kind in publishes)
+                and all(self._node.count_subscribers(self._name(kind)) for kind in subscribes))
+
+    def _name(self, kind: type[m.Message]) -> str:
+        """Name of a topic after remapping, which the counts do not apply."""
+        return self._node.resolve_topic_name(topics.NAMES[kind])

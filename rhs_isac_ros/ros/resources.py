@@ -1,0 +1,16 @@
+"""Files that come with the package."""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+
+
+def default_codebook_file() -> Path:
+    """Return where the default codebook lies.
+
+    Returns
+    -------
+    pathlib.Path
+        The file ``config/codebook.yaml`` of the installed package.
+    """
+    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'codebook.yaml'

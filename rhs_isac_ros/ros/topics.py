@@ -1,0 +1,31 @@
+"""The name of every topic, relative, so that namespaces and remapping work."""
+
+from collections.abc import Mapping
+
+from rhs_isac_ros.protocol import messages as m
+
+NAMES: Mapping[type[m.Message], str] = {
+    m.Beacon: 'beacon',
+    m.Ack: 'ack',
+    m.Grant: 'grant',
+    m.RhsCommand: 'rhs/command',
+    m.RhsConfiguration: 'rhs/configuration',
+    m.PilotRequest: 'pilot_request',
+    m.Pilot: 'pilot',
+    m.FeedSignals: 'feed_signals',
+    m.ReceivedSignals: 'received_signals',
+    m.PositionEstimate: 'position_estimate',
+    m.Beam: 'beam',
+    m.Data: 'data',
+    m.Capacity: 'capacity',
+    m.GroundTruth: 'ground_truth',
+    m.ProtocolState: 'protocol_state',
+}
+# What is not a message of the protocol.
+POSITION = 'position'
+CODEBOOK = 'codebook'
+
+# The node that holds the codebook as its parameters.
+OPTIMIZER_NODE = 'optimizer'
+# Frame of all positions: the surface's centre, x outward, z up.
+MAP_FRAME = 'map'

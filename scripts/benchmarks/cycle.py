@@ -1,0 +1,152 @@
+"""Wall time of a protocol cycle, beside the time of its messages alone.
+
+Problem: a cycle is a chain of messages, each of which waits for the one before, with the
+computations of the nodes in between. What does the network add to bare rclpy? The floor is the
+same number of hops, as ping-pong of a bare publisher and subscription between two processes, in
+the same run and with the same executor.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+
+from rhs_isac_msgs.msg import FeedSignals
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.nodes.demo import start_network, watch
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.resources import default_codebook_file
+from rhs_isac_ros.ros.run import run
+
+# The chain of a cycle; the pilots of a band travel side by side and count once.
+BEFORE = ('beacon', 'ack')
+PER_BAND = ('rhs/command', 'rhs/configuration', 'pilot_request', 'pilot', 'feed_signals')
+AFTER = ('received_signals', 'position_estimate', 'beam', 'rhs/configuration',
+         'data', 'data', 'data', 'data')
+ROUND_TRIPS = 2000
+# Between cycles, so that the report of one does not compete with the next for the cores.
+REST_S = 0.05
+PONG = '--pong'
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument('--users', type=int, default=2)
+    parser.add_argument('--cycles', type=int, default=300)
+    parser.add_argument('--json', type=Path, help='file for the figures')
+    options = parser.parse_args()
+    os.environ.update(private_domain())
+    scenario = Scenario()
+    hops = len(BEFORE) + scenario.n_bands * len(PER_BAND) + len(AFTER)
+    rclpy.init(args=[])
+    try:
+        before_s = ping_pong(scenario)
+        cycles = run_cycles(scenario, options.users, options.cycles)
+        after_s = ping_pong(scenario)
+    finally:
+        rclpy.try_shutdown()
+    hop_s = np.median(np.concatenate([before_s, after_s])) / 2
+    # The first cycles still warm up.
+    cycles = cycles[10:]
+    cycle_s = np.median([record.ended_s - record.began_s for record in cycles])
+    figures = {
+        'users': options.users, 'cycles': len(cycles), 'hops': hops,
+        'cycle_ms': 1e3 * cycle_s, 'floor_ms': 1e3 * hops * hop_s,
+        'ratio': cycle_s / (hops * hop_s), 'hop_us': 1e6 * hop_s,
+        'estimator_ms': 1e3 * np.median([r.estimate.latency_s for r in cycles]),
+        'phases_ms': {phase.name.lower(): 1e3 * np.median(
+            [r.durations_s().get(phase, np.nan) for r in cycles]) for phase in m.Phase},
+    }
+    print(f'cycle     {figures["cycle_ms"]:7.2f} ms  from beacon to end, median of {len(cycles)}, '
+          f'{options.users} users, every node a process')
+    print(f'floor     {figures["floor_ms"]:7.2f} ms  {hops} hops of {figures["hop_us"]:.0f} us')
+    print(f'ratio     {figures["ratio"]:7.2f}')
+    print(f'estimator {figures["estimator_ms"]:7.2f} ms')
+    for phase, value in figures['phases_ms'].items():
+        print(f'  {phase:12s}{value:7.2f} ms')
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+    return 0
+
+
+def run_cycles(scenario: Scenario, users: int, cycles: int) -> list:
+    """Run the network and return its complete cycles."""
+    observer = CycleObserver()
+    with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
+        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
+            start_network(processes, users, 0, None, default_codebook_file(), scenario, REST_S)
+            problem = watch(observer, processes, cycles, lambda *_: None)
+    observer.destroy_node()
+    if problem:
+        raise RuntimeError(problem)
+    return observer.log.complete
+
+
+def ping_pong(scenario: Scenario) -> np.ndarray:
+    """Measure round trips between this process and another one [s]."""
+    feeds = np.ones((scenario.n_subbands, scenario.n_feeds), complex)
+    ball = convert.to_ros(m.FeedSignals(1, 1, 0, 0, feeds), None)
+    times_s: list[float] = []
+    node = Node('ping')
+    publisher = node.create_publisher(FeedSignals, 'benchmark/ping', qos.EXCHANGE)
+
+    def on_pong(message: FeedSignals) -> None:
+        times_s.append(time.perf_counter() - on_pong.sent_s)
+        on_pong.sent_s = time.perf_counter()
+        publisher.publish(ball)
+
+    node.create_subscription(
+        FeedSignals, 'benchmark/pong', on_pong, qos.EXCHANGE,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+    executor = EventsExecutor()
+    executor.add_node(node)
+    other = subprocess.Popen([sys.executable, __file__, PONG])
+    try:
+        while not (publisher.get_subscription_count() and node.count_publishers('benchmark/pong')):
+            executor.spin_once(timeout_sec=0.1)
+        while len(times_s) < ROUND_TRIPS:
+            before = len(times_s)
+            if before == 0:
+                on_pong.sent_s = time.perf_counter()
+                publisher.publish(ball)
+            executor.spin_once(timeout_sec=1.0)
+    finally:
+        other.terminate()
+        other.wait()
+        executor.shutdown()
+        node.destroy_node()
+    return np.array(times_s[ROUND_TRIPS // 10:])
+
+
+def pong() -> int:
+    """Send back what comes, until a signal ends the process."""
+    def make() -> list[Node]:
+        node = Node('pong')
+        publisher = node.create_publisher(FeedSignals, 'benchmark/pong', qos.EXCHANGE)
+        node.create_subscription(
+            FeedSignals, 'benchmark/ping', publisher.publish, qos.EXCHANGE,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        return [node]
+
+    return run(make, [])
+
+
+if __name__ == '__main__':
+    if sys.argv[1:] == [PONG]:
+        sys.exit(pong())
+    sys.exit(main())

@@ -1,0 +1,57 @@
+# Puts ROS 2, the messages and rhs_isac_ros into the current shell, bash or zsh, from any directory:
+#   . scripts/env.sh
+# shellcheck shell=bash
+
+_rhs_prepend() { # NAME directory: puts the directory first in the path variable, unless it is there
+  eval "case :\${$1-}: in (*:\"\$2\":*) ;; (*) export $1=\"\$2\${$1:+:\$$1}\" ;; esac"
+}
+
+_rhs_load() { # root shell
+  local mode='' libraries
+  if [ -f "$1/install/.setup" ]; then read -r mode _ <"$1/install/.setup"; fi
+  case $mode:${ROS_DISTRO:-} in
+    wheels:)
+      # First in PATH even where another environment was activated in between.
+      case $PATH: in ("$1/.venv/bin:"*) ;; (*) PATH=$1/.venv/bin:$PATH ;; esac
+      export PATH VIRTUAL_ENV="$1/.venv"
+      # The wheels would start every Python twice to set these.
+      export _ROS_WHEELS_BOOTSTRAP_COMPLETE=1
+      libraries=$(find "$1/.venv/lib" -maxdepth 3 -name 'ros_*.libs' | sort | tr '\n' ':')
+      _rhs_prepend LD_LIBRARY_PATH "$libraries$1/.venv/lib"
+      _rhs_prepend AMENT_PREFIX_PATH "$1/.venv"
+      # shellcheck source=/dev/null
+      . "$1/install/local_setup.$2"
+      ;;
+    system: | system:jazzy)
+      # shellcheck source=/dev/null
+      . "$1/install/setup.$2"
+      ;;
+    wheels:* | system:*)
+      echo "env.sh: ROS 2 $ROS_DISTRO is sourced, the build is for another ROS: run scripts/setup" >&2
+      return 1
+      ;;
+    *)
+      echo 'env.sh: nothing is built yet: run scripts/setup' >&2
+      return 1
+      ;;
+  esac
+}
+
+_rhs_env() {
+  local shell=bash file=${BASH_SOURCE[0]:-} nounset='' code=0
+  # bash cannot parse what BASH_SOURCE is called in zsh.
+  if [ -n "${ZSH_VERSION:-}" ]; then shell=zsh && eval 'file=${(%):-%x}'; fi
+  # colcon's scripts read unset variables.
+  case $- in (*u*) nounset=1 && set +u ;; esac
+  _rhs_load "$(CDPATH='' builtin cd -- "$(dirname -- "$file")/.." && pwd -P)" "$shell" || code=1
+  if [ -n "$nounset" ]; then set -u; fi
+  return "$code"
+}
+
+# In an `if`, nothing inside ends a shell that has `set -e`.
+if _rhs_env; then
+  unset -f _rhs_prepend _rhs_load _rhs_env
+else
+  unset -f _rhs_prepend _rhs_load _rhs_env
+  return 1
+fi

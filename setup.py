@@ -1,0 +1,43 @@
+"""The ament_python package rhs_isac_ros."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'rhs_isac_ros'
+NODES = (
+    'bs',
+    'channel',
+    'demo',
+    'network',
+    'optimizer',
+    'positioner',
+    'rhs_controller',
+    'transmission',
+    'user',
+)
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Multi-band integrated sensing and communication with a holographic surface',
+    author='rhs_isac_ros authors',
+    author_email='maintainers@rhs-isac-ros.org',
+    maintainer='rhs_isac_ros authors',
+    maintainer_email='maintainers@rhs-isac-ros.org',
+    license='Apache-2.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+    ],
+    python_requires='>=3.10',
+    # What it runs on is in package.xml: rosdep or requirements.txt install it.
+    install_requires=['setuptools'],
+    extras_require={'test': ['pytest']},
+    zip_safe=False,
+    entry_points={
+        'console_scripts': [f'{node} = {NAME}.nodes.{node}:main' for node in NODES],
+    },
+)

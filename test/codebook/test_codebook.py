@@ -1,0 +1,285 @@
+"""The codebook: checks, identity, parameters and files; and the one that is shipped."""
+
+import dataclasses
+import math
+import os
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.model import Scenario
+
+
+def test_arrays_are_copied_checked_and_frozen():
+    analog = np.zeros((2, 1, 3), dtype=int)
+    codebook = Codebook(analog, [[[[1]]], [[[2j]]]])
+    analog[:] = 1
+    assert codebook.shape == (2, 1, 1, 1, 3)
+    assert codebook.analog.dtype == np.float64
+    assert codebook.digital.dtype == np.complex128
+    assert not codebook.analog.any()
+    for array in (codebook.analog, codebook.digital):
+        with pytest.raises(ValueError, match='read-only'):
+            array[:] = 0
+
+
+GOOD = {'analog': np.full((1, 2, 3), 0.5), 'digital': np.ones((1, 4, 2, 1))}
+
+
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'analog': np.zeros((2, 3))}, [r'analog: shape (2, 3)', 'expected [N_B, F, N_E]']),
+    ({'analog': np.zeros((1, 2, 0))}, ['analog: shape (1, 2, 0)', 'expected [N_B, F, N_E]']),
+    ({'digital': np.ones((1, 2, 1))}, ['digital: shape', 'expected [N_B, N_SB, F, K]']),
+    ({'analog': 'x'}, ['analog: ', 'expected numbers [N_B, F, N_E]']),
+    ({'analog': [[[0.1], [0.1, 0.2]]]}, ['analog: ', 'expected numbers']),
+    ({'analog': None}, ['analog: ', 'expected']),
+    ({'analog': np.full((1, 2, 3), np.nan)}, ['analog: not finite']),
+    ({'analog': [[[0.1, np.nan, 0.2], [0.3, 0.4, 0.5]]]}, ['analog: not finite']),
+    ({'digital': np.full((1, 4, 2, 1), np.inf)}, ['digital: not finite']),
+    ({'digital': [[[[1], [1]]] * 3 + [[[1], [1j * np.nan]]]]}, ['digital: not finite']),
+    ({'analog': np.full((1, 2, 3), 1.5)}, ['analog: 1.5 to 1.5', 'expected 0 to 1']),
+    ({'analog': np.full((1, 2, 3), -0.1)}, ['analog: -0.1 to -0.1', 'expected 0 to 1']),
+    ({'analog': np.full((1, 3, 3), 0.5)}, ['[N_B, F] = (1, 3)', 'expected (1, 2)']),
+    ({'analog': np.full((2, 2, 3), 0.5)}, ['[N_B, F] = (2, 2)', 'expected (1, 2)']),
+])
+def test_malformed_content_is_an_error(changes, words):
+    with pytest.raises(CodebookError) as caught:
+        Codebook(**(GOOD | changes))
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_id_is_that_of_the_content_alone(small):
+    codebook = small.codebook
+    assert re.fullmatch('cb[0-9a-f]{16}', codebook.id)
+    noted = dataclasses.replace(codebook, average_crlb_m2=1.0, provenance='noted')
+    assert noted.id == Codebook(codebook.analog.copy(), codebook.digital.copy()).id == codebook.id
+    analog, digital = codebook.analog.copy(), codebook.digital.copy()
+    analog[0, 1, 2] = np.nextafter(analog[0, 1, 2], 0.5)
+    digital[0, 2, 1, 1] += 1e-18j
+    swapped = Codebook(codebook.analog[:, ::-1], codebook.digital)
+    others = [Codebook(analog, codebook.digital), Codebook(codebook.analog, digital), swapped]
+    # The same numbers in another shape are another codebook.
+    flat = np.full(4, 0.5)
+    others += [Codebook(np.full((1, 1, 4), 0.5), flat.reshape(1, 1, 1, 4)),
+               Codebook(np.full((1, 1, 4), 0.5), flat.reshape(1, 4, 1, 1))]
+    assert len({codebook.id, *(other.id for other in others)}) == 6
+
+
+def test_id_does_not_change_between_versions():
+    """Recordings and files hold ids: their definition is part of the format."""
+    codebook = Codebook(np.full((1, 1, 1), 2958 / 4e5), np.ones((1, 1, 1, 1)))
+    assert codebook.id == 'cb756847581339e099'
+
+
+def test_check_accepts_what_fits(case):
+    case.codebook.check(case.scenario)
+
+
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'n_frames': 1}, 'analog: shape (1, 2, 16), expected [N_B, F, N_E] = (1, 1, 16)'),
+    ({'elements_per_side': 5}, 'analog: shape (1, 2, 16), expected [N_B, F, N_E] = (1, 2, 25)'),
+    ({'center_frequencies_hz': (2e9, 3e9)}, 'expected [N_B, F, N_E] = (2, 2, 16)'),
+    ({'n_feeds': 3}, 'digital: shape (1, 3, 2, 2), expected [N_B, N_SB, F, K] = (1, 3, 2, 3)'),
+    ({'n_subbands': 2}, 'digital: shape (1, 3, 2, 2), expected [N_B, N_SB, F, K] = (1, 2, 2, 2)'),
+    ({'max_power_w': 2e-3}, 'power 0.001 W, expected max_power_w = 0.002 W'),
+])
+def test_check_names_what_does_not_fit(small, changes, words):
+    with pytest.raises(CodebookError, match=re.escape(words)):
+        small.codebook.check(dataclasses.replace(small.scenario, **changes))
+
+
+def test_check_finds_one_wrong_frame(small):
+    digital = small.codebook.digital.copy()
+    digital[0, :, 1] *= np.sqrt(1.001)
+    codebook = Codebook(small.codebook.analog, digital)
+    with pytest.raises(CodebookError, match=r'digital: a frame has power 0\.001001 W'):
+        codebook.check(small.scenario)
+    Codebook(small.codebook.analog, small.codebook.digital * (1 + 1e-8)).check(small.scenario)
+
+
+def test_a_file_keeps_every_bit(case, tmp_path):
+    path = tmp_path / 'codebook.yaml'
+    codebook = dataclasses.replace(
+        case.codebook, average_crlb_m2=0.1 + 0.2, provenance='by hand: "é"\n')
+    codebook.save(path)
+    loaded = Codebook.load(path)
+    np.testing.assert_array_equal(loaded.analog, codebook.analog)
+    np.testing.assert_array_equal(loaded.digital, codebook.digital)
+    assert loaded.id == codebook.id
+    assert loaded.average_crlb_m2 == codebook.average_crlb_m2
+    assert loaded.provenance == codebook.provenance
+
+
+def test_metadata_is_optional(small, tmp_path):
+    small.codebook.save(tmp_path / 'codebook.yaml')
+    loaded = Codebook.load(str(tmp_path / 'codebook.yaml'))
+    assert math.isnan(loaded.average_crlb_m2)
+    assert loaded.provenance == ''
+
+
+def test_file_is_a_ros_2_parameter_file(tmp_path):
+    """A list of mixed integers and floats, as [1, 2.5], would abort a node's start."""
+    codebook = Codebook(
+        [[[0, 1, 0.5]]], [[[[1e-5, 1]]]], average_crlb_m2=2, provenance='x')
+    codebook.save(tmp_path / 'codebook.yaml')
+    content = yaml.safe_load((tmp_path / 'codebook.yaml').read_text(encoding='utf-8'))
+    (node, inside), = content.items()
+    assert node.startswith('/**/')
+    assert list(inside) == ['ros__parameters']
+    values = inside['ros__parameters']['codebook']
+    assert values == {
+        'id': codebook.id, 'shape': [1, 1, 1, 2, 3], 'average_crlb': 2.0, 'provenance': 'x',
+        'analog': [0.0, 1.0, 0.5], 'digital_re': [1e-5, 1.0], 'digital_im': [0.0, 0.0]}
+    assert all(type(size) is int for size in values['shape'])
+    for name in ('analog', 'digital_re', 'digital_im'):
+        assert all(type(value) is float for value in values[name])
+    assert type(values['average_crlb']) is float
+
+
+def test_an_id_whose_digits_look_like_a_number_stays_a_string(tmp_path):
+    """ROS reads 756847581339e099 as 7.568e+110, whatever YAML says; the letters prevent it."""
+    codebook = Codebook(np.full((1, 1, 1), 2958 / 4e5), np.ones((1, 1, 1, 1)))
+    codebook.save(tmp_path / 'codebook.yaml')
+    text = (tmp_path / 'codebook.yaml').read_text(encoding='utf-8')
+    assert re.search('^ +id: cb756847581339e099$', text, re.MULTILINE)
+
+
+def test_parameters_have_the_names_of_the_interface(small):
+    parameters = small.codebook.to_parameters()
+    assert set(parameters) == {f'codebook.{name}' for name in (
+        'id', 'shape', 'analog', 'digital_re', 'digital_im', 'average_crlb', 'provenance')}
+    assert Codebook.from_parameters(parameters).id == small.codebook.id
+
+
+MALFORMED = [
+    ('codebook.shape', None, 'codebook.shape'),
+    ('codebook.shape', [1, 3, 2, 2], 'codebook.shape: [1, 3, 2, 2], expected [N_B, N_SB, F'),
+    ('codebook.shape', [1, 3, 2, 2, 0], 'codebook.shape: [1, 3, 2, 2, 0], expected'),
+    ('codebook.shape', [1, 3, 2, 2, -16], 'codebook.shape: [1, 3, 2, 2, -16], expected'),
+    ('codebook.shape', 5, 'codebook.shape'),
+    ('codebook.shape', [1, 3, 2, 2, 9], 'codebook.analog: 32 values, expected 18 = 1 x 2 x 9'),
+    ('codebook.analog', [], 'codebook.analog: 0 values, expected 32 = 1 x 2 x 16'),
+    ('codebook.analog', ['x'] * 32, 'analog'),
+    ('codebook.digital_re', [0.0], 'codebook.digital_re: 1 values, expected 12 = 1 x 3 x 2 x 2'),
+    ('codebook.digital_im', [0.0] * 13, 'codebook.digital_im: 13 values, expected 12'),
+    ('codebook.analog', [2.0] * 32, 'analog: 2 to 2, expected 0 to 1'),
+    ('codebook.digital_im', [math.nan] * 12, 'digital: not finite'),
+    ('codebook.average_crlb', 'low', 'average_crlb'),
+    ('codebook.id', '0123456789abcdef', "codebook.id: '0123456789abcdef', expected "),
+]
+
+
+@pytest.mark.parametrize(('name', 'value', 'words'), MALFORMED)
+def test_malformed_parameters_are_errors(small, name, value, words):
+    with pytest.raises(CodebookError, match=re.escape(words)):
+        Codebook.from_parameters(small.codebook.to_parameters() | {name: value})
+
+
+@pytest.mark.parametrize('name', ['shape', 'analog', 'digital_re', 'digital_im'])
+def test_a_missing_parameter_is_an_error(small, name):
+    parameters = small.codebook.to_parameters()
+    del parameters[f'codebook.{name}']
+    with pytest.raises(CodebookError, match=f'codebook.{name}: '):
+        Codebook.from_parameters(parameters)
+
+
+@pytest.mark.parametrize('change', [{}, {'codebook.id': ''}], ids=['missing', 'empty'])
+def test_the_id_may_be_left_out(small, change):
+    parameters = small.codebook.to_parameters()
+    del parameters['codebook.id']
+    assert Codebook.from_parameters(parameters | change).id == small.codebook.id
+
+
+@pytest.mark.parametrize(('content', 'words'), [
+    (b'', 'expected ros__parameters with a mapping named codebook'),
+    (b'a: [1', 'cannot be read'),
+    (b'\xff\xfe\x00', 'cannot be read'),
+    (b'a: 2023-99-99', 'cannot be read'),
+    (b'- 1', 'expected ros__parameters'),
+    (b'codebook: 1', 'expected ros__parameters'),
+    (b'node: {ros__parameters: 3}', 'expected ros__parameters'),
+    (b'node: {ros__parameters: {codebook: 3}}', 'expected ros__parameters'),
+    (b'node: {ros__parameters: {codebook: {shape: null}}}', 'shape|not iterable'),
+    (b'node: {ros__parameters: {codebook: {}}}', 'codebook.shape'),
+], ids=str)
+def test_a_file_without_a_codebook_is_an_error(tmp_path, content, words):
+    path = tmp_path / 'codebook.yaml'
+    path.write_bytes(content)
+    with pytest.raises(CodebookError, match=words) as caught:
+        Codebook.load(path)
+    assert str(caught.value).startswith(f'{path}: ')
+
+
+def test_a_missing_file_is_an_error(tmp_path):
+    with pytest.raises(CodebookError, match='cannot be read'):
+        Codebook.load(tmp_path / 'none.yaml')
+
+
+def test_a_tampered_file_is_an_error(small, tmp_path):
+    path = tmp_path / 'codebook.yaml'
+    small.codebook.save(path)
+    content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    (node,) = content.values()
+    node['ros__parameters']['codebook']['analog'][3] += 1e-9
+    path.write_text(yaml.safe_dump(content), encoding='utf-8')
+    with pytest.raises(CodebookError, match=f"codebook.id: '{small.codebook.id}', expected "):
+        Codebook.load(path)
+
+
+def test_any_node_of_a_parameter_file_may_hold_the_codebook(small, tmp_path):
+    path = tmp_path / 'parameters.yaml'
+    values = {key.partition('.')[2]: value
+              for key, value in small.codebook.to_parameters().items()}
+    path.write_text(yaml.safe_dump({
+        '/bs': {'ros__parameters': {'policy': 'first'}},
+        '/x/optimizer': {'ros__parameters': {'seed': 1, 'codebook': values}}}), encoding='utf-8')
+    assert Codebook.load(path).id == small.codebook.id
+
+
+@pytest.mark.parametrize('failing', ['replace', 'chmod', 'fdopen'])
+def test_a_failing_write_keeps_the_old_file_alone(small, tmp_path, monkeypatch, failing):
+    path = tmp_path / 'codebook.yaml'
+    small.codebook.save(path)
+    before = path.read_bytes()
+    other = Codebook(1 - small.codebook.analog, small.codebook.digital)
+
+    def fail(*args, **kwargs):
+        if failing == 'fdopen':
+            os.close(args[0])
+        raise OSError('no space left')
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, failing, fail)
+        with pytest.raises(OSError, match='no space left'):
+            other.save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ['codebook.yaml']
+    other.save(path)
+    assert Codebook.load(path).id == other.id
+    assert os.listdir(tmp_path) == ['codebook.yaml']
+
+
+def test_saving_into_no_folder_is_an_error(small, tmp_path):
+    with pytest.raises(OSError, match='none'):
+        small.codebook.save(tmp_path / 'none' / 'codebook.yaml')
+
+
+def test_a_saved_file_is_readable_by_all(small, tmp_path):
+    small.codebook.save(tmp_path / 'codebook.yaml')
+    assert (tmp_path / 'codebook.yaml').stat().st_mode & 0o777 == 0o644
+
+
+def test_the_shipped_codebook_is_feasible_and_good(shipped):
+    """Held-out positions; observing all elements would give about 0.018 m^2."""
+    scenario = Scenario()
+    shipped.check(scenario)
+    positions = scenario.sample_positions(2000, np.random.default_rng(2024))
+    average = crlb(scenario, shipped, positions).mean()
+    assert 0.018 < average <= 0.046
+    assert shipped.average_crlb_m2 == pytest.approx(average, rel=0.15)
+    assert shipped.provenance

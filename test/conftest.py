@@ -1,0 +1,205 @@
+"""Fixtures that all tests share, and the paper's equations written out index by index."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+
+HERE = Path(__file__).resolve().parent
+
+
+class Case(NamedTuple):
+    """A scenario with reference values that were computed independently."""
+
+    scenario: Scenario
+    codebook: Codebook
+    vectors: dict[str, np.ndarray]
+
+
+def load_case(name: str) -> Case:
+    with np.load(HERE / 'data' / f'{name}.npz') as archive:
+        vectors = dict(archive)
+    case = {key.removeprefix('case_'): vectors[key] for key in vectors if key.startswith('case_')}
+    bands = np.arange(case['n_bands'])
+    scenario = Scenario(
+        center_frequencies_hz=case['first_center_hz'] + bands * case['band_spacing_hz'],
+        n_subbands=int(case['n_subbands']), subband_width_hz=case['subband_hz'],
+        n_frames=int(case['n_frames']), frame_duration_s=case['frame_s'],
+        elements_per_side=int(case['side']),
+        element_interval_wavelengths=case['spacing_wavelengths'], n_feeds=int(case['n_feeds']),
+        refractive_index=case['n_r'], delay_spread_s=case['delay_spread_s'],
+        max_user_speed_mps=case['vmax_mps'], angular_spread_deg=case['spread_deg'],
+        noise_psd_dbm_hz=case['noise_dbm_hz'], max_power_w=case['power_w'],
+        roi_center_m=case['roi_center'], roi_size_m=case['roi_size'])
+    return Case(scenario, Codebook(vectors['analog'], vectors['digital']), vectors)
+
+
+@pytest.fixture(scope='session')
+def table1() -> Case:
+    return load_case('table1')
+
+
+@pytest.fixture(scope='session')
+def small() -> Case:
+    return load_case('small')
+
+
+@pytest.fixture(scope='session', params=['small', 'table1'])
+def case(request) -> Case:
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(scope='session')
+def shipped() -> Codebook:
+    """The codebook that the package ships."""
+    return Codebook.load(HERE.parent / 'config' / 'codebook.yaml')
+
+
+@pytest.fixture(scope='session')
+def random_beams():
+    """Function of scenario and generator: a codebook with random phases and amplitudes."""
+    def make(scenario: Scenario, rng: np.random.Generator) -> Codebook:
+        sizes = scenario.sizes
+        digital = rng.normal(size=(*(sizes[s] for s in ('N_B', 'N_SB', 'F', 'K')), 2)) @ [1, 1j]
+        power = np.sum(np.abs(digital)**2, axis=(1, 3), keepdims=True)
+        digital *= np.sqrt(scenario.max_power_w / power)
+        analog = rng.uniform(size=(sizes['N_B'], sizes['F'], sizes['N_E']))
+        return Codebook(analog, digital)
+    return make
+
+
+class Plain:
+    """The model as the paper writes it, one index at a time; indices count from 0.
+
+    Takes what it needs of the scenario from its fields alone. Positions may have leading axes.
+    """
+
+    light = 299_792_458.0
+
+    def __init__(self, scenario, analog=None, digital=None):
+        self.scenario, self.analog, self.digital = scenario, analog, digital
+        self.rows = [(j, q) for j in range(scenario.n_subbands) for q in range(scenario.n_frames)]
+        wavelengths = [self.light / f for f in scenario.center_frequencies_hz]
+        self.patterns = {}
+        self.interval = scenario.element_interval_wavelengths * sum(wavelengths) / len(wavelengths)
+
+    def frequency(self, i, j):
+        s = self.scenario
+        return s.center_frequencies_hz[i] + (j + 1 - (s.n_subbands + 1) / 2) * s.subband_width_hz
+
+    def element(self, m):
+        side = self.scenario.elements_per_side
+        middle = (side - 1) / 2
+        return np.array([0, m % side - middle, m // side - middle]) * self.interval
+
+    def feed(self, k):
+        s = self.scenario
+        if s.feed_positions_m is not None:
+            return np.array(s.feed_positions_m[k])
+        board = s.elements_per_side * self.interval
+        return np.array([0, ((k + 0.5) / s.n_feeds - 0.5) * board, 0])
+
+    def los(self, position, i, j, m):
+        s, f = self.scenario, self.frequency(i, j)
+        distance = np.sqrt(np.sum((position - self.element(m))**2, axis=-1))
+        return (self.light * s.element_gain * s.user_gain / (4 * np.pi * f * distance)
+                * np.exp(-2j * np.pi * f / self.light * distance))
+
+    def los_slope(self, position, i, j, m):
+        """Derivative of `los` by the coordinates, on a new last axis."""
+        offset = position - self.element(m)
+        distance = np.sqrt(np.sum(offset**2, axis=-1))
+        rate = -2j * np.pi * self.frequency(i, j) / self.light - 1 / distance
+        return (self.los(position, i, j, m) * rate / distance)[..., None] * offset
+
+    def kappa(self, f, source, sink):
+        path = np.sqrt(sum((a - b)**2 for a, b in zip(sink, source, strict=True)))
+        return np.exp(-2j * np.pi * self.scenario.refractive_index * f / self.light * path)
+
+    def onboard(self, i, j, k, m):
+        return self.kappa(self.frequency(i, j), self.element(m), self.feed(k))
+
+    def weight(self, i, j, q, m):
+        """Entry of T_i: element m in sub-band j and frame q."""
+        feeds = range(self.scenario.n_feeds)
+        return self.analog[i, q, m] * sum(
+            self.digital[i, j, q, k] * self.onboard(i, j, k, m) for k in feeds)
+
+    def pattern(self, i):
+        if i not in self.patterns:
+            elements = range(self.scenario.n_elements)
+            self.patterns[i] = np.array(
+                [[self.weight(i, j, q, m) for m in elements] for j, q in self.rows])
+        return self.patterns[i]
+
+    def mean(self, position, i):
+        """Mean signals of a band, [..., N_SB F]."""
+        pattern, elements = self.pattern(i), range(self.scenario.n_elements)
+        gains = {(j, m): self.los(position, i, j, m)
+                 for j in range(self.scenario.n_subbands) for m in elements}
+        return np.stack([sum(pattern[r, m] * gains[j, m] for m in elements)
+                         for r, (j, _) in enumerate(self.rows)], axis=-1)
+
+    def mean_slope(self, position, i):
+        """Derivative of `mean` by the coordinates, [..., N_SB F, 3]."""
+        pattern, elements = self.pattern(i), range(self.scenario.n_elements)
+        slopes = {(j, m): self.los_slope(position, i, j, m)
+                  for j in range(self.scenario.n_subbands) for m in elements}
+        return np.stack([sum(pattern[r, m] * slopes[j, m] for m in elements)
+                         for r, (j, _) in enumerate(self.rows)], axis=-2)
+
+    def rho_f(self, i, j1, j2):
+        s = self.scenario
+        difference = self.frequency(i, j1) - self.frequency(i, j2)
+        return 1 / (1 + 2j * np.pi * s.delay_spread_s * difference)
+
+    def rho_t(self, i, q1, q2):
+        """J_0 by Bessel's integral; the mean over equidistant points is exact to rounding."""
+        s = self.scenario
+        doppler = s.max_user_speed_mps * s.center_frequencies_hz[i] / self.light
+        argument = 2 * np.pi * doppler * (q1 - q2) * s.frame_duration_s
+        turns = (np.arange(4000) + 0.5) / 4000 * np.pi
+        return np.mean(np.cos(argument * np.sin(turns)))
+
+    def covariance(self, i, spatial):
+        """Covariance of a band's signals, given V_i."""
+        s, pattern = self.scenario, self.pattern(i)
+        noise = 10**(s.noise_psd_dbm_hz / 10) / 1000 * s.subband_width_hz
+        size = len(self.rows)
+        result = np.zeros((size, size), complex)
+        for a, (j1, q1) in enumerate(self.rows):
+            for b, (j2, q2) in enumerate(self.rows):
+                scattered = pattern[a] @ spatial @ pattern[b].conj()
+                result[a, b] = self.rho_f(i, j1, j2) * self.rho_t(i, q1, q2) * scattered
+            result[a, a] += noise
+        return result
+
+    def information(self, position, spatial):
+        """Fisher information at one position [3], given V of every band."""
+        result = np.zeros((3, 3))
+        for i in range(self.scenario.n_bands):
+            slope = self.mean_slope(position, i)
+            inverse = np.linalg.inv(self.covariance(i, spatial[i]))
+            for u in range(3):
+                for v in range(3):
+                    result[u, v] += 2 * (slope[:, u].conj() @ inverse @ slope[:, v]).real
+        return result
+
+    def crlb(self, positions, spatial):
+        return np.array([np.trace(np.linalg.inv(self.information(p, spatial))) for p in positions])
+
+
+@pytest.fixture(scope='session')
+def plain() -> type[Plain]:
+    return Plain
+
+
+@pytest.fixture(scope='session')
+def table1_estimator(shipped):
+    """The default estimator for Table I and the shipped codebook."""
+    from rhs_isac_ros.positioning import make_estimator
+    return make_estimator('bayes', Scenario(), shipped)

@@ -1,0 +1,92 @@
+"""Water-filling against bisection and its conditions of optimality."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.link.steer import water_filling
+
+RNG = np.random.default_rng(0)
+CASES = {
+    'equal': (np.ones(5), 2.0),
+    'one channel': (np.array([3.0]), 0.5),
+    'all filled': (np.array([2.0, 3.0, 4.0]), 10.0),
+    'only the best': (np.array([1.0, 10.0, 2.0]), 0.1),
+    'two equal best': (np.array([5.0, 1.0, 5.0]), 0.1),
+    'just below the second': (np.array([2.0, 1.0]), 0.5 - 1e-9),
+    'just above the second': (np.array([2.0, 1.0]), 0.5 + 1e-9),
+    'one without gain': (np.array([0.0, 2.0, 3.0]), 1.0),
+    'of a link': (np.array([1e9, 1.1e9, 0.9e9, 3e8]), 1e-3),
+    **{f'random {n}': (10**RNG.uniform(-4, 4, n), 10**RNG.uniform(-3, 3))
+       for n in (2, 3, 8, 64, 500)},
+}
+
+
+@pytest.fixture(params=CASES)
+def channels(request):
+    return CASES[request.param]
+
+
+def rate(gains, shares):
+    return np.log1p(gains * shares).sum()
+
+
+def test_shares_are_those_of_bisection(channels, bisection):
+    gains, power = channels
+    np.testing.assert_allclose(
+        water_filling(gains, power), bisection(gains, power), rtol=1e-9, atol=1e-9 * power)
+
+
+def test_shares_use_the_power_and_are_not_negative(channels):
+    gains, power = channels
+    shares = water_filling(gains, power)
+    assert shares.shape == gains.shape
+    assert (shares >= 0).all()
+    assert shares.sum() == pytest.approx(power, rel=1e-9)
+
+
+def test_the_conditions_of_karush_kuhn_and_tucker_hold(channels):
+    """The slope of the rate is the same where power goes, and not higher elsewhere."""
+    gains, power = channels
+    shares = water_filling(gains, power)
+    slopes = gains / (1 + gains * shares)
+    used = shares > 0
+    np.testing.assert_allclose(slopes[used], slopes[used].max(), rtol=1e-6)
+    assert (slopes[~used] <= slopes[used].max() * (1 + 1e-9)).all()
+
+
+def test_no_other_shares_are_better(channels):
+    gains, power = channels
+    best = rate(gains, water_filling(gains, power))
+    rng = np.random.default_rng(1)
+    for concentration in (0.1, 1.0, 10.0):
+        for shares in rng.dirichlet(np.full(len(gains), concentration), 50) * power:
+            assert rate(gains, shares) <= best * (1 + 1e-12)
+
+
+def test_the_order_of_channels_does_not_matter(channels):
+    gains, power = channels
+    order = np.random.default_rng(2).permutation(len(gains))
+    np.testing.assert_allclose(
+        water_filling(gains[order], power), water_filling(gains, power)[order], rtol=1e-9,
+        atol=1e-12 * power)
+
+
+def test_more_power_lowers_no_share(channels):
+    gains, power = channels
+    assert (water_filling(gains, 2 * power) >= water_filling(gains, power) - 1e-9 * power).all()
+
+
+def test_what_has_no_gain_gets_nothing():
+    shares = water_filling(np.array([0.0, 2.0, -1e-20, 3.0]), 1.0)
+    assert shares[0] == shares[2] == 0
+    assert shares.sum() == pytest.approx(1.0)
+
+
+def test_many_without_gain_get_nothing():
+    shares = water_filling(np.array([1.0] + [0.0] * 7), 1.0)
+    np.testing.assert_array_equal(shares, [1.0] + [0.0] * 7)
+
+
+@pytest.mark.parametrize('gains', [[0.0], [0.0] * 8, [-1e-20, 0.0]])
+def test_without_any_gain_the_power_is_still_used(gains):
+    np.testing.assert_allclose(water_filling(np.array(gains), 3.0), 3.0 / len(gains))

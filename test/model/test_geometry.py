@@ -1,0 +1,48 @@
+"""Positions of elements and feeds, frequencies of sub-bands."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import geometry as g
+
+
+def test_positions_and_frequencies_are_the_vectors(case):
+    s, vectors = case.scenario, case.vectors
+    np.testing.assert_allclose(
+        g.element_positions(s), vectors['element_positions'], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        g.feed_positions(s), vectors['feed_positions'], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(g.subband_frequencies_hz(s), vectors['subband_hz'], rtol=1e-14)
+
+
+@pytest.mark.parametrize('scenario', [
+    Scenario(elements_per_side=1, n_feeds=1, n_subbands=1, center_frequencies_hz=(1e9,)),
+    Scenario(elements_per_side=5, n_feeds=4, n_subbands=5, center_frequencies_hz=(1e9, 2e9, 9e9),
+             element_interval_wavelengths=0.5),
+], ids=['one of each', 'odd'])
+def test_positions_and_frequencies_are_the_plain_ones(scenario, plain):
+    p = plain(scenario)
+    n_elements, n_feeds = scenario.n_elements, scenario.n_feeds
+    assert g.element_interval_m(scenario) == pytest.approx(p.interval, rel=1e-14)
+    np.testing.assert_allclose(
+        g.element_positions(scenario), [p.element(m) for m in range(n_elements)], atol=1e-15)
+    np.testing.assert_allclose(
+        g.feed_positions(scenario), [p.feed(k) for k in range(n_feeds)], atol=1e-15)
+    np.testing.assert_allclose(
+        g.subband_frequencies_hz(scenario),
+        [[p.frequency(i, j) for j in range(scenario.n_subbands)] for i in range(scenario.n_bands)],
+        rtol=1e-14)
+
+
+def test_mean_wavelength_is_that_of_the_bands_not_of_the_mean_frequency():
+    scenario = Scenario(center_frequencies_hz=(1e9, 3e9))
+    assert g.mean_wavelength_m(scenario) == pytest.approx((0.299792458 + 0.299792458 / 3) / 2)
+
+
+def test_given_feed_positions_are_used():
+    wanted = ((0.0, -0.1, 0.2), (0.01, 0.1, 0.0), (0.0, 0.0, 0.3))
+    scenario = dataclasses.replace(Scenario(), feed_positions_m=wanted)
+    np.testing.assert_array_equal(g.feed_positions(scenario), wanted)

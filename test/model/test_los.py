@@ -1,0 +1,89 @@
+"""The line of sight and its derivative."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.los import checked_positions, los_and_derivative, los_derivative, los_gain
+
+
+def test_gains_are_the_vectors(case):
+    for band, expected in enumerate(case.vectors['los']):
+        gains = los_gain(case.scenario, case.vectors['positions'], band)
+        assert gains.shape == expected.shape
+        np.testing.assert_allclose(gains, expected, rtol=1e-8)
+
+
+@pytest.fixture
+def wide() -> Scenario:
+    """A scenario whose sub-bands, gains and distances all differ from Table I."""
+    return Scenario(
+        center_frequencies_hz=(1e9, 2.2e9), n_subbands=5, subband_width_hz=7e6,
+        elements_per_side=3, element_gain=1.7, user_gain=0.3, roi_center_m=(2, 1, 0),
+        roi_size_m=(3, 4, 2))
+
+
+def test_gains_and_derivatives_are_the_plain_ones(wide, plain):
+    positions = wide.sample_positions(3, np.random.default_rng(0))
+    p = plain(wide)
+    for band in range(wide.n_bands):
+        gains = los_gain(wide, positions, band)
+        slopes = los_derivative(wide, positions, band)
+        assert gains.shape == (3, 5, 9)
+        assert slopes.shape == (3, 3, 5, 9)
+        for n, position in enumerate(positions):
+            for j in range(5):
+                for m in range(9):
+                    np.testing.assert_allclose(
+                        gains[n, j, m], p.los(position, band, j, m), rtol=1e-10)
+                    np.testing.assert_allclose(
+                        slopes[n, :, j, m], p.los_slope(position, band, j, m), rtol=1e-10)
+
+
+def test_derivative_is_the_limit_of_differences_of_plain_gains(wide, plain):
+    step = 1e-5
+    positions = wide.sample_positions(4, np.random.default_rng(1))
+    p = plain(wide)
+    for band in range(wide.n_bands):
+        slopes = los_derivative(wide, positions, band)
+        for u in range(3):
+            shift = step * np.eye(3)[u]
+            for j in range(5):
+                for m in range(9):
+                    difference = (p.los(positions + shift, band, j, m)
+                                  - p.los(positions - shift, band, j, m)) / (2 * step)
+                    scale = np.abs(slopes[:, :, j, m]).max()
+                    np.testing.assert_allclose(
+                        slopes[:, u, j, m], difference, rtol=0, atol=1e-7 * scale)
+
+
+def test_both_in_one_are_the_two(case):
+    positions = case.vectors['positions']
+    for band in range(case.scenario.n_bands):
+        gains, slopes = los_and_derivative(case.scenario, positions, band)
+        np.testing.assert_array_equal(gains, los_gain(case.scenario, positions, band))
+        np.testing.assert_array_equal(slopes, los_derivative(case.scenario, positions, band))
+
+
+def test_one_subband_works(plain):
+    scenario = Scenario(n_subbands=1, elements_per_side=2)
+    position = np.array([[7.0, -1.0, 0.5]])
+    expected = [[[plain(scenario).los(position[0], 1, 0, m) for m in range(4)]]]
+    np.testing.assert_allclose(los_gain(scenario, position, 1), expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize('function', [los_gain, los_derivative, los_and_derivative])
+@pytest.mark.parametrize(('positions', 'words'), [
+    ([1.0, 2.0, 3.0], r'positions: shape \(3,\), expected \[N, 3\]'),
+    ([[1.0, 2.0]], r'positions: shape \(1, 2\), expected \[N, 3\]'),
+    ([[1.0, np.nan, 0.0]], 'positions: not finite, expected finite'),
+    ([[1.0, np.inf, 0.0]], 'positions: not finite, expected finite')])
+def test_malformed_positions_are_errors(function, positions, words):
+    with pytest.raises(ValueError, match=words):
+        function(Scenario(), np.array(positions), 0)
+
+
+def test_checked_positions_takes_lists():
+    positions = checked_positions([[1, 2, 3]])
+    assert positions.dtype == float
+    assert positions.tolist() == [[1.0, 2.0, 3.0]]

@@ -1,0 +1,177 @@
+"""How users move."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import Scenario, mobility
+
+SQUARE = [(6.0, 0.0, 0.0), (8.0, 0.0, 0.0), (8.0, 3.0, 0.0), (6.0, 3.0, 0.0)]
+START_S = 1234.5
+
+
+def track(moves, times):
+    """Positions and velocities at times, each [N, 3]."""
+    return tuple(np.array(part) for part in zip(*(moves.state(t) for t in times), strict=True))
+
+
+def test_kinds_are_the_three():
+    assert mobility.KINDS == ('static', 'waypoints', 'random_walk')
+
+
+def test_static_stands_still():
+    positions, velocities = track(mobility.Static((7.0, -1.0, 0.5)), [0.0, 1.0, 1e6])
+    assert (positions == [7, -1, 0.5]).all()
+    assert (velocities == 0).all()
+
+
+@pytest.mark.parametrize('make', [
+    lambda: mobility.Static((7, -1, 0)),
+    lambda: mobility.Waypoints(SQUARE, 0.0),
+    lambda: mobility.RandomWalk(Scenario(), 0.0, np.random.default_rng(0)),
+], ids=['static', 'waypoints', 'random_walk'])
+def test_without_speed_nobody_moves(make):
+    moves = make()
+    positions, velocities = track(moves, [0.0, 5.0, 50.0])
+    assert (positions == positions[0]).all()
+    assert (velocities == 0).all()
+
+
+@pytest.mark.parametrize('make', [
+    lambda: mobility.Static((7, -1, 0)),
+    lambda: mobility.Waypoints(SQUARE, 1.0),
+    lambda: mobility.Waypoints(SQUARE, 0.0),
+    lambda: mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0)),
+    lambda: mobility.RandomWalk(Scenario(), 0.0, np.random.default_rng(0)),
+], ids=['static', 'waypoints', 'standing at one', 'random_walk', 'standing on a walk'])
+def test_who_changes_an_answer_does_not_move_the_user(make):
+    moves = make()
+    position, velocity = moves.state(0.0)
+    kept = position.copy(), velocity.copy()
+    position += 100
+    velocity += 100
+    for a, b in zip(moves.state(0.0), kept, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_waypoints_go_round_a_closed_line():
+    moves = mobility.Waypoints(SQUARE, 0.5)
+    seconds = np.array([0, 2, 4, 7, 10, 12, 14, 17, 20, 24])
+    positions, velocities = track(moves, START_S + seconds)
+    np.testing.assert_allclose(positions, [
+        (6, 0, 0), (7, 0, 0), (8, 0, 0), (8, 1.5, 0), (8, 3, 0), (7, 3, 0), (6, 3, 0),
+        (6, 1.5, 0), (6, 0, 0), (8, 0, 0)], atol=1e-9)
+    along = {'+x': (0.5, 0, 0), '+y': (0, 0.5, 0), '-x': (-0.5, 0, 0), '-y': (0, -0.5, 0)}
+    names = ['+x', '+x', '+y', '+y', '-x', '-x', '-y', '-y', '+x', '+y']
+    np.testing.assert_allclose(velocities, [along[name] for name in names], atol=1e-12)
+
+
+def test_waypoints_begin_with_the_first_call():
+    moves = mobility.Waypoints(SQUARE, 1.0)
+    np.testing.assert_array_equal(moves.state(1e5)[0], SQUARE[0])
+    np.testing.assert_allclose(moves.state(1e5 + 1)[0], (7, 0, 0), atol=1e-9)
+
+
+def test_waypoints_keep_on_the_line_for_long():
+    moves = mobility.Waypoints(SQUARE, 3.0)
+    positions, _ = track(moves, np.concatenate([[0.0], np.sort(
+        np.random.default_rng(0).uniform(0, 1e6, 500))]))
+    on_x = np.isclose(positions[:, 1], 0) | np.isclose(positions[:, 1], 3)
+    on_y = np.isclose(positions[:, 0], 6) | np.isclose(positions[:, 0], 8)
+    assert (on_x | on_y).all()
+    assert (positions >= np.array([6, 0, 0]) - 1e-6).all()
+    assert (positions <= np.array([8, 3, 0]) + 1e-6).all()
+
+
+def test_one_waypoint_is_a_place():
+    positions, velocities = track(mobility.Waypoints([(7, 1, 0)], 2.0), [0.0, 3.0])
+    assert (positions == [7, 1, 0]).all()
+    assert (velocities == 0).all()
+
+
+def test_doubled_waypoints_change_nothing():
+    times = np.linspace(0, 30, 301)
+    doubled = [point for point in SQUARE for _ in (0, 1)]
+    plain = track(mobility.Waypoints(SQUARE, 0.7), times)
+    again = track(mobility.Waypoints(doubled, 0.7), times)
+    for a, b in zip(plain, again, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def movers():
+    yield 'waypoints', lambda: mobility.Waypoints(SQUARE, 1.5)
+    for seed in range(3):
+        yield f'walk {seed}', lambda seed=seed: mobility.RandomWalk(
+            Scenario(), 1.5, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize('make', [m for _, m in movers()], ids=[name for name, _ in movers()])
+def test_movers_keep_their_speed_and_never_jump(make):
+    step_s = 0.05
+    positions, velocities = track(make(), START_S + np.arange(4000) * step_s)
+    np.testing.assert_allclose(np.linalg.norm(velocities, axis=1), 1.5)
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert steps.max() <= 1.5 * step_s * (1 + 1e-6)
+    # A step is shorter only where it goes round a corner.
+    full = np.isclose(steps, 1.5 * step_s, rtol=1e-6)
+    assert full.mean() > 0.95
+    assert not full.all()
+    straight = (velocities[1:] == velocities[:-1]).all(axis=1)
+    np.testing.assert_allclose(
+        np.diff(positions, axis=0)[straight], velocities[1:][straight] * step_s, atol=1e-8)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_walk_stays_in_the_region_and_crosses_it(seed):
+    scenario = Scenario(roi_center_m=(4, 1, -2), roi_size_m=(2, 6, 1))
+    walk = mobility.RandomWalk(scenario, 2.0, np.random.default_rng(seed))
+    positions, _ = track(walk, np.arange(0, 2000, 0.5))
+    low, high = scenario.roi_bounds_m
+    assert (positions >= low - 1e-9).all()
+    assert (positions <= high + 1e-9).all()
+    assert (np.ptp(positions, axis=0) > 0.8 * (high - low)).all()
+
+
+def test_a_walk_begins_where_it_is_told():
+    walk = mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0), (6.0, 2.0, 0.1))
+    np.testing.assert_array_equal(walk.state(START_S)[0], (6, 2, 0.1))
+    assert np.linalg.norm(walk.state(START_S + 1.0)[0] - (6, 2, 0.1)) > 0.1
+
+
+def test_walks_repeat_with_their_seed():
+    def positions(seed):
+        walk = mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(seed))
+        return track(walk, np.arange(0, 100, 1.0))[0]
+
+    np.testing.assert_array_equal(positions(1), positions(1))
+    assert not np.isclose(positions(1), positions(2)).all(axis=1).any()
+
+
+def test_a_walk_does_not_depend_on_when_one_looks():
+    scenario = Scenario()
+    often = mobility.RandomWalk(scenario, 1.5, np.random.default_rng(3))
+    rarely = mobility.RandomWalk(scenario, 1.5, np.random.default_rng(3))
+    often_at = track(often, np.arange(0, 300, 0.5))[0][::200]
+    rarely_at = track(rarely, np.arange(0, 300, 100.0))[0]
+    np.testing.assert_allclose(often_at, rarely_at, atol=1e-9)
+
+
+def test_a_walk_changes_its_direction():
+    walk = mobility.RandomWalk(Scenario(), 5.0, np.random.default_rng(0))
+    _, velocities = track(walk, np.arange(0, 60, 0.2))
+    turns = sum(not np.allclose(a, b) for a, b in itertools.pairwise(velocities))
+    assert 10 < turns < 150
+
+
+@pytest.mark.parametrize('make', [
+    lambda: mobility.Static((7, 1)),
+    lambda: mobility.Static((7, 1, np.nan)),
+    lambda: mobility.Waypoints([(7, 1)], 1.0),
+    lambda: mobility.Waypoints([(7, 1, np.inf)], 1.0),
+    lambda: mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0), (1, 2)),
+    lambda: mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0), (1, 2, np.nan)),
+])
+def test_a_place_that_is_none_is_an_error(make):
+    with pytest.raises(ValueError, match='positions'):
+        make()

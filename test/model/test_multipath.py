@@ -1,0 +1,171 @@
+"""The multipath: covariance, correlations and random gains."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import dblquad, tplquad
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import multipath as mp
+
+
+def test_covariance_is_the_vectors(case):
+    covariance = mp.multipath_covariance(case.scenario)
+    assert covariance.shape == case.vectors['V'].shape
+    np.testing.assert_allclose(covariance, case.vectors['V'], rtol=1e-6)
+    assert not covariance.flags.writeable
+
+
+@pytest.fixture(scope='module')
+def other() -> Scenario:
+    """A scenario whose gains, spread and region all differ from Table I."""
+    return Scenario(
+        center_frequencies_hz=(1.5e9, 4e9), elements_per_side=3, element_gain=2.0, user_gain=0.5,
+        angular_spread_deg=25.0, roi_center_m=(3, 1, -1), roi_size_m=(4, 2, 3))
+
+
+def mean_inverse_square(scenario: Scenario) -> float:
+    low, high = np.array(scenario.roi_center_m) + np.outer([-0.5, 0.5], scenario.roi_size_m)
+    bounds = [value for pair in zip(low, high, strict=True) for value in pair]
+    total, _ = tplquad(lambda z, y, x: 1 / (x * x + y * y + z * z), *bounds, epsrel=1e-9)
+    return total / np.prod(scenario.roi_size_m)
+
+
+@pytest.mark.parametrize('band', [0, 1])
+def test_mean_los_power_is_the_adaptive_integral(other, band):
+    factor = 299_792_458 * 0.5 / (4 * np.pi * other.center_frequencies_hz[band])
+    expected = factor**2 * mean_inverse_square(other)
+    assert mp.mean_los_power(other, band) == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize(('band', 'm', 'n'), [(0, 0, 8), (1, 0, 1), (1, 7, 3), (1, 2, 6)])
+def test_covariance_is_the_adaptive_integral(other, plain, band, m, n):
+    """Integrates every quadrant on its own, the profile having a cusp along both axes."""
+    p = plain(other)
+    wavenumber = 2 * np.pi * other.center_frequencies_hz[band] / 299_792_458
+    offset = wavenumber * (p.element(m) - p.element(n))
+    rate = np.sqrt(2) / np.deg2rad(25.0)
+
+    def density(elevation, azimuth):
+        return np.exp(-rate * (abs(azimuth) + abs(elevation)))
+
+    def phase(elevation, azimuth):
+        return offset @ (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                         np.sin(elevation))
+
+    def integral(function):
+        ends = ((-np.pi / 2, 0), (0, np.pi / 2))
+        return sum(dblquad(function, *azimuths, *elevations, epsrel=1e-8, epsabs=1e-10)[0]
+                   for azimuths in ends for elevations in ends)
+
+    total = (2 * -np.expm1(-rate * np.pi / 2) / rate)**2
+    real = integral(lambda *angles: np.cos(phase(*angles)) * density(*angles)) / total
+    imag = integral(lambda *angles: np.sin(phase(*angles)) * density(*angles)) / total
+    power = (299_792_458 / (4 * np.pi * other.center_frequencies_hz[band]))**2
+    power *= mean_inverse_square(other) * 2.0**2 * 0.5**2
+    np.testing.assert_allclose(
+        mp.multipath_covariance(other)[band, m, n], power * (real + 1j * imag), rtol=1e-6)
+
+
+def test_correlations_are_the_vectors(case):
+    subbands, frames = np.arange(case.scenario.n_subbands), np.arange(case.scenario.n_frames)
+    for band in range(case.scenario.n_bands):
+        over_f = mp.frequency_correlation(case.scenario, band, subbands[:, None], subbands)
+        over_t = mp.time_correlation(case.scenario, band, frames[:, None], frames)
+        np.testing.assert_allclose(over_f, case.vectors['K_f'][band], rtol=1e-10)
+        np.testing.assert_allclose(over_t, case.vectors['K_t'][band], rtol=1e-10)
+
+
+@pytest.fixture(scope='module')
+def fading() -> Scenario:
+    """A small scenario whose sub-bands and frames are correlated by a half or so."""
+    return Scenario(
+        center_frequencies_hz=(2.5e9, 4e9), n_subbands=2, n_frames=3, elements_per_side=2,
+        subband_width_hz=3e5, frame_duration_s=4e-3, angular_spread_deg=60.0)
+
+
+def test_correlations_are_the_plain_ones_when_they_are_low(fading, plain):
+    p = plain(fading)
+    for band in range(2):
+        for a in range(3):
+            for b in range(3):
+                assert mp.time_correlation(fading, band, a, b) == pytest.approx(
+                    p.rho_t(band, a, b), abs=1e-12)
+        for a in range(2):
+            for b in range(2):
+                assert mp.frequency_correlation(fading, band, a, b) == pytest.approx(
+                    p.rho_f(band, a, b), rel=1e-12)
+    assert abs(p.rho_t(1, 0, 2)) < 0.6
+    assert abs(p.rho_f(0, 0, 1)) < 0.8
+
+
+def test_factors_square_to_the_covariances(case):
+    kept = mp.multipath_factors(case.scenario)
+    for band, (spatial, rows) in enumerate(kept):
+        v = case.vectors['V'][band]
+        np.testing.assert_allclose(
+            spatial @ spatial.conj().T, v, rtol=0, atol=1e-10 * np.abs(v).max())
+        over_f, over_t = case.vectors['K_f'][band], case.vectors['K_t'][band]
+        np.testing.assert_allclose(
+            rows @ rows.conj().T, np.kron(over_f, over_t), rtol=0, atol=1e-10)
+
+
+N_DRAWS = 20_000
+# Deviations of sample statistics, in standard deviations; a few hundred are looked at at once.
+SIGMAS = 5.0
+
+
+def assert_sample_covariance(first, second, expected, power):
+    """Check E[first second^H] with both [n, ...] flattened, entries having that mean power."""
+    n = len(first)
+    sample = first.reshape(n, -1).T @ second.reshape(n, -1).conj() / n
+    deviation = np.abs(sample - expected) / power
+    assert deviation.max() < SIGMAS / np.sqrt(n)
+
+
+def test_drawn_gains_have_the_covariance(fading, plain):
+    p, rng = plain(fading), np.random.default_rng(2)
+    first, second = (mp.draw_multipath(fading, band, N_DRAWS, rng) for band in (0, 1))
+    assert first.shape == (N_DRAWS, 6, 4)
+    for band, gains in enumerate((first, second)):
+        v = mp.multipath_covariance(fading)[band]
+        expected = np.zeros((6, 4, 6, 4), complex)
+        for a, (j1, q1) in enumerate(p.rows):
+            for b, (j2, q2) in enumerate(p.rows):
+                expected[a, :, b] = p.rho_f(band, j1, j2) * p.rho_t(band, q1, q2) * v
+        assert_sample_covariance(gains, gains, expected.reshape(24, 24), v[0, 0].real)
+        # Circular: the product without conjugate has mean zero; so has the gain.
+        assert_sample_covariance(gains, gains.conj(), 0, v[0, 0].real * np.sqrt(2))
+        deviation = np.abs(gains.mean(axis=0)) / np.sqrt(v[0, 0].real)
+        assert deviation.max() < SIGMAS / np.sqrt(N_DRAWS)
+    # Bands are independent.
+    power = np.sqrt(np.prod([np.mean(np.abs(gains)**2) for gains in (first, second)]))
+    assert_sample_covariance(first, second, 0, power)
+
+
+def test_drawn_gains_are_reproducible(small):
+    one, same, other = (mp.draw_multipath(small.scenario, 0, 2, np.random.default_rng(seed))
+                        for seed in (7, 7, 8))
+    np.testing.assert_array_equal(one, same)
+    assert not np.isclose(one, other).any()
+
+
+def test_complex_normal_is_circular_with_unit_variance():
+    n = 200_000
+    z = mp.complex_normal((n // 4, 4), np.random.default_rng(3)).ravel()
+    assert z.shape == (n,)
+    assert np.mean(np.abs(z)**2) == pytest.approx(1, abs=SIGMAS / np.sqrt(n))
+    assert abs(np.mean(z)) < SIGMAS / np.sqrt(n)
+    assert abs(np.mean(z * z)) < SIGMAS * np.sqrt(2 / n)
+    # The fourth moment tells a normal from others.
+    assert np.mean(np.abs(z)**4) == pytest.approx(2, abs=SIGMAS * np.sqrt(20 / n))
+    # Successive numbers are independent.
+    assert abs(np.mean(z[1:] * z[:-1].conj())) < SIGMAS / np.sqrt(n)
+
+
+def test_a_narrow_spread_makes_the_multipath_one_wave(small):
+    """Nearly all power comes from the front: the elements are coherent."""
+    narrow = dataclasses.replace(small.scenario, angular_spread_deg=0.05)
+    v = mp.multipath_covariance(narrow)[0]
+    np.testing.assert_allclose(v / v[0, 0], 1, atol=1e-4)

@@ -1,0 +1,198 @@
+"""The scenario: defaults, checks, files and derived numbers."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError
+
+
+def test_defaults_are_table_1_of_the_paper():
+    expected = {
+        'center_frequencies_hz': (2.5e9, 3.0e9), 'n_subbands': 8, 'subband_width_hz': 125e3,
+        'n_frames': 4, 'frame_duration_s': 4e-6, 'elements_per_side': 10,
+        'element_interval_wavelengths': 0.3, 'n_feeds': 3, 'feed_positions_m': None,
+        'refractive_index': 2.1, 'element_gain': 1.0, 'user_gain': 1.0, 'delay_spread_s': 0.5e-6,
+        'max_user_speed_mps': pytest.approx(20e3 / 3600), 'angular_spread_deg': 10.0,
+        'noise_psd_dbm_hz': -174.0, 'max_power_w': 1e-3, 'roi_center_m': (10.0, 0.0, 0.0),
+        'roi_size_m': (10.0, 10.0, 2.0)}
+    assert dataclasses.asdict(Scenario()) == expected
+
+
+def test_defaults_are_the_vectors(table1):
+    assert table1.scenario == Scenario()
+
+
+def test_derived_numbers(case):
+    s, vectors = case.scenario, case.vectors
+    n_bands, n_subbands, n_frames, n_feeds = vectors['digital'].shape
+    n_elements = vectors['analog'].shape[2]
+    assert s.sizes == {'N_B': n_bands, 'N_SB': n_subbands, 'F': n_frames, 'N_E': n_elements,
+                       'K': n_feeds}
+    assert (s.n_bands, s.n_elements) == (n_bands, n_elements)
+    assert s.noise_power_w == pytest.approx(float(vectors['noise_power']), rel=1e-12)
+    assert SPEED_OF_LIGHT_MPS == 299_792_458
+
+
+def test_values_take_their_declared_type():
+    s = Scenario(
+        center_frequencies_hz=np.array([1e9]), n_feeds=np.int64(2), max_power_w=1,
+        feed_positions_m=[[0, 1, 2], (0, '1e-1', 0)], roi_size_m=[1, 2, 3])
+    assert s.center_frequencies_hz == (1e9,)
+    assert type(s.n_feeds) is int
+    assert type(s.max_power_w) is float
+    assert s.feed_positions_m == ((0.0, 1.0, 2.0), (0.0, 0.1, 0.0))
+    assert s.roi_size_m == (1.0, 2.0, 3.0)
+
+
+def test_equal_scenarios_hash_alike():
+    one = Scenario(center_frequencies_hz=[28e9, 29e9], feed_positions_m=np.zeros((3, 3)))
+    same = Scenario(center_frequencies_hz=('28e9', 29e9), feed_positions_m=[[0, 0, 0]] * 3)
+    assert one == same
+    assert hash(one) == hash(same)
+    assert len({one, same, Scenario()}) == 2
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        one.n_feeds = 4
+
+
+# Field, value, how the message shows the value, what it says is expected.
+BAD = [
+    ('n_feeds', 2.5, '2.5', 'expected an integer'),
+    ('n_feeds', True, 'True', 'expected an integer'),
+    ('n_feeds', 'three', "'three'", 'expected an integer'),
+    ('n_feeds', 0, '0', 'expected 1 to 256'),
+    ('n_frames', 5000, '5000', 'expected 1 to 4096'),
+    ('elements_per_side', -1, '-1', 'expected 1 to 128'),
+    ('subband_width_hz', 'wide', "'wide'", 'expected a number'),
+    ('subband_width_hz', 0, '0 Hz', 'expected 1 to 1e+10 Hz'),
+    ('delay_spread_s', None, 'None', 'expected a number'),
+    ('delay_spread_s', -1e-6, '-1e-06 s', 'expected 0 to 1 s'),
+    ('element_gain', True, 'True', 'expected a finite number'),
+    ('max_power_w', math.nan, 'nan', 'expected a finite number'),
+    ('max_power_w', math.inf, 'inf', 'expected a finite number'),
+    ('max_power_w', 0, '0 W', 'expected 1e-15 to 1e+06 W'),
+    ('refractive_index', 0.5, '0.5', 'expected 1 to 100'),
+    ('center_frequencies_hz', 3e9, '3000000000.0', 'expected a list of numbers'),
+    ('center_frequencies_hz', [], '[]', 'expected a list of numbers'),
+    ('center_frequencies_hz', [3e9, 'x'], "'x'", 'expected a number'),
+    ('center_frequencies_hz', [1.0], '1 Hz', 'expected 1e+06 to 1e+13 Hz'),
+    ('roi_center_m', [1, 2], '2 values', 'expected a list of 3 numbers'),
+    ('roi_size_m', [1, 2, 3, 4], '4 values', 'expected a list of 3 numbers'),
+    ('roi_size_m', '123', "'123'", 'expected a list of 3 numbers'),
+    ('roi_size_m', [1, 0, 1], '0 m', 'expected 1e-06 to 1e+06 m'),
+    ('feed_positions_m', 1, '1', 'expected a list of [x, y, z]'),
+    ('feed_positions_m', [], '[]', 'expected a list of [x, y, z]'),
+    ('feed_positions_m', [[0, 0]] * 3, '2 values', 'expected a list of 3 numbers'),
+    ('feed_positions_m', [1, 2, 3], '1', 'expected a list of 3 numbers'),
+    ('feed_positions_m', [[0, 0, 0]] * 2, '2 positions', 'expected n_feeds = 3'),
+    ('roi_center_m', [5, 0, 0], '(5.0, 0.0, 0.0)', 'expected x > 0'),
+    ('roi_center_m', [-10, 0, 0], '(-10.0, 0.0, 0.0)', 'expected x > 0'),
+    ('subband_width_hz', 1e9, '8e+09 Hz', 'expected less than twice the lowest centre frequency'),
+]
+
+
+@pytest.mark.parametrize(('field', 'value', 'shown', 'expected'), BAD)
+def test_message_names_field_value_and_expectation(field, value, shown, expected):
+    with pytest.raises(ScenarioError) as caught:
+        Scenario(**{field: value})
+    message = str(caught.value)
+    assert message.startswith(f'{field}: ')
+    assert shown in message
+    assert expected in message
+
+
+@pytest.mark.parametrize('field', dataclasses.fields(Scenario), ids=lambda field: field.name)
+def test_bounds_are_inclusive_and_beyond_them_is_an_error(field):
+    if isinstance(field.default, int):
+        outside = (field.metadata['low'] - 1, field.metadata['high'] + 1)
+    else:
+        low, high = field.metadata['low'], field.metadata['high']
+        outside = (np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
+    for value in outside:
+        if field.name == 'feed_positions_m':
+            value = [[0, 0, 0], [0, 0, 0], [0, value, 0]]
+        elif field.name == 'center_frequencies_hz':
+            value = [1e9, value]
+        elif isinstance(field.default, tuple):
+            value = [10, value, 1]
+        with pytest.raises(ScenarioError, match=f'^{field.name}: .*, expected .* to .*'):
+            Scenario(**{field.name: value})
+
+
+@pytest.mark.parametrize(('field', 'value'), [
+    ('n_feeds', 1), ('n_feeds', 256), ('delay_spread_s', 0.0), ('delay_spread_s', 1.0),
+    ('refractive_index', 1.0), ('max_power_w', 1e6), ('noise_psd_dbm_hz', -400.0)])
+def test_bounds_themselves_are_allowed(field, value):
+    assert getattr(Scenario(**{field: value}), field) == value
+
+
+@pytest.mark.parametrize(('field', 'value'), [('n_feeds', 10**400), ('max_power_w', 10**400)],
+                         ids=['integer', 'number'])
+def test_a_number_beyond_all_floats_is_out_of_range(field, value):
+    with pytest.raises(ScenarioError, match=f'^{field}: '):
+        Scenario(**{field: value})
+
+
+def test_from_yaml_reads_fields_and_keeps_defaults(tmp_path):
+    path = tmp_path / 'scenario.yaml'
+    # YAML 1.1 reads 28e9 as a string, and 2.8e+10 as a number.
+    path.write_text(
+        'center_frequencies_hz: [28e9, 2.9e+10]\nn_feeds: 2\nsubband_width_hz: 1e6\n'
+        'feed_positions_m: [[0, -1e-2, 0], [0, 0.01, 0]]\n', encoding='utf-8')
+    expected = Scenario(
+        center_frequencies_hz=(28e9, 29e9), n_feeds=2, subband_width_hz=1e6,
+        feed_positions_m=((0.0, -0.01, 0.0), (0.0, 0.01, 0.0)))
+    assert Scenario.from_yaml(path) == expected
+    assert Scenario.from_yaml(str(path)) == expected
+
+
+def test_an_empty_file_is_table_1(tmp_path):
+    path = tmp_path / 'scenario.yaml'
+    path.write_text('# nothing\n', encoding='utf-8')
+    assert Scenario.from_yaml(path) == Scenario()
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('n_feed: 3', ['n_feed: unknown field', 'n_feeds', 'n_frames']),
+    ('1: 3', ['1: unknown field']),
+    ('- n_feeds', ['expected a mapping of field names to values']),
+    ('n_feeds', ['expected a mapping of field names to values']),
+    ('n_feeds: [', ['cannot be read']),
+    ('n_feeds: 3e0', ["n_feeds: '3e0'", 'expected an integer']),
+    ('max_power_w: -28e9', ['max_power_w: -2.8e+10 W', 'expected 1e-15 to 1e+06 W']),
+    ('roi_center_m: [1, 2]', ['roi_center_m: 2 values', 'expected a list of 3 numbers']),
+    ('max_power_w: 2023-99-99', ['cannot be read']),
+])
+def test_from_yaml_message_names_file_and_fault(tmp_path, text, words):
+    path = tmp_path / 'scenario.yaml'
+    path.write_text(text, encoding='utf-8')
+    with pytest.raises(ScenarioError) as caught:
+        Scenario.from_yaml(path)
+    assert str(caught.value).startswith(f'{path}: ')
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize('content', [None, b'\xff\xfe\x00n'], ids=['missing', 'not text'])
+def test_an_unreadable_file_is_an_error(tmp_path, content):
+    path = tmp_path / 'scenario.yaml'
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ScenarioError, match='cannot be read'):
+        Scenario.from_yaml(path)
+
+
+def test_positions_are_uniform_in_the_region():
+    s = Scenario(roi_center_m=(4, 1, -2), roi_size_m=(2, 6, 1))
+    low, high = np.array([3, -2, -2.5]), np.array([5, 4, -1.5])
+    np.testing.assert_array_equal(s.roi_bounds_m, [low, high])
+    positions = s.sample_positions(20_000, np.random.default_rng(0))
+    assert positions.shape == (20_000, 3)
+    assert (positions >= low).all()
+    assert (positions <= high).all()
+    unit = (positions - low) / (high - low)
+    np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.01)
+    np.testing.assert_allclose(np.cov(unit.T), np.eye(3) / 12, atol=0.003)
+    np.testing.assert_array_equal(positions, s.sample_positions(20_000, np.random.default_rng(0)))

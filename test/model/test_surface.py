@@ -1,0 +1,107 @@
+"""The surface: element signals, feeds, combining, and their matrix form."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import Scenario, surface
+
+
+@pytest.fixture(scope='module')
+def odd(random_beams):
+    """A small scenario with odd sizes and feeds off the centre line, and a random codebook."""
+    scenario = Scenario(
+        center_frequencies_hz=(1.9e9, 2.5e9, 3.3e9), n_subbands=3, n_frames=2, n_feeds=2,
+        elements_per_side=3, refractive_index=1.6, subband_width_hz=2e7,
+        feed_positions_m=((0.0, -0.05, 0.02), (0.01, 0.03, -0.01)))
+    return scenario, random_beams(scenario, np.random.default_rng(0))
+
+
+def complex_array(rng, *shape):
+    return rng.normal(size=(*shape, 2)) @ [1, 1j]
+
+
+def test_onboard_matrix_is_the_vectors(case):
+    matrix = surface.onboard_matrix(case.scenario)
+    assert matrix.shape == case.vectors['B'].shape
+    np.testing.assert_allclose(matrix, case.vectors['B'], rtol=1e-8)
+    assert not matrix.flags.writeable
+
+
+def test_onboard_matrix_is_the_plain_one(odd, plain):
+    scenario, _ = odd
+    p = plain(scenario)
+    matrix = surface.onboard_matrix(scenario)
+    assert matrix.shape == (3, 3, 2, 9)
+    for index in np.ndindex(matrix.shape):
+        np.testing.assert_allclose(matrix[index], p.onboard(*index), rtol=1e-10)
+
+
+def test_onboard_gain_is_the_plain_one(plain):
+    scenario, rng = Scenario(refractive_index=3.0), np.random.default_rng(1)
+    sources, sinks = rng.normal(size=(2, 4, 3))
+    gains = surface.onboard_gain(scenario, 2.5e9, sources, sinks)
+    for gain, source, sink in zip(gains, sources, sinks, strict=True):
+        expected = plain(scenario).kappa(2.5e9, source, sink)
+        np.testing.assert_allclose(gain, expected, rtol=1e-10)
+
+
+def test_element_signals_add_both_paths_and_carry_the_symbol():
+    los, multipath = complex_array(np.random.default_rng(2), 2, 3, 4)
+    signals = surface.element_signals(los, multipath, 0.5 - 2j)
+    for j in range(3):
+        for m in range(4):
+            assert signals[j, m] == pytest.approx((los[j, m] + multipath[j, m]) * (0.5 - 2j))
+
+
+def test_feed_signals_are_the_plain_sum(odd, plain):
+    scenario, codebook = odd
+    p = plain(scenario)
+    elements = complex_array(np.random.default_rng(3), 3, 9)
+    for band in range(3):
+        for q in range(2):
+            analog = codebook.analog[band, q]
+            feeds = surface.feed_signals(scenario, band, analog, elements)
+            assert feeds.shape == (3, 2)
+            for j in range(3):
+                for k in range(2):
+                    expected = sum(
+                        analog[m] * elements[j, m] * p.onboard(band, j, k, m) for m in range(9))
+                    np.testing.assert_allclose(feeds[j, k], expected, rtol=1e-10)
+
+
+def test_combine_is_the_plain_sum():
+    rng = np.random.default_rng(4)
+    digital, feeds = complex_array(rng, 2, 5, 3)
+    noise = complex_array(rng, 5)
+    combined = surface.combine(digital, feeds, noise)
+    quiet = surface.combine(digital, feeds, 0)
+    for j in range(5):
+        expected = sum(digital[j, k] * feeds[j, k] for k in range(3))
+        assert quiet[j] == pytest.approx(expected, rel=1e-12)
+        assert combined[j] == pytest.approx(expected + noise[j], rel=1e-12)
+
+
+def test_radiation_matrix_is_the_plain_one(odd, plain):
+    scenario, codebook = odd
+    p = plain(scenario, codebook.analog, codebook.digital)
+    matrix = surface.radiation_matrix(scenario, codebook)
+    assert matrix.shape == (3, 6, 9)
+    for band in range(3):
+        scale = np.abs(p.pattern(band)).max()
+        np.testing.assert_allclose(matrix[band], p.pattern(band), rtol=0, atol=1e-11 * scale)
+
+
+def test_feeds_then_combining_equals_a_row_of_the_matrix_form(odd):
+    """Row j F + q of T_i acts on the element signals of sub-band j in frame q."""
+    scenario, codebook = odd
+    matrix = surface.radiation_matrix(scenario, codebook)
+    elements = complex_array(np.random.default_rng(5), 3, 2, 3, 9)
+    for band in range(3):
+        for q in range(2):
+            feeds = surface.feed_signals(
+                scenario, band, codebook.analog[band, q], elements[band, q])
+            combined = surface.combine(codebook.digital[band, :, q], feeds, 0.0)
+            for j in range(3):
+                expected = sum(matrix[band, 2 * j + q, m] * elements[band, q, j, m]
+                               for m in range(9))
+                np.testing.assert_allclose(combined[j], expected, rtol=1e-9)

@@ -1,0 +1,115 @@
+"""What is wrong at the start ends an executable with one clear line and exit code 2."""
+
+import importlib
+import signal
+
+import pytest
+
+from rhs_isac_ros.ros import run
+
+CASES = {
+    'type': ('bs', {'seed': 'abc'}, ['seed', "'abc'", 'expected an integer']),
+    'no decimal point': ('bs', {'rest_s': 1}, ['rest_s', "'1'", 'a decimal point']),
+    'range': ('bs', {'ack_timeout_s': 0.0}, ['ack_timeout_s', '0.0', '0.001 to 60 s']),
+    'NaN': ('bs', {'step_timeout_s': '.nan'}, ['step_timeout_s', 'nan', '0.01 to 60 s']),
+    'policy': ('bs', {'policy': 'best'}, ['policy', "'best'", 'round_robin, first, random']),
+    'estimator': ('positioner', {'estimator': 'magic'}, ['estimator', "'magic'", 'bayes']),
+    'no scenario file': ('channel', {'scenario_file': '/no/such.yaml'}, ['/no/such.yaml']),
+    'unknown key': ('rhs_controller', {'scenario_file': 'unknown_key.yaml'},
+                    ['unknown_key.yaml', 'n_feed:', 'n_feeds']),
+    'no YAML': ('optimizer', {'scenario_file': 'broken.yaml'}, ['broken.yaml', 'cannot be read']),
+    'band': ('transmission', {'band': 2}, ['band', '2', '0 to 1']),
+    'position': ('user', {'position_m': [20.0, 0.0, 0.0]},
+                 ['position_m', '[20.0, 0.0, 0.0]', 'region of interest']),
+    'list of integers': ('user', {'position_m': [10, 0, 0]}, ['position_m', 'decimal point']),
+    'mixed list': ('user', {'position_m': '[10, 0.0, 0.0]'}, ['position_m']),
+    'codebook file': ('optimizer', {'codebook_file': 'short.yaml'},
+                      ['short.yaml', 'codebook.analog', '799 values', '800']),
+    'no codebook file': ('optimizer', {'codebook_file': '/no/book.yaml'}, ['/no/book.yaml']),
+    'another scenario': ('optimizer', {'scenario_file': 'one_feed.yaml'},
+                         ['digital', '(2, 8, 4, 3)', '(2, 8, 4, 1)']),
+    'codebook parameter': ('optimizer', {'codebook.id': 'deadbeefdeadbeef'},
+                           ['codebook.id', "'deadbeefdeadbeef'"]),
+    'users': ('network', {'users': 0}, ['users', '0', '1 to 1000']),
+    'network': ('network', {'policy': 'best'}, ['policy', "'best'"]),
+    'no parameter file': ('bs', ['--params-file', '/no/parameters.yaml'],
+                          ['/no/parameters.yaml']),
+}
+
+
+# These as processes too, to see that the exit code gets out.
+PROCESSES = ('type', 'unknown key', 'position', 'codebook file')
+
+
+@pytest.fixture(scope='module')
+def files(shipped, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('files')
+    (folder / 'unknown_key.yaml').write_text('n_feed: 3')
+    (folder / 'one_feed.yaml').write_text('n_feeds: 1')
+    (folder / 'broken.yaml').write_text('n_feeds: [\nn_frames: }\n')
+    shipped.save(folder / 'good.yaml')
+    first = repr(float(shipped.analog.flat[0]))
+    text = (folder / 'good.yaml').read_text()
+    assert text.count(f'[{first},') == 1
+    (folder / 'short.yaml').write_text(text.replace(f'[{first},', '['))
+    return folder
+
+
+def arguments(name, files):
+    given = CASES[name][1]
+    if isinstance(given, list):
+        return given
+    words = []
+    for key, value in given.items():
+        in_folder = str(value).endswith('.yaml') and not str(value).startswith('/')
+        words += ['-p', f'{key}:={files / value if in_folder else value}']
+    return words
+
+
+def assert_clear(code, log, name, crashed):
+    assert code == 2, log
+    assert not crashed(log), log
+    # ROS writes lines of its own, which begin with a level.
+    lines = [line for line in log.splitlines() if not line.startswith('[')]
+    assert len(lines) == 1, log
+    assert lines[0].startswith('error: ')
+    for word in CASES[name][2]:
+        assert word in lines[0], log
+
+
+@pytest.fixture
+def never_spins(monkeypatch):
+    """A start that is no failure raises here, and signals stay as they are."""
+    def refuse():
+        raise AssertionError('it starts')
+    monkeypatch.setattr(run, 'EventsExecutor', refuse)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_a_bad_start_ends_with_one_clear_line(name, files, never_spins, crashed, capfd):
+    executable = importlib.import_module(f'rhs_isac_ros.nodes.{CASES[name][0]}')
+    code = executable.main(['--ros-args', *arguments(name, files)])
+    assert_clear(code, capfd.readouterr().err, name, crashed)
+
+
+def test_a_good_start_is_none_of_these(files, never_spins):
+    with pytest.raises(AssertionError, match='it starts'):
+        importlib.import_module('rhs_isac_ros.nodes.optimizer').main(
+            ['--ros-args', '-p', f'codebook_file:={files / "good.yaml"}'])
+
+
+@pytest.fixture(scope='module')
+def started(module_processes, files):
+    """The processes of all cases, which run at the same time."""
+    return {name: module_processes.start(CASES[name][0], *arguments(name, files))
+            for name in PROCESSES}
+
+
+@pytest.mark.parametrize('name', PROCESSES)
+def test_exit_code_and_line_of_a_process(started, crashed, name):
+    code = started[name].wait()
+    assert_clear(code, started[name].log, name, crashed)

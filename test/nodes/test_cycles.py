@@ -1,0 +1,293 @@
+"""Cycles of a network of processes: what they carry, whom they serve, what they survive."""
+
+import collections
+import math
+import signal
+import types
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.fields import check
+from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.resources import default_codebook_file
+
+SCENARIO = Scenario()
+SIZES = SCENARIO.sizes
+# How many messages of each kind one cycle has.
+WHOLE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
+         m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'], m.RhsConfiguration: SIZES['N_B'] + 1,
+         m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'] * SIZES['F'],
+         m.FeedSignals: SIZES['N_B'] * SIZES['F'], m.Data: 4, m.ProtocolState: 4}
+# In another order than those of test_life.
+BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.0, 'ack_timeout_s': 0.3},
+        'positioner': {}, 'optimizer': {}, 'rhs_controller': {}}
+PLACES = {1: (9.0, 1.5, 0.3), 2: (12.0, -3.0, -0.5), 3: (6.5, 0.0, 0.0)}
+
+
+@pytest.fixture(scope='module')
+def network(module_processes, make_watch):
+    """Everything but users, in the paper's scenario."""
+    running = {name: module_processes.start(name, **values) for name, values in BASE.items()}
+    watch = make_watch()
+    watch.until(lambda: watch.heard[m.Beacon], 'the first beacon', running.values())
+    return types.SimpleNamespace(watch=watch, running=running)
+
+
+def start_user(processes, user):
+    return processes.start('user', name=f'user_{user}', user_id=user,
+                           position_m=list(PLACES[user]))
+
+
+@pytest.fixture
+def join(network, processes):
+    """Function that starts a user, which leaves at the end of the test."""
+    yield lambda user: start_user(processes, user)
+    for process in network.running.values():
+        assert process.running, process.log
+
+
+def beacons_in_a_row(watch, since):
+    """Whether the last four beacons since then belong to one cycle."""
+    cycle_ids = [beacon.cycle_id for beacon in watch.heard[m.Beacon][since:][-4:]]
+    return len(cycle_ids) == 4 and len(set(cycle_ids)) == 1
+
+
+def test_without_users_the_base_station_beacons_on(network):
+    watch = network.watch
+    before = len(watch.heard[m.Beacon])
+    watch.until(lambda: beacons_in_a_row(watch, before), 'beacon after beacon')
+    attempts = [beacon.attempt for beacon in watch.heard[m.Beacon][-4:]]
+    assert attempts == list(range(attempts[0], attempts[0] + 4))
+    assert not watch.of_cycle(m.Grant, watch.heard[m.Beacon][-1].cycle_id)
+
+
+@pytest.fixture(scope='module')
+def cycles(network, make_processes):
+    """All messages of some served cycles of one user, by kind."""
+    watch = network.watch
+    with make_processes() as processes:
+        start_user(processes, 1)
+        # The user sends before the others have discovered all of its topics.
+        watch.until(lambda: any(is_whole(watch, end.cycle_id) for end in watch.served),
+                    'a cycle that is seen whole')
+        ends = watch.until_served(5)
+        numbers = [end.cycle_id for end in ends]
+        # The end of a cycle may overtake its other messages.
+        watch.until(lambda: all(is_whole(watch, n) for n in numbers), 'the rest of the cycles')
+        heard = [{kind: watch.of_cycle(kind, n) for kind in watch.heard} for n in numbers]
+        places = [message.position for cycle in heard for message in cycle[m.PositionEstimate]]
+        poses = watch.until(lambda: poses_at(watch.poses, places), 'the poses')
+    return types.SimpleNamespace(heard=heard, poses=poses)
+
+
+def is_whole(watch, cycle_id):
+    """Whether watch and transmission have heard everything of a cycle."""
+    return (all(len(watch.of_cycle(kind, cycle_id)) == n for kind, n in WHOLE.items())
+            and math.isfinite(watch.of_cycle(m.Capacity, cycle_id)[0].actual_bps))
+
+
+def poses_at(poses, places):
+    """One pose for each of some places, or None if there is not one for each."""
+    found = [pose for place in places for pose in poses
+             if tuple(place) == position_of(pose)]
+    return found if len(found) == len(places) else None
+
+
+def position_of(pose):
+    point = pose.pose.pose.position
+    return point.x, point.y, point.z
+
+
+def test_all_messages_of_a_cycle_carry_its_user_and_codebook(cycles):
+    codebook = Codebook.load(default_codebook_file())
+    for heard in cycles.heard:
+        assert {kind: len(heard[kind]) for kind in WHOLE} == WHOLE
+        everything = [message for kind in WHOLE for message in heard[kind]]
+        assert {message.user for message in everything if hasattr(message, 'user')} == {1}
+        assert {message.codebook_id for message in everything
+                if hasattr(message, 'codebook_id')} == {codebook.id}
+        for message in everything:
+            check(message, SIZES)
+
+
+def test_the_phases_of_a_cycle_come_in_turn(cycles):
+    for heard in cycles.heard:
+        assert [(state.phase, state.outcome) for state in heard[m.ProtocolState]] == [
+            (m.Phase.POSITIONING, ''), (m.Phase.ESTIMATING, ''), (m.Phase.TRANSMITTING, ''),
+            (m.Phase.BEACONING, 'served')]
+
+
+def test_received_signals_are_the_combined_feed_signals_and_noise(cycles):
+    codebook = Codebook.load(default_codebook_file())
+    residuals = []
+    for heard in cycles.heard:
+        feeds = np.empty((2, 4, 8, 3), complex)
+        for message in heard[m.FeedSignals]:
+            feeds[message.band, message.frame] = message.signals
+        received, = heard[m.ReceivedSignals]
+        residuals.append(received.signals - receive_feeds(SCENARIO, codebook, feeds, None))
+    power = np.mean(np.abs(residuals)**2)
+    # 320 samples: the mean power lies within 20 % but for three chances in ten thousand.
+    assert power == pytest.approx(SCENARIO.noise_power_w, rel=0.2)
+
+
+def test_estimates_are_near_the_user(cycles):
+    low, high = SCENARIO.roi_bounds_m
+    errors = []
+    for heard in cycles.heard:
+        estimate, = heard[m.PositionEstimate]
+        truth, = heard[m.GroundTruth]
+        assert tuple(truth.position) == PLACES[1]
+        assert not truth.velocity.any()
+        assert ((low <= estimate.position) & (estimate.position <= high)).all()
+        assert np.linalg.eigvalsh(estimate.covariance_m2)[0] > 0
+        assert estimate.estimator == 'bayes'
+        assert 0 < estimate.crlb_m2 < 1
+        assert 0 < estimate.latency_s < 30
+        errors.append(np.linalg.norm(estimate.position - truth.position))
+    # Anywhere in the region would be 5 m away.
+    assert np.median(errors) < 2.5
+
+
+def test_poses_are_the_estimates(cycles):
+    assert len(cycles.poses) == len(cycles.heard)
+    for pose, heard in zip(cycles.poses, cycles.heard, strict=True):
+        estimate, = heard[m.PositionEstimate]
+        assert position_of(pose) == tuple(estimate.position)
+        covariance = np.reshape(pose.pose.covariance, (6, 6))
+        np.testing.assert_array_equal(covariance[:3, :3], estimate.covariance_m2)
+        assert pose.header.frame_id == 'map'
+        assert pose.header.stamp.sec > 0
+
+
+def test_the_capacity_is_what_the_beam_carries(cycles):
+    for heard in cycles.heard:
+        report, beam = heard[m.Capacity][0], heard[m.Beam][0]
+        assert report.expected_bps == beam.expected_bps
+        assert 0 < report.actual_bps
+        assert report.loss_bps == report.perfect_bps - report.actual_bps
+        assert report.loss_percent == pytest.approx(100 * report.loss_bps / report.perfect_bps)
+        # The search for the best beam may end a little below another beam.
+        assert report.loss_percent > -1
+        for direction in m.Direction:
+            offered, delivered = (
+                next(data for data in heard[m.Data]
+                     if (data.direction, data.stage) == (direction, stage)) for stage in m.Stage)
+            assert 0 < delivered.bits <= min(
+                offered.bits, report.actual_bps * delivered.duration_s)
+            assert offered.bits <= report.expected_bps * offered.duration_s
+
+
+def test_who_joins_later_is_served_and_both_in_turn(network, join):
+    watch = network.watch
+    join(1)
+    watch.until_served(2, user=1)
+    late = join(2)
+    watch.until_served(2, user=2, processes=[late])
+    turns = collections.Counter(end.user for end in watch.until_served(8))
+    assert set(turns) == {1, 2}
+    assert min(turns.values()) >= 2
+    # Each is found at its own place.
+    for user in (1, 2):
+        places = [estimate.position for estimate in watch.heard[m.PositionEstimate]
+                  if estimate.user == user][-4:]
+        distances = [math.dist(place, PLACES[user]) for place in places]
+        assert np.median(distances) < 3.5
+
+
+def test_a_user_that_dies_in_its_cycle_is_served_after_its_restart(network, join):
+    watch = network.watch
+    victim = join(3)
+    watch.until_served(user=3, processes=[victim])
+    watch.hooks[m.Grant] = lambda grant: victim.signal(signal.SIGKILL)
+    watch.until(lambda: not victim.running, 'the end of the user')
+    assert victim.wait() == -signal.SIGKILL
+    del watch.hooks[m.Grant]
+    before = len(watch.heard[m.Beacon])
+    watch.until(lambda: beacons_in_a_row(watch, before), 'beacon after beacon',
+                network.running.values())
+    assert watch.given_up[-1].user == 3
+    watch.until_served(2, user=3, processes=[join(3)])
+
+
+@pytest.mark.parametrize('names', [
+    ('bs',), ('channel', 'positioner', 'rhs_controller', 'transmission', 'optimizer')],
+    ids=lambda names: '+'.join(names))
+def test_cycles_go_on_after_nodes_die_and_are_restarted(network, module_processes, join, names):
+    watch, running = network.watch, network.running
+    join(1)
+    watch.until_served(user=1)
+    for name in names:
+        running[name].signal(signal.SIGKILL)
+    for name in names:
+        assert running[name].wait() == -signal.SIGKILL
+        running[name] = module_processes.start(name, **BASE[name])
+    before = len(watch.heard[m.Beacon])
+    watch.until(lambda: len(watch.heard[m.Beacon]) > before, 'beacons', running.values())
+    watch.until_served(3, user=1, processes=running.values())
+
+
+def not_finite(message):
+    return not np.isfinite(message.signals).all()
+
+
+def test_nothing_wrong_comes_of_nan(network, join):
+    """A rogue sends NaN for the very cycle that runs."""
+    watch, running = network.watch, network.running
+    codebook = Codebook.load(default_codebook_file())
+    feeds, received = watch.outlet(m.FeedSignals), watch.outlet(m.ReceivedSignals)
+    sent = collections.Counter()
+
+    def spoil(request):
+        for frame in range(request.n_frames):
+            signals = np.full((8, 3), complex(math.nan, 0))
+            feeds.publish(convert.to_ros(m.FeedSignals(
+                request.cycle_id, request.user, request.band, frame, signals), None))
+        stamp = watch.node.get_clock().now().to_msg()
+        signals = np.full((2, 8, 4), complex(0, math.inf))
+        received.publish(convert.to_ros(m.ReceivedSignals(
+            request.cycle_id, request.user, codebook.id, signals), stamp))
+        sent.update({m.FeedSignals: request.n_frames, m.ReceivedSignals: 1})
+
+    since = {kind: len(messages) for kind, messages in watch.heard.items()}
+    watch.hooks[m.PilotRequest] = spoil
+    join(2)
+    watch.until_served(3, user=2, processes=running.values())
+    del watch.hooks[m.PilotRequest]
+    watch.until(lambda: all(sum(map(not_finite, watch.heard[kind][since[kind]:])) == n
+                            for kind, n in sent.items()), 'what the rogue sent')
+    assert sent[m.FeedSignals] >= 24
+    assert 'dropped: FeedSignals.signals: not finite' in running['bs'].log
+    assert 'dropped: ReceivedSignals.signals: not finite' in running['positioner'].log
+    for kind in watch.heard:
+        if kind not in sent:
+            for message in watch.heard[kind][since[kind]:]:
+                check(message, SIZES)
+    # One line for each, however often.
+    assert running['bs'].log.count('dropped: ') == 1
+    assert running['positioner'].log.count('dropped: ') == 1
+
+
+def test_a_restarted_optimizer_with_another_codebook_is_followed(
+        processes, make_watch, small_files):
+    watch = make_watch('/restart')
+    codebooks = {name: Codebook.load(small_files / f'{name}.yaml')
+                 for name in ('first', 'second')}
+    got = []
+    CodebookSource(watch.node, Scenario.from_yaml(small_files / 'scenario.yaml'), got.append)
+    for name, codebook in codebooks.items():
+        process = processes.start(
+            'optimizer', namespace='/restart', scenario_file=small_files / 'scenario.yaml',
+            codebook_file=small_files / f'{name}.yaml')
+        watch.until(lambda codebook=codebook: got and got[-1].id == codebook.id,
+                    f'the {name} codebook', [process])
+        process.signal(signal.SIGINT)
+        assert process.wait() == 0
+    assert [codebook.id for codebook in got] == [
+        codebook.id for codebook in codebooks.values()]

@@ -1,0 +1,148 @@
+"""The template table and the search on it."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from rhs_isac_ros.model import Scenario, mean_received, simulate_received
+from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.positioning.polar import to_polar
+from rhs_isac_ros.positioning.table import (
+    DIRECTION_STEP,
+    RANGE_CELL_M,
+    TemplateTable,
+    separate,
+)
+from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+
+@pytest.fixture(scope='module')
+def scenario() -> Scenario:
+    """Two bands, and a region away from the axis, of 5 m range."""
+    return Scenario(
+        center_frequencies_hz=(2.4e9, 3.1e9), n_subbands=2, n_frames=4, elements_per_side=5,
+        roi_center_m=(5, 1, 0.5), roi_size_m=(4, 4, 2))
+
+
+@pytest.fixture(scope='module')
+def model(scenario, random_beams) -> WhitenedModel:
+    return WhitenedModel(scenario, random_beams(scenario, np.random.default_rng(0)))
+
+
+@pytest.fixture(scope='module')
+def table(model) -> TemplateTable:
+    return TemplateTable(model)
+
+
+def test_range_steps_resolve_the_shortest_wavelength(scenario, table):
+    quarter = 299_792_458 / 3.1e9 / 4
+    offsets = table.range_offsets_m
+    assert np.diff(offsets).max() <= quarter
+    # From one cell's last step to the next one's first.
+    assert RANGE_CELL_M - (offsets[-1] - offsets[0]) <= quarter
+    ranges = np.unique(table.points[:, 0])
+    np.testing.assert_allclose(np.diff(ranges), RANGE_CELL_M)
+
+
+@pytest.mark.parametrize('region', [
+    {'roi_center_m': (5, 1, 0.5), 'roi_size_m': (4, 4, 2)},
+    {},
+    # Wide angles: a step of direction spans much depth there.
+    {'roi_center_m': (3, 0, 0), 'roi_size_m': (5, 14, 6)},
+    # So near that ranges reach almost zero.
+    {'roi_center_m': (1, 0, 0), 'roi_size_m': (1.9, 2, 2)},
+], ids=['small', 'Table I', 'wide', 'near'])
+def test_grid_covers_the_region(region, random_beams):
+    """Every position has a grid point within half a step in range and direction."""
+    scenario = Scenario(n_subbands=1, n_frames=2, elements_per_side=2, **region)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    points = TemplateTable(WhitenedModel(scenario, codebook)).points
+    steps = np.array([RANGE_CELL_M, DIRECTION_STEP, DIRECTION_STEP])
+    wanted = to_polar(scenario.sample_positions(4000, np.random.default_rng(1))) / steps
+    distance, _ = cKDTree(points / steps).query(wanted, p=np.inf)
+    # At the rim of the half space and at the range 0 the grid is not regular.
+    assert distance.max() < 0.76
+    assert np.mean(distance < 0.5 + 1e-9) > 0.98
+
+
+def exact_log_likelihood(plain, model, received, points):
+    """Log-likelihood of unwhitened signals at polar points, by the plain model."""
+    scenario, codebook = model.scenario, model.codebook
+    p = plain(scenario, codebook.analog, codebook.digital)
+    spatial = multipath_covariance(scenario)
+    distance, u, v = points.T
+    positions = np.stack([distance * np.sqrt(1 - u**2 - v**2), distance * u, distance * v], axis=1)
+    likelihood = energy = 0.0
+    for band in range(scenario.n_bands):
+        mean = p.mean(positions, band)
+        weighed = np.linalg.solve(p.covariance(band, spatial[band]), mean.T).T
+        likelihood = likelihood + 2 * (weighed.conj() @ received[band]).real
+        energy = energy + np.sum(mean.conj() * weighed, axis=1).real
+    return likelihood - energy, energy
+
+
+def test_log_likelihood_is_the_exact_one(scenario, model, table, plain):
+    rng = np.random.default_rng(2)
+    received = simulate_received(
+        scenario, model.codebook, scenario.sample_positions(1, rng), rng)[0]
+    likelihood = table.log_likelihood(model.whiten(received[None])[0])
+    assert likelihood.shape == (len(table.points), len(table.range_offsets_m))
+    cells = rng.integers(len(table.points), size=300)
+    middle = np.abs(table.range_offsets_m).argmin()
+    strength = np.sum(np.abs(model.whiten(received[None]))**2)
+    for fine in (middle, 0, len(table.range_offsets_m) - 1):
+        offset = table.range_offsets_m[fine]
+        points = table.points[cells] + [offset, 0, 0]
+        exact, energy = exact_log_likelihood(plain, model, received, points)
+        # Off the middle the envelope lags: its amplitude falls as 1 / r, and the sub-bands turn.
+        relative = 1e-5 + 1.5 * abs(offset) / points[:, 0]
+        slack = relative * (2 * np.sqrt(strength * energy) + energy)
+        assert (np.abs(likelihood[cells, fine] - exact) < slack).all()
+
+
+def test_modes_hold_the_true_position(scenario, model, table):
+    """For signals without noise the true position is a mode, to one Gauss-Newton step."""
+    positions = scenario.sample_positions(20, np.random.default_rng(3))
+    whitened = model.whiten(mean_received(scenario, model.codebook, positions))
+    for point, y in zip(to_polar(positions), whitened, strict=True):
+        modes = table.modes(y, 30, 10.0)
+        assert 1 <= len(modes) <= 30
+        distances = np.abs(modes - point) / [0.002, 0.02, 0.02]
+        assert distances.max(axis=1).min() < 1
+
+
+def test_modes_are_sorted_separate_and_within_depth(scenario, model, table, plain):
+    rng = np.random.default_rng(4)
+    received = simulate_received(
+        scenario, model.codebook, scenario.sample_positions(1, rng), rng)[0]
+    y = model.whiten(received[None])[0]
+    many, few, shallow, deep = (
+        table.modes(y, n, depth) for n, depth in ((30, 8.0), (3, 8.0), (30, 0.0), (1000, 30.0)))
+    assert 3 < len(many)
+    assert len(shallow) < len(many) < len(deep)
+    np.testing.assert_array_equal(few, many[:3])
+    np.testing.assert_array_equal(shallow, many[:len(shallow)])
+    np.testing.assert_array_equal(many, deep[:len(many)])
+    scale = np.array([0.3 * 299_792_458 / 3.1e9, 0.05, 0.05])
+    for n, point in enumerate(many):
+        assert all((np.abs(point - other) >= scale).any() for other in many[:n])
+    exact, energy = exact_log_likelihood(plain, model, received, many)
+    # The table is good to one Gauss-Newton step and some share of the energy.
+    slack = 4 + 0.05 * energy.max()
+    assert exact[0] > exact.max() - slack
+    assert exact.min() > exact.max() - 8 - slack
+
+
+def test_separate_is_first_come_first_served():
+    points = np.random.default_rng(5).uniform(0, 4, (200, 3))
+    kept = []
+    for n, point in enumerate(points):
+        if all(max(abs(point - points[k])) >= 1 for k in kept):
+            kept.append(n)
+    assert list(separate(points, 1000)) == kept
+    assert list(separate(points, 7)) == kept[:7]
+    assert len(kept) > 7
+
+
+def test_separate_takes_no_points():
+    assert list(separate(np.zeros((0, 3)), 5)) == []

@@ -1,0 +1,70 @@
+"""The whitened model."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+
+@pytest.fixture(scope='module')
+def model(case) -> WhitenedModel:
+    return WhitenedModel(case.scenario, case.codebook)
+
+
+def test_whitening_makes_the_vectors_covariance_the_identity(case, model):
+    """Whitens the columns of a square root of the covariance, one as a signal each."""
+    n_bands, n_rows = case.vectors['cov'].shape[:2]
+    roots = np.linalg.cholesky(case.vectors['cov'])
+    columns = np.moveaxis(roots, 2, 0)
+    white = model.whiten(columns)
+    assert white.shape == (n_rows, n_bands, n_rows)
+    for band in range(n_bands):
+        root = white[:, band].T
+        np.testing.assert_allclose(root @ root.conj().T, np.eye(n_rows), atol=1e-8)
+
+
+def test_whitened_means_have_the_vectors_products(case, model):
+    """Between any two positions: t1^H t2 is the sum of mu1^H Lambda^-1 mu2 over the bands."""
+    t = model.mean(case.vectors['positions'])
+    products = np.einsum('air,bir->ab', t.conj(), t)
+    expected = sum(mean.conj() @ np.linalg.solve(covariance, mean.T) for mean, covariance
+                   in zip(case.vectors['mean'], case.vectors['cov'], strict=True))
+    np.testing.assert_allclose(products, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+def test_log_likelihood_of_whitened_signals_is_the_gaussian_one(case, model):
+    """The density of the unwhitened signals, up to what no position changes."""
+    rng = np.random.default_rng(0)
+    n_bands, n_rows = case.vectors['cov'].shape[:2]
+    noise = 1e-7 * rng.normal(size=(n_bands, n_rows, 2)) @ [1, 1j]
+    received = case.vectors['mean'][:, 0] + noise
+    exact = 0.0
+    for y, means, covariance in zip(
+            received, case.vectors['mean'], case.vectors['cov'], strict=True):
+        residual = (y - means).T
+        weighed = np.linalg.solve(covariance, residual)
+        exact = exact - np.sum(residual.conj() * weighed, axis=0).real
+    y, t = model.whiten(received[None])[0], model.mean(case.vectors['positions'])
+    likelihood = np.sum(2 * (t.conj() * y).real - np.abs(t)**2, axis=(1, 2))
+    np.testing.assert_allclose(
+        likelihood - likelihood[0], exact - exact[0], rtol=1e-6, atol=1e-6 * np.abs(exact).max())
+
+
+def test_derivative_is_the_limit_of_differences(case, model):
+    positions, step = case.vectors['positions'], 1e-5
+    mean, derivative = model.mean_and_derivative(positions)
+    np.testing.assert_allclose(mean, model.mean(positions), rtol=1e-9, atol=1e-9)
+    assert derivative.shape == (len(positions), 3, *mean.shape[1:])
+    for u in range(3):
+        shift = step * np.eye(3)[u]
+        difference = (model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
+        np.testing.assert_allclose(
+            derivative[:, u], difference, rtol=0, atol=1e-7 * np.abs(derivative).max())
+
+
+def test_a_codebook_that_does_not_fit_is_an_error(small):
+    with pytest.raises(CodebookError, match='analog: shape'):
+        WhitenedModel(dataclasses.replace(small.scenario, elements_per_side=3), small.codebook)

@@ -1,0 +1,140 @@
+"""A new codebook holds from the next cycle on, and no cycle mixes two."""
+
+import pytest
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.bs_table import State
+
+IN_A_CYCLE = [State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING,
+              State.STEERING, State.TRANSMITTING]
+WITH_ID = (m.RhsCommand, m.RhsConfiguration, m.ReceivedSignals, m.PositionEstimate, m.Beam,
+           m.Capacity)
+
+
+def ids(network, cycle_id):
+    """Which codebooks the messages of a cycle name."""
+    found = [message for kind in WITH_ID for message in network.sent(kind, cycle_id=cycle_id)]
+    assert {type(message) for message in found} == set(WITH_ID)
+    return {message.codebook_id for message in found}
+
+
+@pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING], ids=lambda state: state.value)
+def test_a_codebook_holds_from_the_next_cycle_on(network, codebooks, state):
+    net = network(2)
+    net.run_cycles(2)
+    net.run_to(state)
+    net.offer(codebooks[1])
+    net.run_cycles(3)
+    assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
+    first = 3 if state is State.RESTING else 4
+    for cycle_id in range(1, 6):
+        assert ids(net, cycle_id) == {codebooks[cycle_id >= first].id}
+    assert not any('wrong' in reason for c in net.counters().values() for reason in c)
+    net.verify()
+
+
+@pytest.mark.parametrize('state', IN_A_CYCLE, ids=lambda state: state.value)
+def test_of_two_codebooks_in_one_cycle_the_last_holds(network, codebooks, state):
+    net = network()
+    net.run_cycles(1)
+    net.run_to(state)
+    net.offer(codebooks[1])
+    net.offer(codebooks[2])
+    net.run_cycles(2)
+    assert net.served() == [1, 1, 1]
+    assert [ids(net, cycle_id) for cycle_id in (1, 2, 3)] == [
+        {codebooks[0].id}, {codebooks[0].id}, {codebooks[2].id}]
+    net.verify()
+
+
+def test_codebooks_change_again_and_again(network, codebooks):
+    net = network(2)
+    for turn in range(12):
+        net.run_to(State.SOUNDING)
+        net.offer(codebooks[turn % 3])
+        net.run_cycles(1)
+    assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 12
+    expected = [{codebooks[max(turn - 1, 0) % 3].id} for turn in range(12)]
+    assert [ids(net, cycle_id) for cycle_id in range(1, 13)] == expected
+    net.verify()
+
+
+def test_the_codebook_in_use_may_come_back(network, codebooks):
+    net = network()
+    net.run_cycles(1)
+    net.run_to(State.SOUNDING)
+    net.offer(codebooks[1])
+    net.offer(codebooks[0])
+    net.run_cycles(2)
+    assert net.served() == [1, 1, 1]
+    assert {i for cycle_id in (1, 2, 3) for i in ids(net, cycle_id)} == {codebooks[0].id}
+
+
+@pytest.mark.parametrize('role', ['rhs_controller', 'positioner', 'transmission'])
+def test_a_role_that_has_the_new_codebook_late_costs_one_cycle(network, codebooks, role):
+    reasons = {'rhs_controller': 'rhs_silent', 'positioner': 'positioner_silent',
+               'transmission': 'transmission_silent'}
+    net = network()
+    net.run_cycles(1)
+    handle = net[role].handle
+    net[role].handle = lambda event, now_s: []
+    net.offer(codebooks[1])
+    net[role].handle = handle
+    net.run_cycles(1)
+    assert net.outcomes()[1:] == [(2, 1, reasons[role])]
+    assert net[role].counters == {'wrong_codebook': 1}
+    net.offer(codebooks[1])
+    net.run_cycles(1)
+    assert net.outcomes()[2:] == [(3, 1, 'served')]
+    net.verify()
+
+
+def test_the_base_station_waits_for_a_codebook(network, codebooks, scenario):
+    net = network(codebook=None)
+    net.run(limit_s=10.0)
+    assert net.said('bs') == ['waiting for codebook']
+    assert net.sent(m.Beacon) == []
+    net.offer(codebooks[1])
+    net.run_cycles(1)
+    assert net.served() == [1]
+    assert ids(net, 1) == {codebooks[1].id}
+
+
+def test_without_role_and_codebook_both_are_named(network):
+    net = network(codebook=None, absent=['channel'])
+    assert net.said('bs') == ['waiting for channel, codebook']
+    net.add('channel')
+    assert net.said('bs')[1:] == ['waiting for codebook']
+
+
+def test_the_positioner_tells_when_it_is_ready(network, codebooks):
+    net = network()
+    net.offer(codebooks[1])
+    net.offer(codebooks[1])
+    assert net.said('positioner') == [
+        f'centre is ready for codebook {c.id} after 0.0 s' for c in codebooks[:2]]
+
+
+def test_a_codebook_offered_before_anybody_was_served_costs_nothing(network, codebooks, places):
+    """Beaconing to an empty network may last for hours, and a codebook be loaded meanwhile."""
+    net = network(0)
+    net.run(limit_s=1.0)
+    net.offer(codebooks[1])
+    net.run(limit_s=1.0)
+    net.add_user(1, places[0])
+    net.run_cycles(2)
+    assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'served')]
+    assert ids(net, 1) == ids(net, 2) == {codebooks[1].id}
+    net.verify()
+
+
+def test_a_codebook_offered_twice_while_beaconing_costs_nothing(network, codebooks):
+    net = network()
+    net.run_cycles(1)
+    net.offer(codebooks[1])
+    net.run_to(State.BEACONING)
+    net.offer(codebooks[2])
+    net.run_cycles(2)
+    assert net.outcomes()[1:] == [(2, 1, 'served'), (3, 1, 'served')]
+    net.verify()
+

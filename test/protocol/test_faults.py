@@ -1,0 +1,551 @@
+"""Every fault has a transition, a counter and a way back to beaconing."""
+
+import collections
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import mobility
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol import user as user_role
+from rhs_isac_ros.protocol.bs_table import State
+from rhs_isac_ros.protocol.events import PeersChanged
+
+POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
+DOWN = {'direction': m.Direction.DOWNLINK}
+UP = {'direction': m.Direction.UPLINK}
+OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
+
+# What follows if the first message of a kind does not reach one that listens to it: outcome of
+# the cycle and counters besides it, by role. The user notices at the next beacon or by itself.
+LOST = [
+    (m.Beacon, {}, 'user1', 'served', {'bs': {'unanswered': 1}}),
+    (m.Ack, {}, 'bs', 'served', {'bs': {'unanswered': 1}}),
+    (m.Grant, {}, 'user1', 'served', {}),
+    (m.GroundTruth, {}, 'channel', 'user_gone', {}),
+    (m.GroundTruth, {}, 'transmission', 'served', {}),
+    (m.RhsCommand, {}, 'rhs_controller', 'rhs_silent', {}),
+    (m.RhsConfiguration, {'mode': POSITIONING}, 'bs', 'rhs_silent', {}),
+    (m.RhsConfiguration, {'mode': POSITIONING}, 'channel', 'user_gone', {}),
+    (m.RhsConfiguration, {'mode': POSITIONING}, 'transmission', 'served', {}),
+    (m.RhsConfiguration, {'mode': POSITIONING, 'band': 1}, 'bs', 'rhs_silent', {}),
+    (m.PilotRequest, {}, 'user1', 'user_gone', {}),
+    (m.PilotRequest, {'band': 1}, 'user1', 'user_gone', {}),
+    (m.Pilot, {}, 'channel', 'user_gone', {}),
+    (m.Pilot, {'band': 1, 'frame': 1}, 'channel', 'user_gone', {}),
+    (m.FeedSignals, {}, 'bs', 'user_gone', {}),
+    (m.FeedSignals, {'band': 1, 'frame': 1}, 'bs', 'user_gone', {}),
+    (m.ReceivedSignals, {}, 'positioner', 'positioner_silent', {}),
+    (m.PositionEstimate, {}, 'bs', 'served', {}),
+    (m.PositionEstimate, {}, 'transmission', 'transmission_silent', {}),
+    (m.Beam, {}, 'bs', 'transmission_silent', {}),
+    (m.Beam, {}, 'rhs_controller', 'transmission_silent', {}),
+    (m.Beam, {}, 'channel', 'data_lost', {}),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', 'transmission_silent', {}),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'channel', 'data_lost', {}),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'transmission', 'served', {}),
+    (m.Data, DOWN | OFFERED, 'channel', 'data_lost', {}),
+    (m.Data, DOWN | DELIVERED, 'user1', 'data_lost', {}),
+    (m.Data, DOWN | DELIVERED, 'bs', 'served', {}),
+    (m.Data, UP | OFFERED, 'channel', 'data_lost', {}),
+    (m.Data, UP | DELIVERED, 'bs', 'data_lost', {}),
+    (m.Data, UP | DELIVERED, 'user1', 'served', {}),
+]
+IDS = [f'{kind.__name__}-{"-".join(map(str, fields.values()))}-{recipient}'
+       for kind, fields, recipient, _, _ in LOST]
+
+
+def matches(message, kind, fields):
+    return isinstance(message, kind) and all(
+        getattr(message, name) == value for name, value in fields.items())
+
+
+class LosesFirst:
+    """Loses the first message of a kind on its way to one recipient, or to all."""
+
+    def __init__(self, kind, fields, recipient=''):
+        self.kind, self.fields, self.recipient = kind, fields, recipient
+        self.lost = None
+
+    def __call__(self, message, recipient):
+        if matches(message, self.kind, self.fields) and recipient.startswith(self.recipient):
+            self.lost = self.lost or message
+            if message is self.lost:
+                return []
+        return [(1e-3, message)]
+
+
+class Adds:
+    """Puts an altered copy after, or before, the first message of a kind to a recipient."""
+
+    def __init__(self, kind, fields, recipient, alter, before=False):
+        self.kind, self.fields, self.recipient = kind, fields, recipient
+        self.alter, self.before, self.done = alter, before, False
+
+    def __call__(self, message, recipient):
+        arriving = [(1e-3, message)]
+        if not self.done and recipient == self.recipient and matches(
+                message, self.kind, self.fields):
+            self.done = True
+            arriving.insert(0 if self.before else 1, (1e-3, self.alter(message)))
+        return arriving
+
+
+def counted(network, role, without=()):
+    counts = dict(network.counters().get(role, {}))
+    return {reason: n for reason, n in counts.items() if reason not in without}
+
+
+@pytest.mark.parametrize(('kind', 'fields', 'recipient', 'outcome', 'besides'), LOST, ids=IDS)
+def test_one_lost_message_ends_one_cycle_at_most(
+        network, kind, fields, recipient, outcome, besides):
+    net = network(transport=LosesFirst(kind, fields, recipient))
+    net.run_cycles(1)
+    assert net.transport.lost is not None
+    assert net.outcomes() == [(1, 1, outcome)]
+    reason = {} if outcome == 'served' else {outcome: 1}
+    assert counted(net, 'bs') == reason | besides.get('bs', {})
+    assert net.counters().keys() <= {'bs', 'user1'}
+    net.run_cycles(3)
+    assert [o for _, _, o in net.outcomes()[1:]] == ['served'] * 3
+    assert counted(net, 'user1', ('abandoned', 'bs_silent', 'not_granted')) == besides.get(
+        'user1', {})
+    net.verify()
+
+
+def test_every_subscription_is_among_the_lost_messages(subscriptions):
+    lost = {(kind, recipient.rstrip('1')) for kind, _, recipient, _, _ in LOST}
+    assert lost == {(kind, role) for role, kinds in subscriptions.items() for kind in kinds}
+
+
+@pytest.mark.parametrize('kind', [
+    m.Beacon, m.Ack, m.Grant, m.GroundTruth, m.RhsCommand, m.RhsConfiguration, m.PilotRequest,
+    m.Pilot, m.FeedSignals, m.ReceivedSignals, m.PositionEstimate, m.Beam, m.Data],
+    ids=lambda kind: kind.__name__)
+def test_a_message_lost_for_everybody_ends_one_cycle_at_most(network, kind):
+    net = network(2, transport=LosesFirst(kind, {}))
+    net.run_cycles(5)
+    outcomes = [outcome for _, _, outcome in net.outcomes()]
+    assert outcomes.count('served') >= 4
+    assert set(net.served()) == {1, 2}
+    net.verify()
+
+
+def test_a_cycle_that_is_given_up_is_told(network):
+    net = network(transport=LosesFirst(m.ReceivedSignals, {}))
+    net.run_cycles(1)
+    warnings = [s.note.text for s in net.notes if s.speaker == 'bs' and s.note.warning]
+    assert warnings == ['cycle 1: user 1 given up: positioner_silent']
+    (last,) = net.sent(m.ProtocolState, phase=m.Phase.BEACONING)
+    assert (last.cycle_id, last.user, last.outcome) == (1, 1, 'positioner_silent')
+    assert net['bs'].state is State.RESTING
+    net.run_to(State.BEACONING)
+    assert net.sent(m.Beacon)[-1].cycle_id == 2
+
+
+def test_a_lost_truth_leaves_the_capacities_unknown(network):
+    net = network(transport=LosesFirst(m.GroundTruth, {}, 'transmission'))
+    net.run_cycles(2)
+    first, second = net.sent(m.Capacity)
+    assert first.expected_bps > 0
+    assert np.isnan([first.actual_bps, first.perfect_bps, first.loss_bps,
+                     first.loss_percent]).all()
+    assert second.actual_bps > 0
+
+
+def test_a_grant_that_does_not_come_is_counted(network):
+    net = network()
+    net.run_to(user_role.State.ACKNOWLEDGED, 'user1')
+    net.remove('bs', noticed=False)
+    net.run_to(user_role.State.LISTENING, 'user1')
+    assert net['user1'].counters == {'not_granted': 1}
+
+
+def test_a_base_station_that_falls_silent_is_counted(network):
+    net = network()
+    net.run_to(user_role.State.GRANTED, 'user1')
+    net.remove('bs', noticed=False)
+    net.run_to(user_role.State.LISTENING, 'user1')
+    assert net['user1'].counters == {'bs_silent': 1}
+
+
+def replace(**changes):
+    def alter(message):
+        shift = changes.get('cycle_id', 0)
+        arrays = {f.name: 0.5 * getattr(message, f.name) for f in dataclasses.fields(message)
+                  if f.name in ('signals', 'analog', 'digital', 'position')}
+        fixed = {'cycle_id': message.cycle_id + shift}
+        return dataclasses.replace(message, **changes | fixed | arrays)
+    return alter
+
+
+# What does not belong to the cycle is dropped and counted; cycle_id is relative.
+WRONG = [
+    (m.Ack, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Ack, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
+    (m.Ack, {}, 'bs', {}, 'duplicate'),
+    (m.Ack, {}, 'bs', {'user': 2}, 'late_ack'),
+    (m.FeedSignals, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.FeedSignals, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
+    (m.FeedSignals, {}, 'bs', {'user': 2}, 'wrong_user'),
+    (m.FeedSignals, {}, 'bs', {'band': 1}, 'wrong_band'),
+    (m.FeedSignals, {'band': 1}, 'bs', {'band': 0}, 'wrong_band'),
+    (m.FeedSignals, {}, 'bs', {}, 'duplicate'),
+    (m.FeedSignals, {'frame': 1}, 'bs', {}, 'wrong_band'),
+    (m.FeedSignals, {'band': 1, 'frame': 1}, 'bs', {}, 'duplicate'),
+    (m.RhsConfiguration, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
+    (m.RhsConfiguration, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.RhsConfiguration, {}, 'bs', {'band': 1}, 'wrong_band'),
+    (m.RhsConfiguration, {}, 'bs', {}, 'unexpected_configured'),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {}, 'unexpected_beam_ready'),
+    (m.PositionEstimate, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.PositionEstimate, {}, 'bs', {'user': 2}, 'wrong_user'),
+    (m.PositionEstimate, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.Beam, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Beam, {}, 'bs', {'user': 2}, 'wrong_user'),
+    (m.Beam, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.Data, UP | DELIVERED, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Data, UP | DELIVERED, 'bs', {'user': 2}, 'wrong_user'),
+    (m.Grant, {}, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Grant, {}, 'user1', {}, ''),
+    (m.Grant, {}, 'user1', {'user': 2, 'cycle_id': -1}, ''),
+    (m.PilotRequest, {}, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.PilotRequest, {}, 'user1', {'user': 2}, ''),
+    (m.Data, DOWN | DELIVERED, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Data, DOWN | DELIVERED, 'user1', {'user': 2}, ''),
+    (m.RhsCommand, {}, 'rhs_controller', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.Beam, {}, 'rhs_controller', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Beam, {}, 'rhs_controller', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.RhsConfiguration, {}, 'channel', {'cycle_id': -1}, ''),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'channel', {'cycle_id': 1}, ''),
+    (m.Pilot, {}, 'channel', {'cycle_id': -1}, 'stale'),
+    (m.Pilot, {}, 'channel', {'user': 2}, 'wrong_user'),
+    (m.Beam, {}, 'channel', {'cycle_id': -1}, ''),
+    (m.Beam, {}, 'channel', {'user': 2}, ''),
+    (m.Data, DOWN | OFFERED, 'channel', {'cycle_id': -1}, 'stale'),
+    (m.Data, UP | OFFERED, 'channel', {'user': 2}, 'wrong_user'),
+    (m.ReceivedSignals, {}, 'positioner', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.PositionEstimate, {}, 'transmission', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'transmission', {'cycle_id': -1},
+     'wrong_cycle'),
+]
+# What would be valid by itself comes after the real message only.
+WRONG_CASES = [(*case, before) for case in WRONG for before in (False, True)
+               if not before or case[3] and case[4] != 'late_ack']
+WRONG_IDS = ['-'.join([kind.__name__, *map(str, fields.values()), recipient,
+                       *(f'{k}={v}' for k, v in changes.items()),
+                       'before' if before else 'after'])
+             for kind, fields, recipient, changes, _, before in WRONG_CASES]
+
+
+@pytest.mark.parametrize(
+    ('kind', 'fields', 'recipient', 'changes', 'counter', 'before'), WRONG_CASES, ids=WRONG_IDS)
+def test_what_does_not_belong_is_dropped_and_counted(
+        network, places, kind, fields, recipient, changes, counter, before):
+    """The cycle goes on as if the altered copy, whose content is another, had never come."""
+    net = network(
+        transport=Adds(kind, fields, recipient, replace(**changes), before), seed=5)
+    plain = network(seed=5)
+    for other in (net, plain):
+        other.run_cycles(2)
+    assert net.transport.done
+    assert net.outcomes() == plain.outcomes() == [(1, 1, 'served'), (2, 1, 'served')]
+    net.run(limit_s=0.05)
+    assert net.counters() == ({recipient: {counter: 1}} if counter else {})
+    net.verify()
+    for kind, field in ((m.ReceivedSignals, 'signals'), (m.PositionEstimate, 'position'),
+                        (m.Beam, 'analog'), (m.Capacity, 'actual_bps'), (m.Data, 'bits')):
+        for a, b in zip(net.sent(kind), plain.sent(kind), strict=True):
+            np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    for kind in (m.Grant, m.RhsCommand, m.RhsConfiguration, m.Pilot, m.FeedSignals, m.Data):
+        assert len(net.sent(kind)) == len(plain.sent(kind))
+
+
+def test_a_doubled_beacon_is_answered_twice_and_counts_once(network):
+    net = network(transport=Adds(m.Beacon, {}, 'user1', replace()))
+    net.run_cycles(2)
+    assert net.served() == [1, 1]
+    assert net.counters() == {'bs': {'duplicate': 1}}
+    net.verify()
+
+
+def test_a_late_user_is_waited_for_in_the_next_cycle(network):
+    """The first answer ends the first cycle's beaconing; who comes later is known from then on."""
+    net = network(2)
+    net.run_cycles(1)
+    assert net.served() == [1]
+    assert net['bs'].counters == {'late_ack': 1}
+    net.run_cycles(4)
+    assert net.served() == [1, 1, 2, 1, 2]
+    assert net['bs'].counters == {'late_ack': 1}
+
+
+def test_one_complaint_for_a_codebook_that_the_surface_does_not_know(network, example):
+    net = network()
+    net.run_cycles(1)
+    for _ in range(3):
+        net.publish(example(m.RhsCommand, cycle_id=2, codebook_id='strange'))
+    net.run_cycles(1)
+    complaints = [text for text in net.said('rhs_controller') if 'strange' in text]
+    assert len(complaints) == 1
+    assert net['rhs_controller'].counters == {'wrong_codebook': 3}
+
+
+@pytest.mark.parametrize('kind', [m.Pilot, m.Beam, m.RhsConfiguration], ids=lambda k: k.__name__)
+def test_what_waits_for_nothing_does_not_pile_up(network, example, kind):
+    net = network()
+    net.run_cycles(1)
+    for n in range(300):
+        net.publish(example(kind, cycle_id=1000 + n))
+    net.run_cycles(3)
+    assert net.served() == [1] * 4
+    assert net['channel'].counters['overflow'] >= 300 - 256
+
+
+def beacon_to_grant_s(network, cycle_id):
+    times = {type(s.message): s.time_s for s in network.log
+             if s.message.cycle_id == cycle_id and isinstance(s.message, m.Beacon | m.Grant)}
+    return times[m.Grant] - times[m.Beacon]
+
+
+def test_a_user_that_is_gone_in_mid_positioning_is_not_waited_for(network):
+    net = network(2)
+    net.run_cycles(3)
+    net.run_to(State.SOUNDING)
+    assert net.sent(m.Grant)[-1].user == 1
+    net.remove('user1')
+    net.run_cycles(3)
+    assert net.outcomes()[3:] == [(4, 1, 'user_gone'), (5, 2, 'served'), (6, 2, 'served')]
+    assert net['bs'].counters['user_gone'] == 1
+    assert beacon_to_grant_s(net, 5) < 0.01
+    net.add('user1')
+    net.run_cycles(3)
+    assert net.served()[-3:].count(1) >= 1
+    net.verify()
+
+
+def test_a_user_that_leaves_between_cycles_is_waited_for_three_times(network):
+    net = network(2)
+    net.run_cycles(4)
+    net.remove('user2')
+    net.run_cycles(6)
+    assert net.served()[4:] == [1] * 6
+    waits = [beacon_to_grant_s(net, cycle_id) > 0.09 for cycle_id in range(5, 11)]
+    assert waits == [True] * 3 + [False] * 3
+
+
+def test_waiting_for_one_user_does_not_cost_the_other_its_cycle(network):
+    """The window for acks may be longer than a user waits for its grant."""
+    net = network(2, ack_timeout_s=3.0)
+    net.run_cycles(4)
+    net.remove('user2')
+    net.run_cycles(5)
+    assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
+    assert net['user1'].counters == {'not_granted': 3}
+
+
+@pytest.mark.parametrize('state', [State.ESTIMATING, State.STEERING, State.TRANSMITTING])
+def test_a_user_that_is_gone_after_positioning_loses_its_data_only(network, state):
+    net = network(2)
+    net.run_cycles(3)
+    net.run_to(state)
+    net.remove('user1')
+    net.run_cycles(2)
+    assert net.outcomes()[3:] == [(4, 1, 'data_lost'), (5, 2, 'served')]
+
+
+ROLE_FAULTS = [
+    ('rhs_controller', State.CONFIGURING, 'rhs_silent'),
+    ('rhs_controller', State.ESTIMATING, 'transmission_silent'),
+    ('channel', State.CONFIGURING, 'user_gone'),
+    ('channel', State.SOUNDING, 'user_gone'),
+    ('channel', State.ESTIMATING, 'data_lost'),
+    ('positioner', State.SOUNDING, 'positioner_silent'),
+    ('transmission', State.SOUNDING, 'transmission_silent'),
+]
+
+
+@pytest.mark.parametrize(('role', 'state', 'reason'), ROLE_FAULTS)
+@pytest.mark.parametrize('noticed', [True, False])
+def test_a_role_that_is_gone_is_timed_out_and_welcome_back(network, role, state, reason, noticed):
+    net = network()
+    net.run_cycles(1)
+    net.run_to(state)
+    gone_s = net.now_s
+    net.remove(role, noticed)
+    net.run_cycles(1)
+    assert net.outcomes()[-1] == (2, 1, reason)
+    assert net.now_s - gone_s < 1.1
+    assert net['bs'].counters == {reason: 1}
+    assert net['bs'].state is State.RESTING
+    net.run(limit_s=10.0)
+    if noticed:
+        assert net['bs'].state is State.WAITING
+        assert net['bs'].counters == {reason: 1}
+    else:
+        assert net['bs'].state is not State.WAITING
+        assert net['bs'].counters.total() > 5
+        assert net.served() == [1]
+    net.add(role)
+    net.run_cycles(3)
+    assert net.served()[-2:] == [1, 1]
+    net.verify()
+
+
+@pytest.mark.parametrize('role', ['rhs_controller', 'positioner', 'transmission', 'channel'])
+@pytest.mark.parametrize('state', [
+    State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
+    State.TRANSMITTING, State.RESTING])
+def test_a_role_that_restarts_costs_one_cycle_at_most(network, role, state):
+    net = network(2)
+    net.run_cycles(4)
+    net.run_to(state)
+    net.restart(role)
+    net.run_cycles(4)
+    outcomes = [outcome for _, _, outcome in net.outcomes()[4:]]
+    assert outcomes[1:] == ['served'] * 3
+    net.verify()
+
+
+@pytest.mark.parametrize('role', ['rhs_controller', 'channel', 'positioner', 'transmission'])
+def test_the_base_station_waits_for_a_role_and_says_so_once(network, role):
+    net = network(absent=[role])
+    net.run(limit_s=30.0)
+    assert net.sent(m.Beacon) == []
+    assert net['bs'].state is State.WAITING
+    assert net.said('bs') == [f'waiting for {role}']
+    net.add(role)
+    net.run_cycles(2)
+    assert net.served() == [1, 1]
+    assert net.said('bs') == [f'waiting for {role}']
+    assert net.counters() == {}
+
+
+def test_every_change_of_what_is_missing_is_said_once(network):
+    net = network(absent=['positioner', 'channel'])
+    net.run(limit_s=5.0)
+    net.add('channel')
+    net.run(limit_s=5.0)
+    net.remove('transmission')
+    net.run(limit_s=5.0)
+    net.add('positioner')
+    net.add('transmission')
+    assert net.said('bs') == [
+        'waiting for channel, positioner', 'waiting for positioner',
+        'waiting for positioner, transmission', 'waiting for transmission']
+    net.run_cycles(1)
+    net.remove('transmission')
+    net.run(limit_s=5.0)
+    assert net.said('bs')[4:] == ['waiting for transmission']
+
+
+def test_what_is_missing_is_not_said_again_for_news_that_change_nothing(network, codebooks):
+    net = network(absent=['positioner'])
+    for codebook in codebooks:
+        net.offer(codebook)
+        net.tell('bs', PeersChanged(('positioner',)))
+    assert net.said('bs') == ['waiting for positioner']
+
+
+def test_a_role_that_is_missing_for_a_moment_between_cycles_costs_nothing(network):
+    net = network()
+    net.run_cycles(1)
+    net.restart('positioner', noticed=True)
+    net.run_cycles(2)
+    assert net.served() == [1, 1, 1]
+    assert net.said('bs') == []
+
+
+def test_a_user_without_a_base_station_waits_and_says_so_once(network):
+    net = network(absent=['bs'])
+    net.run(limit_s=30.0)
+    assert net.said('user1') == ['waiting for bs']
+    assert net['user1'].state is user_role.State.ALONE
+    net.publish(m.Beacon(7, 0))
+    net.run(limit_s=1.0)
+    assert net.sent(m.Ack) == []
+    net.add('bs')
+    net.run_cycles(1)
+    assert net.served() == [1]
+    assert net.said('user1') == ['waiting for bs', 'listening for beacons']
+
+
+@pytest.mark.parametrize('noticed', [True, False])
+@pytest.mark.parametrize('cycles', [0, 3])
+@pytest.mark.parametrize('state', [
+    State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
+    State.TRANSMITTING, State.RESTING])
+def test_a_base_station_that_restarts_is_answered_again(network, state, cycles, noticed):
+    net = network(2)
+    net.run_cycles(cycles)
+    net.run_to(state)
+    net.restart('bs', noticed)
+    mark, n_ends = len(net.log), len(net.outcomes())
+    net.run_cycles(6)
+    ends = [(user, outcome) for _, user, outcome in net.outcomes()[n_ends:]]
+    assert {user for user, outcome in ends if outcome == 'served'} == {1, 2}
+    assert [outcome for _, outcome in ends[2:]] == ['served'] * 4
+    assert {ack.user for ack in net.sent(m.Ack, mark)} == {1, 2}
+    net.verify()
+
+
+@pytest.mark.parametrize('state', [State.SOUNDING, State.STEERING])
+def test_a_cycle_begun_again_takes_the_user_where_it_is_now(network, scenario, state):
+    """After a restart, the first cycle has the number of the one that was cut short."""
+    net = network({1: mobility.RandomWalk(scenario, 50.0, np.random.default_rng(0))})
+    net.run_to(state)
+    net.restart('bs')
+    net.run_cycles(2)
+    assert net.served() == [1, 1]
+    before, again, _ = net.sent(m.GroundTruth)
+    assert before.cycle_id == again.cycle_id == 1
+    assert np.linalg.norm(again.position - before.position) > 1
+    net.verify()
+
+
+def test_a_base_station_that_is_gone_leaves_the_users_alone(network):
+    net = network(2)
+    net.run_cycles(2)
+    net.run_to(State.SOUNDING)
+    net.remove('bs')
+    assert [net[u].state for u in ('user1', 'user2')] == [user_role.State.ALONE] * 2
+    net.run(limit_s=5.0)
+    assert net.said('user1')[-1] == 'waiting for bs'
+
+
+@pytest.mark.parametrize(('loss', 'seed'), [(0.05, 1), (0.2, 1), (0.2, 2)])
+def test_the_network_serves_on_while_messages_are_lost_at_random(network, noisy, loss, seed):
+    """At 20 % only one cycle in 200 gets all of its 24 messages through, but none is mixed up."""
+    net = network(2, transport=noisy(seed, loss=loss), step_timeout_s=0.1)
+    duration_s = 60.0 if loss < 0.1 else 300.0
+    for half in range(2):
+        before = len(net.served())
+        net.run(limit_s=duration_s / 2)
+        assert len(net.served()) > before, half
+    assert {user for _, user, _ in net.outcomes()} == {1, 2}
+    reasons = collections.Counter(outcome for _, _, outcome in net.outcomes())
+    assert reasons.keys() == {'served', 'rhs_silent', 'user_gone', 'positioner_silent',
+                              'transmission_silent', 'data_lost'}
+    assert {r: n for r, n in reasons.items() if r != 'served'} == {
+        r: n for r, n in net['bs'].counters.items() if r in reasons}
+    ends = [0.0, *(s.time_s for s in net.log
+                   if isinstance(s.message, m.ProtocolState) and s.message.outcome), net.now_s]
+    assert np.diff(ends).max() < 3.0
+    net.verify()
+    net.transport = lambda message, recipient: [(1e-3, message)]
+    net.run_cycles(2)
+    mark = len(net.outcomes())
+    net.run_cycles(4)
+    assert sorted(u for _, u, o in net.outcomes()[mark:] if o == 'served') == [1, 1, 2, 2]
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_nothing_is_mixed_while_messages_are_lost_doubled_and_overtaken(network, noisy, seed):
+    net = network(3, ordered=False, step_timeout_s=0.2, rest_s=0.0, transport=noisy(
+        seed, loss=0.03, doubles=0.2, jitter_s=0.01))
+    net.run(limit_s=30.0)
+    assert set(net.served()) == {1, 2, 3}
+    net.verify()

@@ -1,0 +1,179 @@
+"""Whom the base station knows, waits for and serves."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.protocol.roster import POLICIES, Roster
+
+
+@pytest.fixture
+def roster():
+    def make(policy='round_robin', seed=0):
+        return Roster(policy, np.random.default_rng(seed))
+    return make
+
+
+def cycle(roster, *users):
+    """One cycle in which these users answer, in this order."""
+    roster.open()
+    for user in users:
+        roster.answer(user)
+    return roster.select()
+
+
+def test_policies_are_the_three():
+    assert set(POLICIES) == {'round_robin', 'first', 'random'}
+
+
+def test_another_policy_is_an_error(roster):
+    with pytest.raises(ValueError, match=r"policy: 'last', expected one of \['round_robin'"):
+        roster('last')
+
+
+def test_round_robin_serves_who_was_served_longest_ago(roster):
+    r = roster()
+    assert [cycle(r, 3, 1, 2) for _ in range(6)] == [1, 2, 3, 1, 2, 3]
+    assert cycle(r, 2, 3) == 2
+    assert [cycle(r, 1, 2, 3) for _ in range(4)] == [1, 3, 2, 1]
+
+
+def test_round_robin_puts_a_new_user_beside_the_one_that_waits_longest(roster):
+    r = roster()
+    assert [cycle(r, 2, 3) for _ in range(5)] == [2, 3, 2, 3, 2]
+    # User 3 waits longest; among equals the lower number comes first.
+    assert [cycle(r, 1, 2, 3, 9) for _ in range(8)] == [1, 3, 9, 2, 1, 3, 9, 2]
+
+
+def test_who_comes_and_goes_is_not_served_more_often_than_the_others(roster):
+    r = roster()
+    served = [cycle(r, 1, 2, 3)]
+    for n in range(40):
+        if n % 2:
+            r.forget(1)
+        served.append(cycle(r, 1, 2, 3))
+    counts = [served.count(user) for user in (1, 2, 3)]
+    assert max(counts) <= 21
+    assert min(counts) >= 9
+
+
+def test_first_serves_who_answers_first(roster):
+    r = roster('first')
+    assert [cycle(r, 3, 1, 2), cycle(r, 2, 3), cycle(r, 2, 1)] == [3, 2, 2]
+
+
+def test_random_serves_each_as_often_and_repeats_with_its_seed(roster):
+    r = roster('random')
+    served = [cycle(r, 1, 2, 3) for _ in range(3000)]
+    for user in (1, 2, 3):
+        assert 900 < served.count(user) < 1100
+    again, other = roster('random'), roster('random', seed=1)
+    assert [cycle(again, 1, 2, 3) for _ in range(20)] == served[:20]
+    assert [cycle(other, 1, 2, 3) for _ in range(20)] != served[:20]
+
+
+def test_random_serves_only_who_answered(roster):
+    r = roster('random')
+    cycle(r, 1, 2, 3)
+    assert {cycle(r, 2, 3) for _ in range(50)} == {2, 3}
+
+
+def test_who_comes_back_has_not_waited_meanwhile(roster):
+    r = roster()
+    assert [cycle(r, 2, 3, 9) for _ in range(3)] == [2, 3, 9]
+    r.forget(9)
+    assert [cycle(r, 2, 3) for _ in range(4)] == [2, 3, 2, 3]
+    assert [cycle(r, 2, 3, 9) for _ in range(3)] == [2, 9, 3]
+
+
+def test_a_cycle_begins_without_answers(roster):
+    r = roster()
+    cycle(r, 1, 2)
+    assert r.answered == [1, 2]
+    r.open()
+    assert r.answered == []
+
+
+def test_an_empty_roster_waits_for_nobody(roster):
+    r = roster()
+    r.open()
+    assert r.complete_with(5)
+
+
+@pytest.mark.parametrize('policy', ['round_robin', 'random'])
+def test_the_selection_waits_for_all_that_are_known(roster, policy):
+    r = roster(policy)
+    cycle(r, 1, 2, 3)
+    r.open()
+    assert not r.complete_with(1)
+    r.answer(1)
+    assert not r.complete_with(4)
+    assert not r.complete_with(2)
+    r.answer(2)
+    assert not r.complete_with(1)
+    assert r.complete_with(3)
+
+
+def test_first_waits_for_nobody(roster):
+    r = roster('first')
+    cycle(r, 1, 2, 3)
+    r.open()
+    assert r.complete_with(2)
+
+
+def test_who_leaves_three_beacons_unanswered_is_not_waited_for(roster):
+    r = roster()
+    cycle(r, 1, 2)
+    for _ in range(3):
+        r.open()
+        assert not r.complete_with(1)
+        r.answer(1)
+        r.select()
+    r.open()
+    assert r.complete_with(1)
+
+
+def test_an_answer_forgives_what_was_missed(roster):
+    r = roster()
+    cycle(r, 1, 2)
+    for _ in range(2):
+        cycle(r, 1)
+    cycle(r, 1, 2)
+    for _ in range(3):
+        r.open()
+        assert not r.complete_with(1)
+        r.answer(1)
+        r.select()
+
+
+def test_who_is_forgotten_is_not_waited_for_until_it_answers(roster):
+    r = roster()
+    cycle(r, 1, 2)
+    r.forget(2)
+    r.open()
+    assert r.complete_with(1)
+    r.answer(1)
+    r.answer(2)
+    r.select()
+    r.open()
+    assert not r.complete_with(1)
+
+
+def test_who_is_welcome_is_waited_for_but_has_not_answered(roster):
+    r = roster()
+    cycle(r, 1)
+    r.welcome(2)
+    assert r.answered == [1]
+    r.open()
+    assert not r.complete_with(1)
+    r.answer(1)
+    assert r.select() == 1
+    assert cycle(r, 1, 2) == 2
+
+
+def test_being_welcome_again_does_not_change_the_turn(roster):
+    r = roster()
+    cycle(r, 1, 2)
+    cycle(r, 1, 2)
+    r.welcome(1)
+    r.welcome(2)
+    assert cycle(r, 2, 1) == 1

@@ -1,0 +1,171 @@
+"""The user by itself: what the whole network seldom shows."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import mobility
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import Note, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.user import State, User, timeouts
+
+DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
+OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
+
+
+@pytest.fixture
+def user():
+    """User 4, connected; waits 2 s for a grant and 3 s when granted."""
+    way = mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)
+    made = User(4, way, {State.ACKNOWLEDGED: 2.0, State.GRANTED: 3.0})
+    made.handle(PeersChanged(()), 0.0)
+    return made
+
+
+def answers(user, event, now_s):
+    return [action.message for action in user.handle(event, now_s) if isinstance(action, Send)]
+
+
+def grant(user, cycle_id=7, now_s=10.0):
+    user.handle(m.Beacon(cycle_id, 0), now_s)
+    return answers(user, m.Grant(cycle_id, 4), now_s)
+
+
+def test_a_beacon_is_answered(user):
+    (ack,) = answers(user, m.Beacon(7, 0), 10.0)
+    assert (type(ack), ack.cycle_id, ack.user) == (m.Ack, 7, 4)
+    assert user.state is State.ACKNOWLEDGED
+    assert user.next_deadline() == 12.0
+
+
+@pytest.mark.parametrize('cycle_id', [7, 8])
+def test_every_further_beacon_is_answered_and_starts_the_time_out_afresh(user, cycle_id):
+    user.handle(m.Beacon(7, 0), 10.0)
+    (ack,) = answers(user, m.Beacon(cycle_id, 1), 11.5)
+    assert ack.cycle_id == cycle_id
+    assert user.next_deadline() == 13.5
+    assert user.counters == {}
+
+
+def test_a_grant_is_answered_with_the_position_of_the_moment(user):
+    user.whereabouts(8.0)
+    (truth,) = grant(user)
+    assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
+    np.testing.assert_allclose(truth.position, (7, 0, 0))
+    np.testing.assert_allclose(truth.velocity, (0.5, 0, 0))
+    assert user.next_deadline() == 13.0
+
+
+def test_whereabouts_belong_to_no_cycle_unless_told(user):
+    assert user.whereabouts(0.0).cycle_id == 0
+    assert user.whereabouts(0.0, 9).cycle_id == 9
+    assert user.whereabouts(0.0).user == 4
+
+
+def test_a_pilot_request_is_answered_frame_by_frame_and_starts_the_time_out_afresh(user):
+    grant(user)
+    pilots = answers(user, m.PilotRequest(7, 4, 1, 3), 12.5)
+    assert [(p.cycle_id, p.user, p.band, p.frame) for p in pilots] == [
+        (7, 4, 1, frame) for frame in range(3)]
+    assert {complex(p.symbol_re, p.symbol_im) for p in pilots} == {1 + 0j}
+    assert user.next_deadline() == 15.5
+
+
+def test_the_downlink_is_answered_in_kind_and_ends_the_cycle(user):
+    grant(user)
+    (data,) = answers(user, m.Data(7, 4, DOWN, DELIVERED, 0.25, 123.0), 11.0)
+    assert (data.cycle_id, data.user, data.direction, data.stage) == (7, 4, UP, OFFERED)
+    assert (data.duration_s, data.bits) == (0.25, 123.0)
+    assert user.state is State.LISTENING
+    assert user.next_deadline() is None
+
+
+@pytest.mark.parametrize(('direction', 'stage'), [(DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED)])
+def test_data_on_their_way_are_none_of_its_business(user, direction, stage):
+    grant(user)
+    assert user.handle(m.Data(7, 4, direction, stage, 0.25, 123.0), 11.0) == []
+    assert user.state is State.GRANTED
+    assert user.counters == {}
+
+
+def test_a_late_beacon_of_the_cycle_that_it_was_granted_is_counted_only(user):
+    """Another beacon of a cycle may be on its way while the first answer is granted."""
+    grant(user)
+    assert user.handle(m.Beacon(7, 1), 11.0) == []
+    assert user.state is State.GRANTED
+    assert user.next_deadline() == 13.0
+    assert user.counters == {'stale_beacon': 1}
+
+
+def test_a_beacon_of_another_cycle_tells_that_its_own_was_given_up(user):
+    grant(user)
+    (ack,) = answers(user, m.Beacon(8, 0), 11.0)
+    assert ack.cycle_id == 8
+    assert user.state is State.ACKNOWLEDGED
+    assert user.counters == {'abandoned': 1}
+
+
+def test_the_grant_of_another_user_ends_its_hope(user):
+    user.handle(m.Beacon(7, 0), 10.0)
+    assert user.handle(m.Grant(7, 5), 10.5) == []
+    assert user.state is State.LISTENING
+    assert user.counters == {}
+
+
+@pytest.mark.parametrize('other', [
+    m.Grant(6, 5), m.PilotRequest(7, 5, 0, 2), m.Data(6, 5, DOWN, DELIVERED, 0.25, 1.0)],
+    ids=['grant of another cycle', 'request', 'data'])
+def test_what_else_goes_to_another_user_is_none_of_its_business(user, other):
+    for event, state in ((m.Beacon(7, 0), State.ACKNOWLEDGED), (m.Grant(7, 4), State.GRANTED)):
+        user.handle(event, 10.0)
+        assert user.handle(other, 10.5) == []
+        assert user.state is state
+    assert user.counters == {}
+
+
+def test_a_pilot_request_that_overtakes_the_grant_stands_for_it(user):
+    user.handle(m.Beacon(7, 0), 10.0)
+    truth, *pilots = answers(user, m.PilotRequest(7, 4, 0, 2), 10.5)
+    assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
+    assert [(type(p), p.frame) for p in pilots] == [(m.Pilot, 0), (m.Pilot, 1)]
+    assert user.state is State.GRANTED
+    assert user.handle(m.Grant(7, 4), 11.0) == []
+    assert user.next_deadline() == 13.5
+    assert user.counters == {}
+
+
+def test_a_granted_user_outlasts_the_steps_that_it_hears_nothing_of():
+    """Sounding of the last band, estimating and steering, each just within its time-out."""
+    waits = timeouts(0.5)
+    assert waits[State.GRANTED] > 3 * 0.5
+    assert waits.keys() == {State.ACKNOWLEDGED, State.GRANTED}
+
+
+@pytest.mark.parametrize(('granted', 'deadline_s', 'reason'), [
+    (False, 12.0, 'not_granted'), (True, 13.0, 'bs_silent')])
+def test_waiting_in_vain_ends_with_listening(user, granted, deadline_s, reason):
+    user.handle(m.Beacon(7, 0), 10.0)
+    if granted:
+        user.handle(m.Grant(7, 4), 10.0)
+    assert user.next_deadline() == deadline_s
+    assert user.handle(Tick(), deadline_s) == []
+    assert user.state is State.LISTENING
+    assert user.counters == {reason: 1}
+    assert user.next_deadline() is None
+
+
+@pytest.mark.parametrize('state', State)
+def test_a_user_that_is_cut_off_says_so_and_is_silent(user, state):
+    user.state = state
+    assert user.handle(PeersChanged(('channel', 'bs')), 1.0) == [
+        Note('waiting for channel, bs', warning=True)]
+    assert user.state is State.ALONE
+    assert user.handle(m.Beacon(7, 0), 1.0) == []
+    assert user.handle(PeersChanged(()), 2.0) == [Note('listening for beacons')]
+    assert user.state is State.LISTENING
+
+
+@pytest.mark.parametrize('state', [State.LISTENING, State.ACKNOWLEDGED, State.GRANTED])
+def test_a_user_that_is_connected_stays_as_it_is(user, state):
+    user.state = state
+    assert user.handle(PeersChanged(()), 1.0) == []
+    assert user.state is state

@@ -1,0 +1,190 @@
+"""How nodes get the codebook from the parameters of the optimizer."""
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.nodes.optimizer import OptimizerNode
+from rhs_isac_ros.ros.codebook_source import CodebookSource
+
+
+@pytest.fixture
+def follow(bench):
+    """Function that makes a client and returns the list of codebooks that it gets."""
+    def follow(scenario=None, name='client', **options):
+        got = []
+        node = bench.add(Node, name, **options)
+        CodebookSource(node, scenario or Scenario(), got.append)
+        return got
+    return follow
+
+
+@pytest.fixture
+def optimizer_of(bench, small_files):
+    """Function that makes an optimizer with a codebook of the small scenario."""
+    def optimizer_of(name, **options):
+        files = {'scenario_file': 'scenario', 'codebook_file': name}
+        return bench.add(OptimizerNode, parameter_overrides=[
+            Parameter(key, value=str(small_files / f'{file}.yaml'))
+            for key, file in files.items()], **options)
+    return optimizer_of
+
+
+def ids(codebooks):
+    return [codebook.id for codebook in codebooks]
+
+
+@pytest.fixture(scope='session')
+def stored(small_files):
+    return {name: Codebook.load(small_files / f'{name}.yaml') for name in ('first', 'second')}
+
+
+def change(optimizer, codebook):
+    result = optimizer.set_parameters_atomically(
+        [Parameter(name, value=value) for name, value in codebook.to_parameters().items()])
+    assert result.successful, result.reason
+
+
+def test_the_codebook_comes_bit_for_bit_and_once(bench, follow, shipped):
+    bench.add(OptimizerNode)
+    got = follow()
+    bench.until(lambda: got, 'the codebook')
+    later = follow(name='later')
+    bench.until(lambda: later, 'the codebook of the other client')
+    for codebook in (*got, *later):
+        assert codebook.analog.tobytes() == shipped.analog.tobytes()
+        assert codebook.digital.tobytes() == shipped.digital.tobytes()
+        assert codebook.average_crlb_m2 == shipped.average_crlb_m2
+        assert codebook.provenance == shipped.provenance
+    assert len(got) == len(later) == 1
+
+
+def test_a_client_that_is_first_waits(bench, follow, shipped):
+    got = follow()
+    # It has asked in vain by the time that another client has what it wants.
+    other = follow(name='other', namespace='/there')
+    bench.add(OptimizerNode, namespace='/there')
+    bench.until(lambda: other, 'the codebook in the other namespace')
+    assert not got
+    bench.add(OptimizerNode)
+    bench.until(lambda: got, 'the codebook')
+    assert ids(got) == [shipped.id]
+
+
+def test_changes_are_followed(bench, follow, optimizer_of, stored, small):
+    optimizer = optimizer_of('first')
+    got = follow(small.scenario)
+    bench.until(lambda: len(got) == 1, 'the first codebook')
+    change(optimizer, stored['second'])
+    bench.until(lambda: len(got) == 2, 'the second codebook')
+    change(optimizer, stored['first'])
+    bench.until(lambda: len(got) == 3, 'the first codebook again')
+    assert ids(got) == [stored[name].id for name in ('first', 'second', 'first')]
+
+
+def test_the_last_of_many_changes_holds(bench, follow, optimizer_of, random_beams, small):
+    optimizer = optimizer_of('first')
+    got = follow(small.scenario)
+    bench.until(lambda: got, 'the first codebook')
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        last = random_beams(small.scenario, rng)
+        change(optimizer, last)
+    bench.until(lambda: got[-1].id == last.id, 'the last codebook')
+
+
+def test_a_change_that_is_taken_back_while_it_is_fetched_does_not_stay(
+        bench, follow, optimizer_of, stored, small, monkeypatch):
+    optimizer = optimizer_of('first')
+    got = follow(small.scenario)
+    bench.until(lambda: got, 'the first codebook')
+    read, done = optimizer.get_parameter, []
+
+    def take_back(name):
+        """Read a parameter; after the last of an answer, change it before the answer leaves."""
+        value = read(name)
+        if name == 'codebook.digital_im' and not done:
+            done.append(name)
+            change(optimizer, stored['first'])
+        return value
+    change(optimizer, stored['second'])
+    monkeypatch.setattr(optimizer, 'get_parameter', take_back)
+    bench.until(lambda: done, 'the change')
+    # Another client has asked later, so that what was under way has come.
+    other = follow(small.scenario, 'other')
+    bench.until(lambda: other, 'the codebook of the other client')
+    bench.until(lambda: got[-1].id == stored['first'].id, 'the codebook that holds')
+    assert ids(other) == [stored['first'].id]
+
+
+def test_what_does_not_change_the_arrays_is_no_new_codebook(
+        bench, follow, optimizer_of, stored, small):
+    optimizer = optimizer_of('first')
+    got = follow(small.scenario)
+    bench.until(lambda: got, 'the first codebook')
+    result, = optimizer.set_parameters([Parameter('codebook.average_crlb', value=0.5)])
+    assert result.successful
+    # By the time that another client has asked, this one has asked again.
+    other = follow(small.scenario, 'other')
+    bench.until(lambda: other, 'the first codebook of the other client')
+    change(optimizer, stored['second'])
+    bench.until(lambda: got[-1].id == stored['second'].id, 'the second codebook')
+    assert ids(got) == [stored['first'].id, stored['second'].id]
+
+
+def test_events_of_other_nodes_are_none_of_its_business(
+        bench, follow, optimizer_of, stored, small):
+    here, there = optimizer_of('first'), optimizer_of('first', namespace='/there')
+    got = follow(small.scenario)
+    far = follow(small.scenario, 'far', namespace='/there')
+    bench.until(lambda: got and far, 'both first codebooks')
+    change(there, stored['second'])
+    bench.until(lambda: len(far) == 2, 'the second codebook there')
+    change(here, stored['second'])
+    bench.until(lambda: len(got) == 2, 'the second codebook here')
+    assert ids(got) == ids(far) == [stored['first'].id, stored['second'].id]
+
+
+def test_a_codebook_that_does_not_fit_is_refused_and_the_node_stays(
+        bench, follow, optimizer_of, stored, small, random_beams, capfd):
+    misfit = bench.add(OptimizerNode)
+    got = follow(small.scenario)
+    witness = follow(name='witness')
+    log = []
+
+    def complaint():
+        log.append(capfd.readouterr().err)
+        return 'not used' in ''.join(log)
+    bench.until(complaint, 'the complaint')
+    text = next(line for line in ''.join(log).splitlines() if 'not used' in line)
+    assert '[ERROR]' in text
+    assert 'optimizer' in text
+    sizes = small.scenario.sizes
+    expected = tuple(sizes[symbol] for symbol in ('N_B', 'F', 'N_E'))
+    assert f'analog: shape (2, 4, 100), expected [N_B, F, N_E] = {expected}' in text
+    assert not got
+    bench.until(lambda: witness, 'the codebook where it fits')
+    # The same complaint once more is not worth another line.
+    change(misfit, random_beams(Scenario(), np.random.default_rng(0)))
+    bench.until(lambda: len(witness) == 2, 'the change')
+    bench.remove(misfit)
+    optimizer = optimizer_of('first')
+    change(optimizer, stored['second'])
+    bench.until(lambda: got, 'the codebook that fits')
+    assert got[-1].id in {codebook.id for codebook in stored.values()}
+    log.append(capfd.readouterr().err)
+    assert sum('[client]' in line and 'not used' in line
+               for line in ''.join(log).splitlines()) == 1
+
+
+def test_an_optimizer_that_is_restarted_is_followed(bench, follow, optimizer_of, stored, small):
+    optimizer = optimizer_of('first')
+    got = follow(small.scenario)
+    bench.until(lambda: got, 'the first codebook')
+    bench.remove(optimizer)
+    optimizer_of('second')
+    bench.until(lambda: len(got) == 2, 'the codebook of the new optimizer')
+    assert ids(got) == [stored['first'].id, stored['second'].id]

@@ -1,0 +1,257 @@
+"""Conversions between plain messages and ROS messages."""
+
+import dataclasses
+import enum
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from rclpy.serialization import deserialize_message, serialize_message
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.fields import MessageError, check
+from rhs_isac_ros.ros import convert, topics
+
+SIZES = Scenario().sizes
+STAMP = Time(sec=12, nanosec=345)
+KINDS = list(topics.NAMES)
+FILES = Path(__file__).resolve().parents[2] / 'msg_defs' / 'msg'
+# Types that are parts of messages, and the one that is no message of the protocol.
+OTHER_TYPES = {'RealArray', 'ComplexArray', 'Codebook'}
+ENUMS = {'RhsConfiguration': [m.Mode], 'Data': [m.Direction, m.Stage], 'ProtocolState': [m.Phase]}
+
+
+def random_scalar(field, rng):
+    meta = field.metadata
+    if 'below' in meta:
+        return int(rng.integers(SIZES[meta['below']]))
+    if issubclass(field.type, enum.IntEnum):
+        return rng.choice(list(field.type))
+    if field.type is int:
+        bits = 64 if field.name == 'cycle_id' else 32
+        return [0, 1, 2**bits - 1, int(rng.integers(2**32))][rng.integers(4)]
+    if field.type is float:
+        special = [math.nan, math.inf] if 'open' in meta else [0.0]
+        return float(rng.choice([-0.0, 5e-324, 1.7e308, rng.normal(), *special]))
+    assert field.type is str
+    return ''.join(rng.choice(list('aZ09 _/µ漢\n"'), size=rng.integers(0, 20)))
+
+
+def random_array(meta, rng):
+    """An array with any number of frames, which nothing but the check fixes."""
+    shape = [SIZES.get(d) or int(d if d.isdigit() else rng.integers(1, 6)) for d in meta['dims']]
+    if meta['kind'] is complex:
+        return rng.normal(size=(*shape, 2)) @ [1, 1j] * 10.0**rng.integers(-200, 200)
+    if math.isfinite(meta['low']):
+        return rng.uniform(meta['low'], meta['high'], shape)
+    return rng.normal(size=shape) * 10.0**rng.integers(-200, 200)
+
+
+def random_message(kind, rng):
+    return kind(**{
+        field.name: random_array(field.metadata, rng) if 'dims' in field.metadata
+        else random_scalar(field, rng) for field in dataclasses.fields(kind)})
+
+
+def assert_same(one, other):
+    """Equal class, types and values, bit for bit."""
+    assert type(one) is type(other)
+    for field in dataclasses.fields(one):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(a, np.ndarray):
+            assert (a.dtype, a.shape) == (b.dtype, b.shape), field.name
+            assert a.tobytes() == b.tobytes(), field.name
+        elif isinstance(a, float):
+            assert np.float64(a).tobytes() == np.float64(b).tobytes(), field.name
+        else:
+            assert isinstance(b, field.type), field.name
+            assert a == b, field.name
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_round_trip_keeps_every_bit(kind):
+    rng = np.random.default_rng(KINDS.index(kind))
+    for _ in range(20):
+        message = random_message(kind, rng)
+        sent = convert.to_ros(message, STAMP)
+        assert type(sent) is getattr(ros, kind.__name__)
+        assert_same(message, convert.from_ros(kind, sent))
+        received = deserialize_message(serialize_message(sent), type(sent))
+        back = convert.from_ros(kind, received)
+        assert_same(message, back)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_arrays_travel_in_c_order_whatever_their_layout(kind):
+    message = random_message(kind, np.random.default_rng(0))
+    turned = {field.name: np.asfortranarray(getattr(message, field.name))
+              for field in dataclasses.fields(kind) if 'dims' in field.metadata}
+    sent = convert.to_ros(dataclasses.replace(message, **turned), STAMP)
+    assert_same(message, convert.from_ros(kind, sent))
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_header_has_stamp_and_frame(kind):
+    sent = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
+    if kind in (m.GroundTruth, m.PositionEstimate, m.Capacity, m.ReceivedSignals,
+                m.ProtocolState):
+        assert sent.header.stamp == STAMP
+        assert sent.header.frame_id == 'map'
+    else:
+        assert not hasattr(sent, 'header')
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_fields_are_those_of_the_ros_type(kind):
+    names = [name for name in convert.ros_type(kind).get_fields_and_field_types()
+             if name != 'header']
+    assert [field.name for field in dataclasses.fields(kind)] == names
+
+
+def test_every_message_has_a_ros_type_and_every_ros_type_a_message():
+    kinds = {kind.__name__ for kind in KINDS}
+    assert kinds == {kind.__name__ for kind in m.Message.__subclasses__()}
+    files = {path.stem for path in FILES.glob('*.msg')}
+    assert files == kinds | OTHER_TYPES
+    assert files == {name for name in dir(ros) if isinstance(getattr(ros, name), type)}
+
+
+def test_no_sequence_is_bounded():
+    types = [text for name in (*OTHER_TYPES, *(kind.__name__ for kind in KINDS))
+             for text in getattr(ros, name).get_fields_and_field_types().values()]
+    assert 'double[9]' in types
+    assert not [text for text in types if re.search(r'sequence<.*,|<=|string<', text)]
+
+
+@pytest.mark.parametrize('name', [path.stem for path in sorted(FILES.glob('*.msg'))])
+def test_constants_are_those_of_the_enumerations(name):
+    constants = re.findall(r'^uint8 (\w+)=(\d+)$', (FILES / f'{name}.msg').read_text(), re.M)
+    members = [member for kind in ENUMS.get(name, ()) for member in kind]
+    assert [(key, int(value)) for key, value in constants] == [
+        (member.name, member.value) for member in members]
+    for member in members:
+        assert getattr(getattr(ros, name), member.name) == member.value
+
+
+def test_every_enumeration_is_in_a_ros_type():
+    listed = [kind for kinds in ENUMS.values() for kind in kinds]
+    assert {kind for kind in vars(m).values()
+            if isinstance(kind, type) and issubclass(kind, enum.IntEnum)
+            and kind is not enum.IntEnum} == set(listed)
+
+
+REAL = 'Beam.analog'
+COMPLEX = 'FeedSignals.signals'
+
+
+@pytest.mark.parametrize(('where', 'array'), [
+    (COMPLEX, ros.ComplexArray(shape=[2], re=[1.0, 2.0], im=[1.0])),
+    (COMPLEX, ros.ComplexArray(shape=[2], re=[1.0], im=[1.0, 2.0])),
+    (COMPLEX, ros.ComplexArray(shape=[2], re=[1.0] * 3, im=[1.0] * 3)),
+    (COMPLEX, ros.ComplexArray(shape=[2, 2], re=[1.0] * 2, im=[1.0] * 2)),
+    (COMPLEX, ros.ComplexArray(shape=[2], re=[1.0, 2.0])),
+    (COMPLEX, ros.ComplexArray(shape=[2], im=[1.0, 2.0])),
+    (COMPLEX, ros.ComplexArray(shape=[0, 3])),
+    (COMPLEX, ros.ComplexArray(shape=[8, 3])),
+    (COMPLEX, ros.ComplexArray()),
+    (COMPLEX, ros.ComplexArray(re=[1.0, 2.0], im=[1.0, 2.0])),
+    (COMPLEX, ros.ComplexArray(shape=[1] * 200, re=[1.0], im=[1.0])),
+    # One value that claims to fill 16 TB, and more than an address can count.
+    (COMPLEX, ros.ComplexArray(shape=[2**20] * 2, re=[1.0], im=[1.0])),
+    (COMPLEX, ros.ComplexArray(shape=[2**32 - 1] * 2, re=[1.0], im=[1.0])),
+    (REAL, ros.RealArray(shape=[3], data=[1.0] * 2)),
+    (REAL, ros.RealArray(shape=[2, 2], data=[1.0] * 2)),
+    (REAL, ros.RealArray(data=[1.0] * 2)),
+    (REAL, ros.RealArray(shape=[0])),
+    (REAL, ros.RealArray(shape=[100])),
+    (REAL, ros.RealArray()),
+    (REAL, ros.RealArray(shape=[2**32 - 1] * 8, data=[1.0])),
+    (REAL, ros.RealArray(shape=[1] * 200, data=[1.0])),
+])
+def test_an_array_that_does_not_fill_its_shape_is_refused(where, array):
+    name, _, field = where.partition('.')
+    kind = getattr(m, name)
+    message = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
+    setattr(message, field, array)
+    with pytest.raises(MessageError, match=rf'^{where}: .'):
+        convert.from_ros(kind, message)
+
+
+def test_a_number_without_shape_is_no_vector():
+    message = convert.to_ros(random_message(m.Beam, np.random.default_rng(0)), STAMP)
+    message.analog = ros.RealArray(data=[1.0])
+    with pytest.raises(MessageError, match=r'^Beam.analog: shape \[\], expected \[N_E = 100\]'):
+        check(convert.from_ros(m.Beam, message), SIZES)
+
+
+@pytest.mark.parametrize(('kind', 'field', 'number'), [
+    (m.RhsConfiguration, 'mode', 2), (m.Data, 'direction', 2), (m.Data, 'stage', 255),
+    (m.ProtocolState, 'phase', 5)])
+def test_an_unknown_constant_is_refused(kind, field, number):
+    message = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
+    setattr(message, field, number)
+    with pytest.raises(MessageError, match=rf'^{kind.__name__}.{field}: {number} '):
+        convert.from_ros(kind, message)
+
+
+def test_codebook_travels_bit_for_bit(shipped):
+    sent = convert.codebook_to_ros(shipped, STAMP)
+    received = deserialize_message(serialize_message(sent), ros.Codebook)
+    assert received.codebook_id == shipped.id
+    assert (received.header.stamp, received.header.frame_id) == (STAMP, 'map')
+    back = convert.codebook_from_ros(received)
+    assert back.analog.tobytes() == shipped.analog.tobytes()
+    assert back.digital.tobytes() == shipped.digital.tobytes()
+    assert back.average_crlb_m2 == shipped.average_crlb_m2
+    assert back.id == shipped.id
+
+
+def test_codebook_without_a_bound_travels(small):
+    assert math.isnan(small.codebook.average_crlb_m2)
+    back = convert.codebook_from_ros(convert.codebook_to_ros(small.codebook, STAMP))
+    assert math.isnan(back.average_crlb_m2)
+    assert back.id == small.codebook.id
+
+
+def test_a_malformed_codebook_is_refused(shipped):
+    sent = convert.codebook_to_ros(shipped, STAMP)
+    sent.analog.data = sent.analog.data[:-1]
+    with pytest.raises(MessageError, match='^Codebook: 799 values'):
+        convert.codebook_from_ros(sent)
+    sent = convert.codebook_to_ros(shipped, STAMP)
+    sent.digital.im = sent.digital.im[:-1]
+    with pytest.raises(MessageError, match='^Codebook: 191 values'):
+        convert.codebook_from_ros(sent)
+    sent = convert.codebook_to_ros(shipped, STAMP)
+    sent.analog.data[0] = 1.5
+    with pytest.raises(CodebookError, match='analog: .* expected 0 to 1'):
+        convert.codebook_from_ros(sent)
+    sent.analog.data[0] = math.nan
+    with pytest.raises(CodebookError, match='analog: not finite'):
+        convert.codebook_from_ros(sent)
+
+
+def test_pose_holds_position_and_covariance():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    estimate = dataclasses.replace(
+        random_message(m.PositionEstimate, rng), position=np.array([9.0, -2.0, 0.5]),
+        covariance_m2=root @ root.T)
+    pose = convert.pose(estimate, STAMP)
+    assert (pose.header.stamp, pose.header.frame_id) == (STAMP, 'map')
+    point, turn = pose.pose.pose.position, pose.pose.pose.orientation
+    assert (point.x, point.y, point.z) == (9.0, -2.0, 0.5)
+    assert (turn.x, turn.y, turn.z, turn.w) == (0, 0, 0, 1)
+    covariance = np.reshape(pose.pose.covariance, (6, 6))
+    np.testing.assert_array_equal(covariance[:3, :3], estimate.covariance_m2)
+    # The variance of an angle that is uniform from -pi to pi; nothing correlates with it.
+    turned = np.linspace(-math.pi, math.pi, 100_001)
+    np.testing.assert_allclose(covariance[3:, 3:], np.eye(3) * np.var(turned), rtol=1e-4)
+    assert not covariance[:3, 3:].any()
+    assert not covariance[3:, :3].any()

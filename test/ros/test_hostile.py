@@ -1,0 +1,177 @@
+"""Messages that pass every check of their form and still make no sense: no node dies of them.
+
+In a test the executor passes on what a callback raises, so that a node that would die fails it.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import simulate_received
+from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.nodes.channel import ChannelNode
+from rhs_isac_ros.nodes.optimizer import OptimizerNode
+from rhs_isac_ros.nodes.positioner import PositionerNode
+from rhs_isac_ros.nodes.transmission import TransmissionNode
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.fields import check
+from rhs_isac_ros.ros import convert
+
+# A node at work only prints them.
+pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
+
+PLACE = np.array([10.0, 0.5, 0.2])
+HUGE = (1e100, 1e200, 1e308)
+
+
+class Stage:
+    """One node under test, and outlets for what the rest of the network would send it."""
+
+    def __init__(self, bench, files, kind, hears, answers, **values):
+        overrides = [Parameter('scenario_file', value=str(files / 'scenario.yaml'))]
+        if kind is not ChannelNode:
+            bench.add(OptimizerNode, parameter_overrides=[
+                *overrides, Parameter('codebook_file', value=str(files / 'first.yaml'))])
+        overrides += [Parameter(name, value=value) for name, value in values.items()]
+        self.node = bench.add(kind, parameter_overrides=overrides)
+        self._bench = bench
+        probe = bench.add(Node, 'probe')
+        self._outlets = {kind: bench.outlet(probe, kind) for kind in hears}
+        self._told, self._tell = 0, self.node.tell
+        self.node.tell = self._note
+        self.heard = bench.hear(probe, answers)
+        self.scenario = self.node.scenario
+        self.codebook = Codebook.load(files / 'first.yaml')
+
+    def _note(self, event):
+        try:
+            self._tell(event)
+        finally:
+            self._told += 1
+
+    @property
+    def _handled(self):
+        """How many messages have been told to the role, or dropped before."""
+        return self._told + self.node._role.counters['malformed']
+
+    def send(self, *messages):
+        """Send messages, one after the other has been handled: topics have no common order."""
+        stamp = self.node.get_clock().now().to_msg()
+        for message in messages:
+            before = self._handled
+            self._outlets[type(message)].publish(convert.to_ros(message, stamp))
+            self._bench.until(lambda before=before: self._handled > before, 'the handling')
+
+    def until_answer(self, cycle_id):
+        """Wait for the answer to a sane message, and see that all answers make sense."""
+        self._bench.until(lambda: self.heard and self.heard[-1].cycle_id == cycle_id,
+                          'the answer to a sane message')
+        for message in self.heard:
+            check(message, self.scenario.sizes)
+
+
+@pytest.fixture
+def stage(bench, small_files):
+    def stage(*args, **values):
+        return Stage(bench, small_files, *args, **values)
+    return stage
+
+
+@pytest.fixture
+def channel(stage):
+    return stage(ChannelNode, (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
+                 m.FeedSignals)
+
+
+def truth(cycle_id, place=PLACE):
+    return m.GroundTruth(cycle_id, 1, np.asarray(place, float), np.zeros(3))
+
+
+def pilot(cycle_id, symbol=1.0):
+    return m.Pilot(cycle_id, 1, 0, 1, symbol, 0.0)
+
+
+def applied(scenario, cycle_id, mode=m.Mode.POSITIONING, rows=None):
+    rows = rows or (scenario.n_frames if mode is m.Mode.POSITIONING else 1)
+    return m.RhsConfiguration(cycle_id, mode, 0, '', np.full((rows, scenario.n_elements), 0.5))
+
+
+def beam(scenario, cycle_id, amplitude=1e-3, expected_bps=1e6):
+    digital = np.full((scenario.n_subbands, scenario.n_feeds), amplitude + 0j)
+    return m.Beam(cycle_id, 1, '', 0, np.full(scenario.n_elements, 0.5), digital, expected_bps)
+
+
+def sane_pilot(stage):
+    stage.send(truth(9), applied(stage.scenario, 9), pilot(9))
+    stage.until_answer(9)
+
+
+@pytest.mark.parametrize('rows', [1, 3, 5])
+def test_channel_survives_configurations_for_another_number_of_frames(channel, rows):
+    channel.send(truth(1), applied(channel.scenario, 1, rows=rows), pilot(1))
+    sane_pilot(channel)
+
+
+@pytest.mark.parametrize('place', [
+    (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
+def test_channel_survives_users_in_impossible_places(channel, place):
+    scenario = channel.scenario
+    place = element_positions(scenario)[1] if place == 'on an element' else place
+    channel.send(truth(1, place), applied(scenario, 1), pilot(1),
+                 applied(scenario, 1, m.Mode.TRANSMISSION), beam(scenario, 1),
+                 m.Data(1, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1.0, 1.0))
+    sane_pilot(channel)
+
+
+@pytest.mark.parametrize('number', HUGE)
+def test_channel_survives_huge_numbers(channel, number):
+    scenario = channel.scenario
+    channel.send(
+        truth(1), applied(scenario, 1), pilot(1, number),
+        applied(scenario, 1, m.Mode.TRANSMISSION), beam(scenario, 1),
+        m.Data(1, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, number, number),
+        truth(2), applied(scenario, 2, m.Mode.TRANSMISSION), beam(scenario, 2, number),
+        m.Data(2, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1.0, 1.0))
+    sane_pilot(channel)
+
+
+def test_channel_survives_messages_of_no_cycle(channel):
+    last = 2**64 - 1
+    for cycle_id in (0, last):
+        channel.send(pilot(cycle_id), applied(channel.scenario, cycle_id), truth(cycle_id),
+                     m.Data(cycle_id, 0, m.Direction.UPLINK, m.Stage.DELIVERED, -1.0, -1.0))
+    sane_pilot(channel)
+
+
+def estimate(stage, cycle_id, place=PLACE):
+    return m.PositionEstimate(cycle_id, 1, stage.codebook.id, np.asarray(place, float),
+                              np.eye(3), 0.1, 'rogue', 0.1)
+
+
+@pytest.mark.parametrize('place', [
+    (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
+@pytest.mark.parametrize('what', ['estimate', 'truth'])
+def test_transmission_survives_impossible_places(stage, place, what):
+    stage = stage(TransmissionNode, (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth),
+                  m.Beam)
+    scenario = stage.scenario
+    place = element_positions(scenario)[1] if place == 'on an element' else place
+    places = {'estimate': PLACE, 'truth': PLACE, what: place}
+    stage.send(truth(1, places['truth']), estimate(stage, 1, places['estimate']),
+               applied(scenario, 1, m.Mode.TRANSMISSION), estimate(stage, 2))
+    stage.until_answer(2)
+
+
+@pytest.mark.parametrize('number', HUGE)
+def test_positioner_survives_huge_signals(stage, number):
+    stage = stage(PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
+    scenario, codebook = stage.scenario, stage.codebook
+    shape = codebook.digital.shape[:3]
+    sane = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(0))[0]
+    received = m.ReceivedSignals(1, 1, codebook.id, np.full(shape, number * (1 + 1j)))
+    stage.send(received, dataclasses.replace(received, cycle_id=9, signals=sane.reshape(shape)))
+    stage.until_answer(9)

@@ -1,0 +1,233 @@
+"""The node that holds the codebook as its parameters."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.nodes.optimizer import OptimizerNode
+from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.resources import default_codebook_file
+
+TYPES = {
+    'codebook.id': Parameter.Type.STRING,
+    'codebook.shape': Parameter.Type.INTEGER_ARRAY,
+    'codebook.analog': Parameter.Type.DOUBLE_ARRAY,
+    'codebook.digital_re': Parameter.Type.DOUBLE_ARRAY,
+    'codebook.digital_im': Parameter.Type.DOUBLE_ARRAY,
+    'codebook.average_crlb': Parameter.Type.DOUBLE,
+}
+
+
+@pytest.fixture
+def optimizer(bench):
+    return bench.add(OptimizerNode)
+
+
+@pytest.fixture
+def client(bench, probe, optimizer):
+    client = AsyncParameterClient(probe, 'optimizer')
+    bench.until(client.services_are_ready, 'the parameter services')
+    return client
+
+
+@pytest.fixture(scope='session')
+def other(random_beams):
+    """Another codebook for Table I."""
+    return random_beams(Scenario(), np.random.default_rng(5))
+
+
+def latched(bench, node):
+    heard = []
+    node.create_subscription(ros.Codebook, 'codebook', heard.append, qos.LATCHED)
+    bench.until(lambda: heard, 'the latched codebook')
+    return heard
+
+
+def as_parameters(codebook, **changes):
+    values = codebook.to_parameters() | {f'codebook.{k}': v for k, v in changes.items()}
+    return [Parameter(name, value=value) for name, value in values.items()]
+
+
+def held(optimizer):
+    return Codebook.from_parameters(
+        {p.name: p.value for p in optimizer.get_parameters_by_prefix('').values()})
+
+
+def test_the_codebook_is_in_the_parameter_services(bench, client, shipped):
+    listed = bench.result(client.list_parameters(['codebook'], 1)).result.names
+    assert {*TYPES, 'codebook.provenance'} == set(listed)
+    answer = bench.result(client.get_parameters(list(TYPES))).values
+    assert [value.type for value in answer] == [kind.value for kind in TYPES.values()]
+    values = {name: Parameter.from_parameter_msg(ParameterMessage(name=name, value=value)).value
+              for name, value in zip(TYPES, answer, strict=True)}
+    codebook = Codebook.from_parameters(values)
+    assert values['codebook.id'] == codebook.id == shipped.id
+    assert tuple(values['codebook.shape']) == (2, 8, 4, 3, 100)
+    assert codebook.average_crlb_m2 == shipped.average_crlb_m2 > 0
+    for descriptor in bench.result(client.describe_parameters(list(TYPES))).descriptors:
+        assert descriptor.description
+        assert not descriptor.read_only
+
+
+def test_who_joins_late_gets_the_codebook(bench, optimizer, probe, shipped):
+    message, = latched(bench, probe)
+    assert message.codebook_id == shipped.id
+    assert message.header.frame_id == 'map'
+    assert convert.codebook_from_ros(message).id == shipped.id
+
+
+def test_a_change_of_all_at_once_is_taken_and_published(bench, optimizer, client, probe, other):
+    heard = latched(bench, probe)
+    answer = bench.result(client.set_parameters_atomically(as_parameters(other)))
+    assert answer.result.successful
+    assert held(optimizer).id == other.id
+    bench.until(lambda: len(heard) == 2, 'the new codebook')
+    assert convert.codebook_from_ros(heard[1]).id == other.id
+    assert math.isnan(heard[1].average_crlb_m2)
+    late, = latched(bench, bench.add(Node, 'late'))
+    assert late.codebook_id == other.id
+
+
+def test_a_change_without_an_id_gets_one(bench, optimizer, client, probe, other):
+    """Whoever sets the arrays need not know how the hash is made."""
+    heard = latched(bench, probe)
+    answer = bench.result(client.set_parameters_atomically(as_parameters(other, id='')))
+    assert answer.result.successful, answer.result.reason
+    bench.until(lambda: len(heard) == 2, 'the new codebook')
+    assert heard[1].codebook_id == other.id
+
+
+def test_the_same_codebook_again_is_taken(bench, client, shipped):
+    assert bench.result(
+        client.set_parameters_atomically(as_parameters(shipped))).result.successful
+
+
+def wrong_sets():
+    nan_at_5 = np.where(np.arange(800) == 5, math.nan, 0.5).tolist()
+    high_at_5 = np.where(np.arange(800) == 5, 1.25, 0.5).tolist()
+    return {
+        'analog alone': ({'analog': [0.5] * 800}, 'codebook.id'),
+        'digital alone': ({'digital_re': [0.001] * 192}, 'codebook.id|power'),
+        'one value less': ({'analog': [0.5] * 799}, 'codebook.analog: 799 values, expected 800'),
+        'no values': ({'digital_im': Parameter.Type.DOUBLE_ARRAY}, 'codebook.digital_im'),
+        'wrong id': ({'id': 'deadbeefdeadbeef'}, "codebook.id: 'deadbeefdeadbeef', expected"),
+        'NaN': ({'analog': nan_at_5, 'id': ''}, 'analog: not finite'),
+        'beyond 1': ({'analog': high_at_5, 'id': ''}, 'analog: 0.5 to 1.25, expected 0 to 1'),
+        'infinite': ({'digital_re': [math.inf] * 192, 'id': ''}, 'digital: not finite'),
+        'power': ({'digital_re': [1.0] * 192, 'id': ''}, 'digital: .*power'),
+        'another shape': ({'shape': [2, 8, 4, 3, 99]}, 'codebook.analog: 800 values, .*792'),
+        'no shape': ({'shape': [2, 8, 4]}, r'codebook.shape: .*\[2, 8, 4\].*, expected'),
+        'negative shape': ({'shape': [2, 8, -4, -3, 100]}, 'codebook.shape: .*positive'),
+        'endless shape': ({'shape': [10**5, 10**5, 100, 3, 100]}, 'codebook'),
+        'another scenario': (
+            {'shape': [1, 8, 4, 3, 100], 'analog': [0.5] * 400, 'digital_re': [0.001] * 96,
+             'digital_im': [0.0] * 96, 'id': ''},
+            r'analog: shape \(1, 4, 100\), expected \[N_B, F, N_E\] = \(2, 4, 100\)'),
+    }
+
+
+@pytest.mark.parametrize('name', wrong_sets())
+def test_a_set_that_makes_no_codebook_is_refused_whole(
+        bench, optimizer, client, probe, shipped, other, name):
+    heard = latched(bench, probe)
+    changes, text = wrong_sets()[name]
+    wrong = [Parameter(f'codebook.{k}', value=v) if isinstance(v, list | str) else
+             Parameter(f'codebook.{k}', v, []) for k, v in changes.items()]
+    answer = bench.result(client.set_parameters_atomically(wrong))
+    assert not answer.result.successful
+    assert re.search(text, answer.result.reason), answer.result.reason
+    # Alone, none of them is taken either: the node stays with what it has.
+    for parameter in wrong:
+        result, = bench.result(client.set_parameters([parameter])).results
+        if parameter.value != '':
+            assert not result.successful
+            assert result.reason
+    assert held(optimizer).id == shipped.id
+    bench.result(client.set_parameters_atomically(as_parameters(other)))
+    bench.until(lambda: heard[-1].codebook_id == other.id, 'the next good codebook')
+    assert {message.codebook_id for message in heard} == {shipped.id, other.id}
+
+
+@pytest.mark.parametrize('name', [*TYPES, 'codebook.provenance'])
+def test_a_value_of_another_type_is_refused(bench, optimizer, client, shipped, name):
+    for wrong in (Parameter(name, value=True), Parameter(name, Parameter.Type.NOT_SET)):
+        result, = bench.result(client.set_parameters([wrong])).results
+        assert not result.successful
+        assert result.reason
+    assert held(optimizer).id == shipped.id
+    assert optimizer.get_parameter(name).value == pytest.approx(
+        shipped.to_parameters()[name], nan_ok=True)
+
+
+def test_own_settings_do_not_change_at_run_time(bench, client):
+    for name in ('scenario_file', 'codebook_file'):
+        result, = bench.result(client.set_parameters([Parameter(name, value='/x')])).results
+        assert not result.successful
+        assert 'read-only' in result.reason
+
+
+@pytest.mark.parametrize('namespace', ['/', '/hall/east'])
+def test_a_codebook_file_is_a_parameter_file(bench, other, tmp_path, shipped, namespace):
+    path = tmp_path / 'other.yaml'
+    other.save(path)
+    for file, codebook in ((path, other), (default_codebook_file(), shipped)):
+        node = bench.add(
+            OptimizerNode, namespace=namespace,
+            cli_args=['--ros-args', '--params-file', str(file)], use_global_arguments=False)
+        assert held(node).id == codebook.id
+        assert node.get_parameter('codebook.id').value == codebook.id
+        bench.remove(node)
+
+
+def test_a_codebook_file_can_be_loaded_while_it_runs(bench, optimizer, client, other, tmp_path):
+    path = tmp_path / 'other.yaml'
+    dataclasses.replace(other, average_crlb_m2=0.2, provenance='a test').save(path)
+    answer = bench.result(client.load_parameter_file_atomically(str(path), use_wildcard=True))
+    assert answer.result.successful
+    assert held(optimizer).id == other.id
+
+
+def test_scenario_and_codebook_of_other_files(bench, small, small_files):
+    node = bench.add(OptimizerNode, parameter_overrides=[
+        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
+        Parameter('codebook_file', value=str(small_files / 'first.yaml'))])
+    assert held(node).id == Codebook.load(small_files / 'first.yaml').id
+    held(node).check(small.scenario)
+
+
+@pytest.mark.parametrize(('name', 'content', 'error', 'text'), [
+    ('codebook_file', None, CodebookError, 'cannot be read'),
+    ('codebook_file', '{', CodebookError, 'cannot be read'),
+    ('codebook_file', 'a: 1', CodebookError, 'expected ros__parameters'),
+    ('scenario_file', None, ScenarioError, 'cannot be read'),
+    ('scenario_file', 'n_feed: 3', ScenarioError, 'n_feed: unknown field'),
+    ('scenario_file', 'n_feeds: 2', CodebookError, r'digital: shape \(2, 8, 4, 3\), expected'),
+])
+def test_a_bad_file_is_refused_at_the_start(bench, tmp_path, name, content, error, text):
+    path = tmp_path / 'bad.yaml'
+    if content is not None:
+        path.write_text(content, encoding='utf-8')
+    with pytest.raises(error, match=text):
+        bench.add(OptimizerNode, parameter_overrides=[Parameter(name, value=str(path))])
+
+
+def test_a_bad_codebook_is_refused_at_the_start(bench):
+    with pytest.raises(CodebookError, match='codebook.id'):
+        bench.add(OptimizerNode, parameter_overrides=[
+            Parameter('codebook.id', value='deadbeefdeadbeef')])
+
+
+def test_a_setting_of_the_wrong_type_is_refused_at_the_start(bench):
+    with pytest.raises(ParameterError, match='codebook_file: .*expected a string'):
+        bench.add(OptimizerNode, parameter_overrides=[Parameter('codebook_file', value=1)])

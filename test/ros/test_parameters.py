@@ -1,0 +1,243 @@
+"""Declaration, checks and documentation of the parameters."""
+
+import itertools
+import math
+
+import pytest
+from rcl_interfaces.msg import ParameterType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.nodes.bs import BsNode
+from rhs_isac_ros.nodes.transmission import TransmissionNode
+from rhs_isac_ros.nodes.user import UserNode
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros.parameters import NODES, ParameterError, declare
+
+PAIRS = [(executable, p) for executable, group in NODES.items() for p in group]
+NAMES = [f'{executable}-{p.name}' for executable, p in PAIRS]
+each_parameter = pytest.mark.parametrize(('executable', 'parameter'), PAIRS, ids=NAMES)
+TYPES = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
+         float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING,
+         list: ParameterType.PARAMETER_DOUBLE_ARRAY}
+
+
+def only(choose):
+    """Parametrise over the parameters that a function chooses."""
+    chosen = [(pair, name) for pair, name in zip(PAIRS, NAMES, strict=True) if choose(pair[1])]
+    assert chosen
+    return pytest.mark.parametrize(
+        ('executable', 'parameter'), [pair for pair, _ in chosen],
+        ids=[name for _, name in chosen])
+
+
+has_range = only(lambda p: p.low is not None)
+has_choices = only(lambda p: p.choices)
+has_fractions = only(lambda p: type(p.default) in (float, list))
+
+
+@pytest.fixture
+def make(bench):
+    """Function that makes a node with the given start-up values."""
+    numbers = itertools.count()
+
+    def make(**values):
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        return bench.add(Node, f'probe_{next(numbers)}', parameter_overrides=overrides)
+    return make
+
+
+def value_of(parameter, number):
+    return [0.0, float(number)] if isinstance(parameter.default, list) else type(
+        parameter.default)(number)
+
+
+def refusal(make, executable, name, value):
+    """What declare() says to a bad value."""
+    with pytest.raises(ParameterError) as caught:
+        declare(make(**{name: value}), executable)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize('executable', NODES)
+def test_defaults(make, executable):
+    values = vars(declare(make(), executable))
+    assert values == {p.name: p.default for p in NODES[executable]}
+    assert [type(values[p.name]) for p in NODES[executable]] == [
+        type(p.default) for p in NODES[executable]]
+
+
+@pytest.mark.parametrize('executable', NODES)
+def test_descriptors(make, executable):
+    node = make()
+    declare(node, executable)
+    for p in NODES[executable]:
+        descriptor = node.describe_parameter(p.name)
+        assert descriptor.read_only
+        assert descriptor.type == TYPES[type(p.default)]
+        assert descriptor.description.startswith(p.text)
+        assert f'[{p.unit}]' in descriptor.description or not p.unit
+        assert descriptor.additional_constraints == p.expected
+        ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
+        assert [(r.from_value, r.to_value) for r in ranges] == (
+            [(p.low, p.high)] if type(p.default) in (int, float) else [])
+
+
+@each_parameter
+def test_numbers_have_ranges_and_texts_are_sentences(executable, parameter):
+    assert (parameter.low is not None) == (type(parameter.default) in (int, float, list))
+    assert parameter.text.endswith('.')
+    assert parameter.choices == () or parameter.default in parameter.choices
+
+
+@each_parameter
+def test_a_value_of_another_type_is_refused(make, executable, parameter):
+    others = {bool: 'yes', int: 2.5, float: 3, str: 17, list: ['1', '2']}
+    wrong = others[type(parameter.default)]
+    text = refusal(make, executable, parameter.name, wrong)
+    assert text.startswith(f'{parameter.name}: ')
+    assert str(wrong) in text
+    assert f'expected {parameter.expected}' in text
+
+
+@only(lambda p: isinstance(p.default, int | float) and not isinstance(p.default, bool))
+def test_a_number_given_as_a_string_is_refused(make, executable, parameter):
+    # As `ros2 param set` sends 28e9.
+    text = refusal(make, executable, parameter.name, '28e9')
+    assert text.startswith(f'{parameter.name}: ')
+    assert "'28e9'" in text
+    assert f'expected {parameter.expected}' in text
+
+
+@has_range
+@pytest.mark.parametrize('side', ['low', 'high'])
+def test_ends_of_a_range_are_in_it_and_what_is_beyond_is_not(make, executable, parameter, side):
+    end = getattr(parameter, side)
+    inside = value_of(parameter, end)
+    assert getattr(declare(make(**{parameter.name: inside}), executable),
+                   parameter.name) == inside
+    away = end + (1 if side == 'high' else -1) * max(1, abs(end) * 1e-6)
+    beyond = value_of(parameter, away)
+    text = refusal(make, executable, parameter.name, beyond)
+    assert text.startswith(f'{parameter.name}: ')
+    assert str(beyond) in text
+    assert f'expected {parameter.expected}' in text
+    assert format(parameter.high, 'd' if type(end) is int else 'g') in text
+
+
+@has_fractions
+@pytest.mark.parametrize('number', [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_refused(make, executable, parameter, number):
+    text = refusal(make, executable, parameter.name, value_of(parameter, number))
+    assert text.startswith(f'{parameter.name}: ')
+    assert str(number) in text
+    assert f'expected {parameter.expected}' in text
+
+
+@has_choices
+def test_choices(make, executable, parameter):
+    for choice in parameter.choices:
+        node = make(**{parameter.name: choice})
+        assert getattr(declare(node, executable), parameter.name) == choice
+    text = refusal(make, executable, parameter.name, 'best')
+    assert text.startswith(f"{parameter.name}: 'best', expected ")
+    assert all(choice in text for choice in parameter.choices)
+    assert refusal(make, executable, parameter.name, '').startswith(f"{parameter.name}: ''")
+
+
+@each_parameter
+def test_nothing_changes_at_run_time(make, executable, parameter):
+    node = make()
+    declare(node, executable)
+    # A value that would be right at the start.
+    right = parameter.choices[-1] if parameter.choices else {
+        bool: not parameter.default, int: 1, float: parameter.low, str: 'a', list: [1.0]}[
+            type(parameter.default)]
+    result, = node.set_parameters([Parameter(parameter.name, value=right)])
+    assert not result.successful
+    assert 'read-only' in result.reason
+    unset = Parameter(parameter.name, value=[])
+    assert node.get_parameter_or(parameter.name, unset).value == parameter.default
+
+
+def test_table_lists_every_parameter_once_with_all_that_is_to_know():
+    head, rule, *rows = parameters.table().splitlines()
+    columns = head.count('|')
+    assert rule == '|' + '---|' * (columns - 1)
+    owners = {}
+    for executable, p in PAIRS:
+        owners.setdefault(p.name, []).append(executable)
+    assert [row.split('|')[1] for row in rows] == [f' `{name}` ' for name in owners]
+    by_name = {p.name: p for _, p in PAIRS}
+    for row, (name, nodes) in zip(rows, owners.items(), strict=True):
+        p, cells = by_name[name], [cell.strip() for cell in row.split('|')]
+        assert row.count('|') == columns
+        default = {True: 'true', False: 'false'}[p.default] if isinstance(
+            p.default, bool) else str(p.default)
+        assert ('empty' if p.default in ('', []) else default) in cells
+        assert {p.text, ', '.join(nodes)} <= set(cells)
+        assert all(choice in row for choice in p.choices)
+        assert p.unit in row
+
+
+def test_a_parameter_that_nodes_share_is_the_same_in_all():
+    shared = {}
+    for _, p in PAIRS:
+        assert shared.setdefault(p.name, p) == p
+
+
+@pytest.mark.parametrize(('values', 'text'), [
+    ({'position_m': [10.0, 0.0]}, r'position_m: 2 numbers, expected three'),
+    ({'position_m': [10.0, 0.0, 0.0] * 2}, r'position_m: 2 points, expected one'),
+    ({'position_m': [4.9, 0.0, 0.0]}, r'position_m: \[\[4.9, 0.0, 0.0\]\], .* region'),
+    ({'position_m': [10.0, 0.0, 1.1]}, r'position_m: .*1.1.*, expected .*\[5.0, -5.0, -1.0\]'),
+    ({'mobility': 'waypoints'}, r'waypoints_m: empty, expected x, y, z'),
+    ({'mobility': 'waypoints', 'waypoints_m': [10.0]}, r'waypoints_m: 1 numbers'),
+    ({'mobility': 'waypoints', 'waypoints_m': [10.0, 0.0, 0.0, 10.0, 6.0, 0.0]},
+     r'waypoints_m: .* region of interest'),
+    ({'mobility': 'random_walk', 'speed_mps': 5.6},
+     r'speed_mps: 5.6, expected at most max_user_speed_mps = 5.55'),
+])
+def test_values_of_a_user_that_do_not_fit_the_scenario_are_refused(bench, values, text):
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
+    with pytest.raises(ParameterError, match=text):
+        bench.add(UserNode, parameter_overrides=overrides)
+
+
+@pytest.mark.parametrize(('values', 'place'), [
+    ({'position_m': [9.0, 1.0, -0.5]}, (9.0, 1.0, -0.5)),
+    ({'mobility': 'random_walk', 'position_m': [9.0, 1.0, -0.5], 'speed_mps': 0.0},
+     (9.0, 1.0, -0.5)),
+    ({'mobility': 'waypoints', 'waypoints_m': [5.0, 5.0, 1.0]}, (5.0, 5.0, 1.0)),
+])
+def test_a_user_starts_where_its_parameters_say(bench, values, place):
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
+    bench.add(UserNode, parameter_overrides=overrides)
+    truths = bench.hear(bench.add(Node, 'probe'), m.GroundTruth)
+    bench.until(lambda: truths, 'the true position')
+    assert truths[0].position == pytest.approx(place, abs=1e-12)
+    assert truths[0].user == 1
+
+
+def test_a_user_without_a_position_starts_in_the_region(bench):
+    bench.add(UserNode)
+    bench.add(UserNode, 'second', parameter_overrides=[Parameter('user_id', value=2)])
+    truths = bench.hear(bench.add(Node, 'probe'), m.GroundTruth)
+    bench.until(lambda: {truth.user for truth in truths} == {1, 2}, 'both true positions')
+    low, high = Scenario().roi_bounds_m
+    assert all(((low <= truth.position) & (truth.position <= high)).all() for truth in truths)
+    first, second = ({tuple(t.position) for t in truths if t.user == user} for user in (1, 2))
+    assert len(first) == len(second) == 1
+    assert first != second
+
+
+def test_a_band_that_the_scenario_does_not_have_is_refused(bench):
+    with pytest.raises(ParameterError, match='band: 2, expected 0 to 1 of the scenario'):
+        bench.add(TransmissionNode, parameter_overrides=[Parameter('band', value=2)])
+
+
+def test_a_node_reads_the_scenario_of_its_file(bench, small, small_files):
+    overrides = [Parameter('scenario_file', value=str(small_files / 'scenario.yaml'))]
+    assert bench.add(BsNode, parameter_overrides=overrides).scenario == small.scenario

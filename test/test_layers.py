@@ -1,0 +1,107 @@
+"""The layers of the package: who may import whom."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rhs_isac_ros
+
+LAYERS = (
+    'model', 'bounds', 'codebook', 'positioning', 'link', 'protocol', 'ros', 'nodes')
+ROS_LAYERS = ('ros', 'nodes')
+PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)
+# All that the pure layers may import besides the standard library and their own.
+LIBRARIES = {'numpy', 'scipy', 'yaml'}
+ROOT = Path(rhs_isac_ros.__file__).parent
+MODULES = sorted(ROOT.rglob('*.py'))
+MOST_LINES = 299
+
+
+def module_name(path: Path) -> str:
+    return '.'.join(('rhs_isac_ros', *path.relative_to(ROOT).with_suffix('').parts))
+
+
+def imported(path: Path) -> set[str]:
+    """Full names of all that a module imports, anywhere in it."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}: relative import'
+            # From the package itself, what is imported may be a layer.
+            names.add(node.module)
+            names.update(f'{node.module}.{alias.name}' for alias in node.names)
+    return names
+
+
+def layer_of(name: str) -> str | None:
+    parts = name.split('.')
+    if parts[0] != 'rhs_isac_ros' or len(parts) == 1:
+        return None
+    return parts[1] if parts[1] in LAYERS else None
+
+
+def test_the_package_is_made_of_its_layers():
+    folders = {path.name for path in ROOT.iterdir()
+               if path.is_dir() and any(path.rglob('*.py'))}
+    assert folders <= set(LAYERS)
+    assert set(PURE_LAYERS[:4]) <= folders
+    assert {path.name for path in ROOT.glob('*.py')} == {'__init__.py'}
+
+
+@pytest.mark.parametrize('path', MODULES, ids=module_name)
+def test_imports_go_down(path):
+    own = layer_of(module_name(path))
+    allowed = () if own is None else LAYERS[:LAYERS.index(own) + 1]
+    above = {name for name in imported(path) if (layer_of(name) or own) != own
+             and layer_of(name) not in allowed}
+    assert not above
+
+
+@pytest.mark.parametrize(
+    'path', [path for path in MODULES if layer_of(module_name(path)) not in ROS_LAYERS],
+    ids=module_name)
+def test_pure_layers_import_no_ros(path):
+    """Nor anything else that a plain Python with three libraries lacks."""
+    roots = {name.partition('.')[0] for name in imported(path)}
+    assert roots <= set(sys.stdlib_module_names) | LIBRARIES | {'rhs_isac_ros'}
+
+
+def test_pure_layers_work_where_there_is_no_ros():
+    """In a fresh interpreter that refuses whatever is not needed."""
+    names = [module_name(path).removesuffix('.__init__') for path in MODULES
+             if layer_of(module_name(path)) in PURE_LAYERS]
+    code = f'''
+import importlib, sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        root = name.partition('.')[0]
+        if root in ('rclpy', 'launch', 'launch_ros', 'tf2_ros') or root.endswith(
+                ('_msgs', '_interfaces')) or root.startswith(('rosidl', 'rpyutils')):
+            raise ImportError('refused: ' + name)
+
+sys.meta_path.insert(0, Refuse())
+for name in {names!r}:
+    importlib.import_module(name)
+try:
+    importlib.import_module('rclpy')
+except ImportError:
+    print('done')
+'''
+    paths = [str(ROOT.parent), *filter(None, [os.environ.get('PYTHONPATH')])]
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, timeout=60,
+        env=os.environ | {'PYTHONPATH': os.pathsep.join(paths)}, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == 'done'
+
+
+@pytest.mark.parametrize('path', MODULES, ids=module_name)
+def test_modules_are_short(path):
+    assert len(path.read_text(encoding='utf-8').splitlines()) <= MOST_LINES
