@@ -1,5 +1,6 @@
 """Executables in processes of their own, and a node in this process that watches them."""
 
+import collections
 import contextlib
 import math
 import os
@@ -123,6 +124,9 @@ class Watch:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self.heard = {kind: [] for kind in topics.NAMES}
+        self._of_cycle = collections.defaultdict(list)
+        # Cycles that were served, in their order.
+        self.served = []
         self.poses = []
         # Functions to call with each message of a kind.
         self.hooks = {}
@@ -136,11 +140,17 @@ class Watch:
     def _hear(self, kind, message):
         plain = convert.from_ros(kind, message)
         self.heard[kind].append(plain)
+        self._of_cycle[kind, getattr(plain, 'cycle_id', None)].append(plain)
+        if kind is m.ProtocolState and plain.outcome == 'served':
+            self.served.append(plain)
         if kind in self.hooks:
             self.hooks[kind](plain)
 
-    def spin_once(self):
-        self._executor.spin_once(timeout_sec=0.1)
+    def _spin(self):
+        """Hear for a moment: a condition that is asked after each message would fall behind."""
+        end_s = time.monotonic() + 0.02
+        while (left_s := end_s - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left_s)
 
     def until(self, condition, what, processes=()):
         """Spin until a condition holds, and return its value."""
@@ -150,7 +160,7 @@ class Watch:
                 assert process.running, f'ended with {process.wait()}\n{process.log}'
             assert time.monotonic() < end_s, '\n'.join(
                 [f'{what} does not come about', *(process.log for process in processes)])
-            self.spin_once()
+            self._spin()
         return value
 
     def answer(self, client, request, processes=()):
@@ -181,12 +191,7 @@ class Watch:
         return publisher
 
     def of_cycle(self, kind, cycle_id):
-        return [message for message in self.heard[kind] if message.cycle_id == cycle_id]
-
-    @property
-    def served(self):
-        """Cycles that were served, in their order."""
-        return [message for message in self.heard[m.ProtocolState] if message.outcome == 'served']
+        return list(self._of_cycle[kind, cycle_id])
 
     @property
     def given_up(self):
