@@ -2,7 +2,8 @@
 
 import numpy as np
 
-CHANNEL, RECEIVER, USER, BASE_STATION, SAMPLES, START, HELD_OUT = range(7)
+(CHANNEL, RECEIVER, USER, BASE_STATION, SAMPLES, START, HELD_OUT, SKETCH, PAIRS,
+ METHOD) = range(10)
 
 
 def generator(seed: int, stream: int, *key: int) -> np.random.Generator:

@@ -132,6 +132,104 @@ def test_inverse_information_inverts_what_it_can():
     np.testing.assert_array_equal(np.diag(inverse[1]), np.inf)
 
 
+def random_directions(rng, n):
+    return np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+
+
+def test_inverse_information_is_the_inverse_whatever_the_units():
+    """Each axis has its own unit, up to nine orders apart."""
+    rng = np.random.default_rng(4)
+    roots = rng.normal(size=(200, 3, 5))
+    matrices = roots @ np.swapaxes(roots, 1, 2)
+    units = 10.0**rng.uniform(-4, 5, size=(200, 3))
+    scale = units[:, :, None] * units[:, None, :]
+    inverse = fisher.inverse_information(matrices * scale)
+    expected = np.linalg.inv(matrices)
+    errors = np.abs(inverse * scale - expected).max(axis=(1, 2))
+    sizes = np.abs(expected).max(axis=(1, 2))
+    assert (errors <= 1e-14 * np.linalg.cond(matrices) * sizes).all()
+    np.testing.assert_allclose(inverse, np.swapaxes(inverse, 1, 2), rtol=1e-9)
+
+
+@pytest.mark.parametrize('eigenvalues', [
+    (1, 1, 1e-4), (1, 1e-4, 1e-4), (1, 1e-2, 1e-4), (1, 1, 1e-8), (1, 1e-4, 1e-8),
+    (1, 1e-8, 1e-8), (1, 1, 1e-10), (1, 1e-5, 1e-10), (1, 1e-10, 1e-10)], ids=str)
+def test_inverse_information_is_as_accurate_as_the_condition_allows(eigenvalues):
+    rng = np.random.default_rng(5)
+    turns = random_directions(rng, 100)
+    matrices = (turns * np.array(eigenvalues)) @ np.swapaxes(turns, 1, 2)
+    matrices = (matrices + np.swapaxes(matrices, 1, 2)) / 2
+    units = 10.0**rng.uniform(-3, 3, size=(100, 3))
+    scale = units[:, :, None] * units[:, None, :]
+    inverse = fisher.inverse_information(matrices * scale) * scale
+    expected = np.linalg.inv(matrices)
+    errors = np.linalg.norm(inverse - expected, axis=(1, 2))
+    # Both have errors; with a matrix that is off by one unit in the last place, so is its inverse.
+    allowed = 2e-15 * np.linalg.cond(matrices) * np.linalg.norm(expected, axis=(1, 2))
+    assert (errors <= allowed).all()
+
+
+@pytest.mark.parametrize('rank', [0, 1, 2])
+def test_singular_information_is_infinite_without_a_warning(rank):
+    rng = np.random.default_rng(6 + rank)
+    units = 10.0**rng.uniform(-3, 3, size=(100, 3, 1))
+    roots = units * rng.normal(size=(100, 3, rank))
+    inverse = fisher.inverse_information(roots @ np.swapaxes(roots, 1, 2))
+    np.testing.assert_array_equal(np.diagonal(inverse, axis1=1, axis2=2), np.inf)
+    assert not np.isnan(inverse).any()
+
+
+@pytest.mark.parametrize('axes', [(), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2)], ids=str)
+def test_an_axis_without_information_makes_the_bound_infinite(axes):
+    information = np.zeros((1, 3, 3))
+    information[0, axes, axes] = 7.0
+    inverse = fisher.inverse_information(information)
+    np.testing.assert_array_equal(np.diagonal(inverse[0]), np.inf)
+
+
+def test_a_singular_matrix_leaves_the_others_alone():
+    information = np.stack([np.diag([1.0, 4.0, 0.25]), np.ones((3, 3)), np.zeros((3, 3)),
+                            np.diag([2.0, 5.0, 10.0])])
+    inverse = fisher.inverse_information(information)
+    np.testing.assert_allclose(inverse[0], np.diag([1, 0.25, 4]), rtol=1e-15)
+    np.testing.assert_allclose(inverse[3], np.diag([0.5, 0.2, 0.1]), rtol=1e-15)
+    assert fisher.inverse_information(np.zeros((0, 3, 3))).shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize('distance', [10, 100, 1000])
+def test_bound_is_the_inverse_near_and_far(shipped, distance):
+    """Far away, all information is about the distance, but there is some of the rest."""
+    scenario = Scenario()
+    positions = distance * np.array([[1.0, 1.0, 0.3], [1.0, 0.0, 0.0], [2.0, -1.0, 0.1]])
+    information = fisher_information(scenario, shipped, positions)
+    assert np.linalg.cond(information).max() < 1e10
+    expected = np.trace(np.linalg.inv(information), axis1=1, axis2=2)
+    np.testing.assert_allclose(
+        crlb(scenario, shipped, positions), expected,
+        rtol=1e-15 * np.linalg.cond(information).max())
+
+
+@pytest.mark.parametrize('n_rows', [1, 2, 3])
+def test_mean_derivative_takes_any_number_of_rows(faded, n_rows):
+    """One a pair of positions, three a position."""
+    scenario, codebook = faded
+    rng, pattern = np.random.default_rng(7), radiation_matrix(scenario, codebook)[1]
+    rows = rng.normal(size=(4, n_rows, 2, 9, 2)) @ [1, 1j]
+    means = fisher.mean_derivative(rows, pattern)
+    assert means.shape == (4, n_rows, 6)
+    expected = np.einsum('jqm,ngjm->ngjq', pattern.reshape(2, 3, 9), rows)
+    np.testing.assert_allclose(means, expected.reshape(4, n_rows, 6), rtol=1e-10)
+
+
+def test_information_is_twice_the_real_part_of_the_products():
+    whitened = np.random.default_rng(8).normal(size=(4, 2, 5, 2)) @ [1, 1j]
+    expected = 2 * np.einsum('nga,nha->ngh', whitened.conj(), whitened).real
+    # In whatever order it lies in memory.
+    for layout in (whitened, np.asfortranarray(whitened)):
+        np.testing.assert_allclose(
+            fisher.information_of(layout), expected, rtol=1e-12, atol=1e-12)
+
+
 def test_no_positions_have_no_bounds(small):
     assert crlb(small.scenario, small.codebook, np.zeros((0, 3))).shape == (0,)
 

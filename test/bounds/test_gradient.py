@@ -1,121 +1,65 @@
-"""The average bound and its gradients."""
-
-import dataclasses
+"""The chain rule from beam patterns to a codebook."""
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import AverageCrlb, average_crlb, gradient
-from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.bounds.gradient import gradient_analog, gradient_digital
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.multipath import multipath_covariance
 
 
-def assert_is_the_vectors(outcome, vectors):
-    value, by_analog, by_digital = outcome
-    assert value == pytest.approx(float(vectors['average_crlb']), rel=1e-8)
-    for actual, expected in ((by_analog, vectors['grad_analog']),
-                             (by_digital, vectors['grad_digital'])):
-        assert actual.shape == expected.shape
-        assert actual.dtype == expected.dtype
-        scale = np.abs(expected).max()
-        np.testing.assert_allclose(actual, expected, rtol=1e-8, atol=1e-8 * scale)
+def complex_array(rng, *shape):
+    return rng.normal(size=(*shape, 2)) @ [1, 1j]
 
 
-def test_value_and_gradients_are_the_vectors(case):
-    outcome = average_crlb(case.scenario, case.codebook, case.vectors['positions'])
-    assert type(outcome[0]) is float
-    assert_is_the_vectors(outcome, case.vectors)
-
-
-def test_result_does_not_depend_on_the_blocks(case, monkeypatch):
-    monkeypatch.setattr(gradient, '_BLOCK', 4)
-    assert_is_the_vectors(
-        average_crlb(case.scenario, case.codebook, case.vectors['positions']), case.vectors)
-
-
-@pytest.mark.parametrize(('limit', 'calls'), [(1 << 30, 0), (0, 2)], ids=['cached', 'uncached'])
-def test_derivatives_are_kept_only_within_the_memory_limit(case, monkeypatch, limit, calls):
-    monkeypatch.setattr(gradient, '_CACHE_BYTES', limit)
-    monkeypatch.setattr(gradient, '_BLOCK', 4)
-    average = AverageCrlb(case.scenario, case.vectors['positions'])
-    original, counted = gradient.los_derivative, []
-
-    def count(*args):
-        counted.append(args)
-        return original(*args)
-
-    monkeypatch.setattr(gradient, 'los_derivative', count)
-    for _ in range(2):
-        assert_is_the_vectors(average(case.codebook), case.vectors)
-    # Two evaluations of two blocks in every band.
-    assert len(counted) == 2 * calls * case.scenario.n_bands
-
-
-# N_B, N_SB, F, K, elements along a side.
-SIZES = [(1, 3, 2, 2, 3), (2, 2, 3, 1, 3), (3, 1, 2, 3, 2), (2, 2, 1, 2, 4), (1, 1, 4, 3, 4)]
-
-
-@pytest.mark.parametrize('sizes', SIZES)
-def test_gradients_are_the_limit_of_differences_of_plain_bounds(sizes, plain, random_beams):
-    n_bands, n_subbands, n_frames, n_feeds, side = sizes
-    rng = np.random.default_rng(SIZES.index(sizes))
+@pytest.fixture(scope='module')
+def odd(random_beams):
     scenario = Scenario(
-        center_frequencies_hz=tuple(rng.uniform(1e9, 4e9, n_bands)), n_subbands=n_subbands,
-        n_frames=n_frames, n_feeds=n_feeds, elements_per_side=side, subband_width_hz=3e5,
-        frame_duration_s=2e-3, roi_center_m=(3, 0, 0), roi_size_m=(2, 3, 2))
-    codebook = random_beams(scenario, rng)
-    spatial = multipath_covariance(scenario)
-    positions = scenario.sample_positions(2, rng)
+        center_frequencies_hz=(1.9e9, 3.3e9), n_subbands=3, n_frames=2, n_feeds=4,
+        elements_per_side=3, subband_width_hz=2e7)
+    return scenario, random_beams(scenario, np.random.default_rng(0))
 
-    def bound(analog, digital):
-        return plain(scenario, analog, digital).crlb(positions, spatial).mean()
 
-    value, by_analog, by_digital = average_crlb(scenario, codebook, positions)
+@pytest.fixture(scope='module')
+def distance(odd, plain):
+    """Sum of |T - A|^2 with plain patterns T and some A, as a function of a codebook.
+
+    It is quadratic in the analog and in the digital variables, for which central differences are
+    exact. The second result is its derivative by the patterns.
+    """
+    scenario, _ = odd
+    targets = 0.05 * complex_array(np.random.default_rng(1), 2, 6, 9)
+
+    def of(analog, digital):
+        p = plain(scenario, analog, digital)
+        offsets = np.stack([p.pattern(i) for i in range(2)]) - targets
+        return np.sum(np.abs(offsets)**2), 2 * offsets
+    return of
+
+
+def test_gradient_by_the_configurations_is_the_difference_quotient(odd, distance):
+    scenario, codebook = odd
     analog, digital = codebook.analog, codebook.digital
-    assert value == pytest.approx(bound(analog, digital), rel=1e-7)
-    size, scale, step = np.linalg.norm(analog), np.linalg.norm(digital), 1e-5
-    # One feed's weights hardly count, next to rounding in the bound itself.
-    slack = 1e-6 * value
-    for _ in range(2):
-        way = rng.normal(size=analog.shape)
-        way *= size / np.linalg.norm(way)
-        difference = (bound(analog + step * way, digital) - bound(analog - step * way, digital))
-        assert np.sum(by_analog * way) == pytest.approx(
-            difference / (2 * step), abs=slack + 1e-6 * np.linalg.norm(by_analog) * size)
-        way = rng.normal(size=(*digital.shape, 2)) @ [1, 1j]
-        way *= scale / np.linalg.norm(way)
-        difference = (bound(analog, digital + step * way) - bound(analog, digital - step * way))
-        assert np.sum(by_digital.conj() * way).real == pytest.approx(
-            difference / (2 * step), abs=slack + 1e-6 * np.linalg.norm(by_digital) * scale)
+    gradient = gradient_analog(scenario, codebook, distance(analog, digital)[1])
+    assert (gradient.shape, gradient.dtype) == (analog.shape, float)
+    for index in ((0, 0, 0), (0, 1, 5), (1, 0, 3), (1, 1, 8)):
+        step = np.zeros_like(analog)
+        step[index] = 1.0
+        difference = distance(analog + step, digital)[0] - distance(analog - step, digital)[0]
+        assert gradient[index] == pytest.approx(
+            difference / 2, rel=1e-9, abs=1e-9 * np.abs(gradient).max())
 
 
-def test_value_is_the_mean_over_the_positions(small):
-    """The vectors hold the bound of every position; any choice of them has their mean."""
-    average = AverageCrlb(small.scenario, small.vectors['positions'][[4, 1, 1]])
-    expected = small.vectors['crlb'][[4, 1, 1]].mean()
-    assert average(small.codebook)[0] == pytest.approx(expected, rel=1e-8)
-
-
-def test_a_common_phase_of_a_frame_changes_nothing(small):
-    """So the gradient has no part along it; noise and multipath are circular."""
-    value, _, by_digital = average_crlb(
-        small.scenario, small.codebook, small.vectors['positions'])
-    turned = dataclasses.replace(
-        small.codebook, digital=small.codebook.digital * np.exp(0.7j))
-    assert average_crlb(small.scenario, turned, small.vectors['positions'])[0] == pytest.approx(
-        value, rel=1e-9)
-    along = np.sum(by_digital.conj() * 1j * small.codebook.digital, axis=(1, 3)).real
-    assert np.abs(along).max() < 1e-7 * value
-
-
-def test_singular_information_is_infinite_without_a_warning(small):
-    dark = Codebook(np.zeros((1, 2, 16)), small.codebook.digital)
-    assert average_crlb(small.scenario, dark, small.vectors['positions'])[0] == np.inf
-
-
-@pytest.mark.parametrize('positions', [
-    np.zeros((0, 3)), [10.0, 0.0, 0.0], [[10.0, 0.0]], [[np.nan, 0.0, 0.0]]])
-def test_malformed_positions_are_errors(small, positions):
-    with pytest.raises(ValueError, match='^positions: .*, expected '):
-        average_crlb(small.scenario, small.codebook, np.array(positions))
+def test_gradient_by_the_digital_weights_is_the_difference_quotient(odd, distance):
+    scenario, codebook = odd
+    analog, digital = codebook.analog, codebook.digital
+    gradient = gradient_digital(scenario, codebook, distance(analog, digital)[1])
+    assert (gradient.shape, gradient.dtype) == (digital.shape, complex)
+    size = np.abs(digital).max()
+    for index in ((0, 0, 0, 0), (0, 2, 1, 3), (1, 1, 0, 2), (1, 2, 1, 1)):
+        for direction in (1, 1j):
+            step = np.zeros_like(digital)
+            step[index] = direction * size
+            difference = (distance(analog, digital + step)[0]
+                          - distance(analog, digital - step)[0])
+            assert (gradient[index].conj() * direction).real == pytest.approx(
+                difference / (2 * size), rel=1e-9, abs=1e-9 * np.abs(gradient).max())

@@ -1,0 +1,182 @@
+"""Averages of losses of quadratic forms."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import compressed_rows, rows
+from rhs_isac_ros.bounds.average import Average, Gradient
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.multipath import multipath_covariance
+
+N_ITEMS = 7
+
+
+def complex_array(rng, *shape):
+    return rng.normal(size=(*shape, 2)) @ [1, 1j]
+
+
+@pytest.fixture(scope='module')
+def faded(random_beams):
+    """Two bands whose sub-bands and frames are far from fully correlated."""
+    scenario = Scenario(
+        center_frequencies_hz=(1.2e9, 3.1e9), n_subbands=3, n_frames=2, n_feeds=2,
+        elements_per_side=3, subband_width_hz=4e5, frame_duration_s=3e-3, noise_psd_dbm_hz=-70,
+        roi_center_m=(3, 0, 0), roi_size_m=(2, 4, 2))
+    return scenario, random_beams(scenario, np.random.default_rng(0))
+
+
+@pytest.fixture(scope='module', params=[1, 2, 3], ids='{} rows'.format)
+def items(request):
+    """Rows of some items, complex [N_ITEMS, G, N_B, N_SB, N_E], of nothing in particular."""
+    return 1e-4 * complex_array(np.random.default_rng(request.param), N_ITEMS, request.param,
+                                2, 3, 9)
+
+
+def make(scenario, items, loss, tolerance=0.0):
+    return Average(
+        scenario, lambda start, stop, band: items[start:stop, :, band], N_ITEMS, items.shape[1],
+        loss, tolerance)
+
+
+def plain_forms(p, items, spatial):
+    """The forms [N_ITEMS, G, G] by their definition, one number at a time."""
+    n_items, n_rows, n_bands = items.shape[:3]
+    forms = np.zeros((n_items, n_rows, n_rows))
+    for i in range(n_bands):
+        pattern, inverse = p.pattern(i), np.linalg.inv(p.covariance(i, spatial[i]))
+        means = np.stack([items[:, :, i, j] @ pattern[r] for r, (j, _) in enumerate(p.rows)], -1)
+        for n, u, v in np.ndindex(forms.shape):
+            forms[n, u, v] += 2 * (means[n, u].conj() @ inverse @ means[n, v]).real
+    return forms
+
+
+@pytest.fixture(scope='module')
+def loss(items):
+    """Other for every item: the product of its matrix and the form, plus log(1 + trace)."""
+    roots = np.random.default_rng(4).normal(size=(N_ITEMS, *[items.shape[1]] * 2))
+    matrices = roots + np.swapaxes(roots, 1, 2)
+
+    def of(block, forms):
+        traces = np.trace(forms, axis1=1, axis2=2)
+        values = np.sum(matrices[block] * forms, axis=(1, 2)) + np.log(1 + traces)
+        slopes = matrices[block] + np.eye(forms.shape[1]) / (1 + traces)[:, None, None]
+        return values, -slopes
+    return of
+
+
+@pytest.fixture(scope='module')
+def plain_average(faded, items, loss, plain):
+    scenario, _ = faded
+    spatial = multipath_covariance(scenario)
+
+    def of(analog, digital):
+        forms = plain_forms(plain(scenario, analog, digital), items, spatial)
+        return loss(slice(None), forms)[0].mean()
+    return of
+
+
+def assert_is(outcome, expected, tolerance):
+    for actual, wanted in zip(outcome, expected, strict=True):
+        np.testing.assert_allclose(
+            actual, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
+def test_gradients_are_the_limit_of_differences_of_the_plain_average(
+        faded, items, loss, plain_average, tolerance):
+    scenario, codebook = faded
+    rng, step = np.random.default_rng(5), 1e-5
+    analog, digital = codebook.analog, codebook.digital
+    outcome = make(scenario, items, loss, tolerance)(codebook)
+    assert isinstance(outcome, Gradient)
+    assert type(outcome.value) is float
+    assert outcome.value == pytest.approx(plain_average(analog, digital), rel=1e-6)
+    assert (outcome.by_analog.shape, outcome.by_analog.dtype) == (analog.shape, float)
+    assert (outcome.by_digital.shape, outcome.by_digital.dtype) == (digital.shape, complex)
+    for _ in range(2):
+        way = rng.normal(size=analog.shape)
+        difference = (plain_average(analog + step * way, digital)
+                      - plain_average(analog - step * way, digital))
+        scale = np.linalg.norm(outcome.by_analog) * np.linalg.norm(way)
+        assert np.sum(outcome.by_analog * way) == pytest.approx(
+            difference / (2 * step), abs=1e-6 * scale)
+        way = complex_array(rng, *digital.shape) * np.abs(digital).max()
+        difference = (plain_average(analog, digital + step * way)
+                      - plain_average(analog, digital - step * way))
+        scale = np.linalg.norm(outcome.by_digital) * np.linalg.norm(way)
+        assert np.sum(outcome.by_digital.conj() * way).real == pytest.approx(
+            difference / (2 * step), abs=1e-6 * scale)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
+def test_value_alone_is_that_with_gradients(faded, items, loss, tolerance):
+    scenario, codebook = faded
+    average = make(scenario, items, loss, tolerance)
+    value = average.value(codebook)
+    assert type(value) is float
+    assert value == pytest.approx(average(codebook).value, rel=1e-13)
+    assert value == pytest.approx(average.value(codebook), rel=1e-13)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
+@pytest.mark.parametrize('size', [1, 3, 7])
+def test_results_do_not_depend_on_the_blocks(
+        faded, items, loss, monkeypatch, tolerance, size):
+    """With the last block shorter, equal or the only one; the loss knows its items."""
+    scenario, codebook = faded
+    expected = make(scenario, items, loss)(codebook)
+    monkeypatch.setattr(rows, '_BLOCK', size)
+    average = make(scenario, items, loss, tolerance)
+    assert len(list(rows.blocks(average.rows.n_items))) == -(-N_ITEMS // size)
+    assert_is(average(codebook), expected, max(1e-12, 10 * tolerance))
+    assert average.value(codebook) == pytest.approx(expected.value, rel=max(1e-12, 10 * tolerance))
+
+
+def test_the_next_codebook_is_not_affected_by_the_last(faded, items, loss, random_beams):
+    scenario, codebook = faded
+    average = make(scenario, items, loss)
+    expected = average(codebook)
+    average(random_beams(scenario, np.random.default_rng(6)))
+    average.value(random_beams(scenario, np.random.default_rng(7)))
+    assert_is(average(codebook), expected, 1e-14)
+
+
+def test_a_constant_loss_has_its_value_and_no_gradient(faded, items):
+    scenario, codebook = faded
+    value, by_analog, by_digital = make(
+        scenario, items, lambda block, forms: (np.full(len(forms), 2.5), np.zeros_like(forms))
+    )(codebook)
+    assert value == 2.5
+    np.testing.assert_array_equal(by_analog, 0)
+    np.testing.assert_array_equal(by_digital, 0)
+
+
+def test_the_loss_gets_every_item_once_and_in_order(faded, items, plain, monkeypatch):
+    scenario, codebook = faded
+    monkeypatch.setattr(rows, '_BLOCK', 3)
+    seen = []
+
+    def record(block, forms):
+        seen.append((range(N_ITEMS)[block], forms.copy()))
+        return np.zeros(len(forms)), np.zeros_like(forms)
+
+    average = make(scenario, items, record)
+    p = plain(scenario, codebook.analog, codebook.digital)
+    expected = plain_forms(p, items, multipath_covariance(scenario))
+    for evaluate in (average, average.value):
+        seen.clear()
+        evaluate(codebook)
+        assert [n for numbers, _ in seen for n in numbers] == list(range(N_ITEMS))
+        assert_is([np.concatenate([forms for _, forms in seen])], [expected], 1e-9)
+
+
+def test_rows_are_exact_unless_there_is_a_tolerance(faded, items, loss):
+    scenario, _ = faded
+    assert isinstance(make(scenario, items, loss).rows, rows.ExactRows)
+    assert isinstance(make(scenario, items, loss, 1e-3).rows, compressed_rows.CompressedRows)
+
+
+@pytest.mark.parametrize('tolerance', [compressed_rows.MIN_TOLERANCE / 2, -1.0, -0.1, np.nan])
+def test_a_tolerance_that_cannot_be_held_is_an_error(faded, items, loss, tolerance):
+    with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
+        make(faded[0], items, loss, tolerance)
