@@ -7,7 +7,7 @@ import numpy as np
 from rhs_isac_ros.bounds.rows import Collected, Pass, RowSource, blocks
 from rhs_isac_ros.model import Scenario, streams
 
-# Columns of the first sketch; each next one has twice as many.
+# Least columns of the first sketch; each next one has twice as many.
 _SKETCH = 128
 # Gram matrices resolve no smaller relative error.
 MIN_TOLERANCE = 1e-7
@@ -48,7 +48,7 @@ class CompressedRows:
             coefficients, basis = _compress(
                 lambda block, band=band: source(block.start, block.stop, band).reshape(
                     -1, scenario.n_subbands * scenario.n_elements),
-                n_items, n_rows, tolerance)
+                n_items, n_rows, tolerance, _first_sketch(scenario))
             self.coefficients.append(coefficients)
             self.bases.append(basis.reshape(*self._shape, -1))
 
@@ -76,6 +76,8 @@ class CompressedRows:
 
 
 class _CompressedPass:
+    """One evaluation with coefficients."""
+
     def __init__(self, coefficients: Sequence[np.ndarray], bases: Sequence[np.ndarray],
                  n_rows: int, patterns: np.ndarray, whiteners: np.ndarray) -> None:
         self._coefficients, self._bases, self._n_rows = coefficients, bases, n_rows
@@ -109,6 +111,11 @@ class _CompressedPass:
                          weights.T @ np.conj(zeta))
 
 
+def _first_sketch(scenario: Scenario) -> int:
+    """Columns of the first sketch: about what Table I needs, and larger surfaces accordingly."""
+    return max(_SKETCH, scenario.n_elements // 2)
+
+
 def _filters(basis: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """What a pattern makes of the vectors of a basis: [R, N_SB F]."""
     n_subbands, n_elements, rank = basis.shape
@@ -118,12 +125,12 @@ def _filters(basis: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 
 def _compress(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
-              tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+              tolerance: float, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients [n_items n_rows, R] and an orthonormal basis [N_SB N_E, R] of some rows."""
     if not MIN_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f'tolerance: {tolerance:g}, expected {MIN_TOLERANCE:g} to 1, or 0 for exact rows')
-    total, size = n_items * n_rows, _SKETCH
+    total = n_items * n_rows
     while True:
         basis = _sketch(rows_of, n_items, n_rows, min(size, total))
         coefficients = np.empty((total, basis.shape[1]), complex)
@@ -151,8 +158,9 @@ def _sketch(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
     rng = streams.generator(0, streams.SKETCH, size)
     mixtures: np.ndarray | float = 0.0
     for block in blocks(n_items):
-        rows = np.conj(rows_of(block))
-        norms = np.linalg.norm(rows, axis=1, keepdims=True)
-        rows /= np.where(norms == 0, 1.0, norms)
-        mixtures = mixtures + rows.T @ rng.normal(size=(len(rows), size))
-    return np.linalg.qr(mixtures)[0]
+        rows = rows_of(block)
+        norms = np.linalg.norm(rows, axis=1)
+        weights = rng.normal(size=(size, len(rows))) / np.where(norms == 0, 1.0, norms)
+        # A real product: a quarter of the work of a complex one.
+        mixtures = mixtures + weights @ rows.view(float)
+    return np.linalg.qr(np.conj(mixtures.view(complex).T))[0]

@@ -182,6 +182,8 @@ class ExactRows:
 
 
 class _ExactPass:
+    """One evaluation with exact rows."""
+
     def __init__(self, rows: ExactRows, patterns: np.ndarray, whiteners: np.ndarray) -> None:
         self._rows, self._patterns, self._whiteners = rows, patterns, whiteners
         self._by_mean, self._spread = np.zeros_like(patterns), np.zeros_like(whiteners)

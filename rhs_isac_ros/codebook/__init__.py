@@ -1,10 +1,15 @@
 """Codebooks of analog and digital beamforming, and their optimisation."""
 
 from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
-from rhs_isac_ros.codebook.optimize import METHODS, OptimizeResult, Progress, optimize
+from rhs_isac_ros.codebook.directional import directional_codebook
+from rhs_isac_ros.codebook.objective import OBJECTIVES
+from rhs_isac_ros.codebook.optimize import METHODS, OptimizeResult, optimize
+from rhs_isac_ros.codebook.provenance import Provenance
+from rhs_isac_ros.codebook.sampling import SAMPLINGS
+from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.codebook.start import random_codebook
 
 __all__ = [
-    'METHODS', 'Codebook', 'CodebookError', 'OptimizeResult', 'Progress', 'optimize',
-    'random_codebook',
+    'METHODS', 'OBJECTIVES', 'SAMPLINGS', 'Codebook', 'CodebookError', 'OptimizeResult',
+    'Progress', 'Provenance', 'directional_codebook', 'optimize', 'random_codebook',
 ]

@@ -1,43 +1,59 @@
-"""The one entry to all optimisers, with what they share: sampling, start, history."""
+"""The one entry to all optimisers, with what they share: sampling, start, loop and provenance."""
 
 import dataclasses
-import time
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook.alternating import minimize_alternating
 from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.codebook.direct import minimize_direct
+from rhs_isac_ros.codebook.directional import directional_codebook
+from rhs_isac_ros.codebook.genetic import minimize_genetic
 from rhs_isac_ros.codebook.lbfgs import minimize_lbfgs
-from rhs_isac_ros.codebook.problem import Problem, sampled_objective
+from rhs_isac_ros.codebook.objective import OBJECTIVES
+from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.codebook.provenance import Provenance
+from rhs_isac_ros.codebook.sampling import SAMPLINGS
+from rhs_isac_ros.codebook.search import BudgetSpent, Progress, Search
 from rhs_isac_ros.codebook.start import random_codebook
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.los import checked_positions
 
-# Each takes (function, start, bounds, max_steps, on_step) and returns why it stopped.
-METHODS: Mapping[str, Callable] = {'lbfgs': minimize_lbfgs}
-DEFAULT_POSITIONS = 1200
-DEFAULT_STEPS = 400
+# Of Sobol; these give what 1200 independent ones do, and better.
+DEFAULT_POSITIONS = 256
+# Why a search stopped that Ctrl-C ended.
+INTERRUPTED = 'interrupted'
 
 
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """State of an optimisation after a step.
+class Method(NamedTuple):
+    """A way to optimise.
 
     Attributes
     ----------
-    step
-        Update steps so far.
-    evaluations
-        Evaluations of value and gradient so far.
-    value_m2
-        Lowest objective so far [m^2].
-    elapsed_s
-        Time since the start [s].
+    minimize
+        Takes a `Search` and returns why it stopped; None if the start is the result.
+    steps
+        Default limit of update steps.
     """
 
-    step: int
-    evaluations: int
-    value_m2: float
-    elapsed_s: float
+    minimize: Callable[[Search], str] | None
+    steps: int
+
+
+# Codebooks that need no optimisation: the methods start from the first one.
+STARTS: Mapping[str, Callable] = {
+    'random': random_codebook, 'directional': directional_codebook}
+METHODS: Mapping[str, Method] = {
+    'alternating': Method(minimize_alternating, 400),
+    'direct': Method(minimize_direct, 400),
+    'directional': Method(None, 0),
+    'genetic': Method(minimize_genetic, 10),
+    'lbfgs': Method(minimize_lbfgs, 600),
+    'random': Method(None, 0),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,11 +63,11 @@ class OptimizeResult:
     Attributes
     ----------
     codebook
-        The best codebook met; its `average_crlb_m2` is the objective on the sampled positions.
+        The best codebook met; its `average_crlb_m2` is over the sampled positions.
     history
         Progress after each step, the start being step 0.
     reason
-        Why the method stopped.
+        Why it stopped.
     """
 
     codebook: Codebook
@@ -61,86 +77,133 @@ class OptimizeResult:
 
 def optimize(
         scenario: Scenario, positions: np.ndarray | None = None, method: str = 'lbfgs', *,
-        n_positions: int = DEFAULT_POSITIONS, seed: int = 0, start: Codebook | None = None,
-        max_steps: int = DEFAULT_STEPS,
-        progress: Callable[[Progress], None] | None = None) -> OptimizeResult:
-    """Find a codebook with a low average Cramer-Rao bound.
+        objective: str = 'crlb', sampling: str = 'sobol', n_positions: int = DEFAULT_POSITIONS,
+        seed: int = 0, start: Codebook | None = None, resume: Codebook | None = None,
+        max_steps: int | None = None, max_evaluations: int | None = None,
+        progress: Callable[[Progress], None] | None = None,
+        keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
+    """Find a codebook that locates users well.
+
+    KeyboardInterrupt ends the search, and the best codebook so far is the result.
 
     Parameters
     ----------
     scenario
         The scenario.
     positions
-        Samples of the user's position, float64 [N_sam, 3] [m]; by default uniform ones.
+        Samples of the user's position, float64 [N_sam, 3] [m]; by default drawn by `sampling`.
     method
         One of `METHODS`.
+    objective
+        One of `OBJECTIVES`: ``crlb``, the average bound, or ``ambiguity``, which counts
+        confusions over distances that a local bound does not see.
+    sampling
+        One of `SAMPLINGS`: ``sobol``, or ``monte_carlo`` as in the paper.
     n_positions
         How many samples to draw if none are given.
     seed
-        Seeds the samples and the start.
+        Seeds the samples, the start and the method.
     start
         Codebook to start from; by default the paper's, with random configurations.
+    resume
+        Result of an earlier call with the same arguments, to go on from: its steps and
+        evaluations count.
     max_steps
-        Limit of update steps.
+        Limit of update steps; by default the method's.
+    max_evaluations
+        Limit of evaluations of the objective; by default none.
     progress
         Called after each step.
+    keep
+        Called now and then with the result so far.
 
     Returns
     -------
     OptimizeResult
-        The best codebook, the history and why the method stopped.
+        The best codebook, the history and why the search stopped.
 
     Raises
     ------
     ValueError
-        If the method is unknown, positions are malformed, or no signals determine them.
+        If a name is unknown, a number or the positions are out of range, `resume` was made with
+        other arguments, the method needs a library that is missing, or no signals determine the
+        positions.
     CodebookError
         If `start` does not fit the scenario.
     """
-    if method not in METHODS:
-        raise ValueError(f'method: {method!r}, expected one of {sorted(METHODS)}')
+    for name, value, known in (('method', method, METHODS), ('objective', objective, OBJECTIVES),
+                               ('sampling', sampling, SAMPLINGS)):
+        if value not in known:
+            raise ValueError(f'{name}: {value!r}, expected one of {sorted(known)}')
+    limits = {'n_positions': n_positions, 'max_evaluations': max_evaluations,
+              'max_steps': METHODS[method].steps or 1 if max_steps is None else max_steps}
+    for name, limit in limits.items():
+        if limit is not None and limit < 1:
+            raise ValueError(f'{name}: {limit}, expected at least 1')
     if positions is None:
-        positions = scenario.sample_positions(
-            n_positions, streams.generator(seed, streams.SAMPLES))
-    if start is None:
-        start = random_codebook(scenario, streams.generator(seed, streams.START))
-    start.check(scenario)
-    problem = Problem(scenario, sampled_objective(scenario, positions))
-    record = _Record(problem, progress)
-    first = problem.pack(start)
-    value, _ = record(first)
-    if not np.isfinite(value):
-        raise ValueError(
-            f'positions: average CRLB {value} at the start, expected a finite one: the signals '
-            'of the scenario do not determine the position')
-    record.on_step()
-    reason = METHODS[method](record, first, problem.bounds, max_steps, record.on_step)
-    provenance = f'method {method}, seed {seed}, {len(positions)} positions'
-    codebook = dataclasses.replace(
-        problem.unpack(record.best), average_crlb_m2=record.value, provenance=provenance)
-    return OptimizeResult(codebook, tuple(record.history), reason)
+        positions = SAMPLINGS[sampling](
+            scenario, n_positions, streams.generator(seed, streams.SAMPLES))
+    else:
+        positions, sampling = checked_positions(positions), 'given'
+        if not len(positions):
+            raise ValueError('positions: none, expected at least one')
+    made = Provenance(
+        method=method, objective=objective, seed=int(seed), sampling=sampling,
+        positions=len(positions), scenario=scenario.changes())
+    done = made.resumed(resume) if resume else made
+    first = resume or start or STARTS.get(method, random_codebook)(
+        scenario, streams.generator(seed, streams.START))
+    first.check(scenario)
+    problem = Problem(scenario, OBJECTIVES[objective](
+        scenario, positions, streams.generator(seed, streams.PAIRS)))
+
+    def result(reason: str) -> OptimizeResult:
+        best = problem.unpack(search.best)
+        bound = float(crlb(scenario, best, positions).mean())
+        text = made.of_result(search.history[-1], reason)
+        return OptimizeResult(
+            dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
+            tuple(search.history), reason)
+
+    search = Search(
+        problem, problem.pack(first), limits['max_steps'], max_evaluations,
+        streams.generator(seed, streams.METHOD),
+        _Keeper(progress, lambda: keep(result('not finished'))) if keep else progress,
+        (done.steps, done.evaluations))
+    return result(_run(search, METHODS[method].minimize))
 
 
-class _Record:
-    """The objective as a method sees it; remembers the best point and the history."""
+def _run(search: Search, minimize: Callable[[Search], str] | None) -> str:
+    """Evaluate the start, run a method, and return why it stopped."""
+    try:
+        value = search.begin()
+        if not np.isfinite(value):
+            raise ValueError(
+                f'positions: objective {value} at the start, expected a finite one: the signals '
+                'of the scenario do not determine the position')
+        if search.max_steps < 1:
+            return 'max_steps reached'
+        return minimize(search) if minimize else 'nothing to optimise'
+    except BudgetSpent:
+        search.finish()
+        return 'max_evaluations reached'
+    except KeyboardInterrupt:
+        search.finish()
+        return INTERRUPTED
 
-    def __init__(self, problem: Problem, progress: Callable[[Progress], None] | None) -> None:
-        self._problem, self._progress = problem, progress
-        self._begin = time.perf_counter()
-        self._evaluations = 0
-        self.value, self.best = np.inf, None
-        self.history: list[Progress] = []
 
-    def __call__(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = self._problem.value_and_gradient(variables)
-        self._evaluations += 1
-        if value < self.value:
-            self.value, self.best = value, np.array(variables)
-        return value, gradient
+class _Keeper:
+    """Calls a function after steps, at most so often that it takes little of the time."""
 
-    def on_step(self) -> None:
-        elapsed = time.perf_counter() - self._begin
-        entry = Progress(len(self.history), self._evaluations, self.value, elapsed)
-        self.history.append(entry)
+    _PERIOD_S = 10.0
+
+    def __init__(self, progress: Callable[[Progress], None] | None,
+                 keep: Callable[[], None]) -> None:
+        self._progress, self._keep, self._kept_s = progress, keep, 0.0
+
+    def __call__(self, entry: Progress) -> None:
         if self._progress:
             self._progress(entry)
+        if entry.elapsed_s >= self._kept_s + self._PERIOD_S:
+            self._kept_s = entry.elapsed_s
+            self._keep()

@@ -2,32 +2,9 @@
 
 import numpy as np
 
-from rhs_isac_ros.bounds import AverageCrlb
+from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-
-
-def sampled_objective(scenario: Scenario, positions: np.ndarray) -> AverageCrlb:
-    """Implements Eq. (18). Objective of P1 on sampled positions.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    positions
-        Samples of the user's position, float64 [N_sam, 3] [m].
-
-    Returns
-    -------
-    AverageCrlb
-        A function of the codebook: value [m^2] and gradients.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is empty or not a finite [N, 3] array.
-    """
-    return AverageCrlb(scenario, positions)
 
 
 class Problem:
@@ -42,10 +19,10 @@ class Problem:
     scenario
         The scenario.
     objective
-        Function of a codebook that returns value, grad_analog and grad_digital.
+        Function of a codebook that returns value and gradients, and its `value` alone.
     """
 
-    def __init__(self, scenario: Scenario, objective: AverageCrlb) -> None:
+    def __init__(self, scenario: Scenario, objective: Average) -> None:
         self.scenario = scenario
         self.objective = objective
         sizes = scenario.sizes
@@ -91,6 +68,21 @@ class Problem:
         """
         analog, raw, norm = self._split(variables)
         return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
+
+    def value(self, variables: np.ndarray) -> float:
+        """Evaluate the objective alone.
+
+        Parameters
+        ----------
+        variables
+            Float64 vector as `pack` returns it.
+
+        Returns
+        -------
+        float
+            The objective [m^2].
+        """
+        return self.objective.value(self.unpack(variables))
 
     def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
         """Evaluate the objective and its gradient by the variables.

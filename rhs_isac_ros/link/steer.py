@@ -6,7 +6,7 @@ from rhs_isac_ros.link.capacity import Beam, capacity
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
 
 # Rounds at most; five are usual.
 _ROUNDS = 20
@@ -66,25 +66,6 @@ def _climb(scenario: Scenario, los: np.ndarray, analog: np.ndarray, band: int) -
         analog = better
         digital = _best_digital(scenario, analog, los, spatial, onboard)
     return Beam(analog, digital, band)
-
-
-def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
-    """Configuration by the holographic principle: strong where feed and path waves agree.
-
-    Parameters
-    ----------
-    los
-        Line-of-sight gains, complex128 [N_SB, N_E].
-    onboard
-        B_j, complex128 [N_SB, K, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N_E], from 0 to 1.
-    """
-    interference = np.einsum('jm,jkm->m', los, onboard).real
-    return (interference / np.abs(interference).max() + 1) / 2
 
 
 def _best_digital(

@@ -119,6 +119,17 @@ class Scenario:
         except ScenarioError as error:
             raise ScenarioError(f'{path}: {error}') from None
 
+    def changes(self) -> dict[str, Any]:
+        """Return what differs from Table I.
+
+        Returns
+        -------
+        dict
+            Values by field names, in the form that `from_yaml` reads.
+        """
+        return {field.name: _plain(value) for field in dataclasses.fields(self)
+                if (value := getattr(self, field.name)) != field.default}
+
     @property
     def n_bands(self) -> int:
         """Number of bands N_B."""
@@ -165,6 +176,10 @@ class Scenario:
         """
         low, high = self.roi_bounds_m
         return rng.uniform(low, high, size=(n, 3))
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
 def _checked(field: dataclasses.Field, value: Any) -> Any:

@@ -164,3 +164,22 @@ def onboard_matrix(scenario: Scenario) -> np.ndarray:
     matrix = onboard_gain(scenario, frequencies, elements, feeds[:, None, :])
     matrix.flags.writeable = False
     return matrix
+
+
+def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
+    """Configuration by the holographic principle: strong where feed and path waves agree.
+
+    Parameters
+    ----------
+    los
+        Line-of-sight gains, complex128 [N_SB, N_E].
+    onboard
+        B_j, complex128 [N_SB, K, N_E].
+
+    Returns
+    -------
+    numpy.ndarray
+        Float64 [N_E], from 0 to 1.
+    """
+    interference = np.einsum('jm,jkm->m', los, onboard).real
+    return (interference / np.abs(interference).max() + 1) / 2

@@ -1,18 +1,26 @@
-"""The executable ``optimizer``: holds the codebook as its parameters."""
+"""The executable ``optimizer``: optimises a codebook, holds it as its parameters, or pushes it."""
 
+import argparse
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.utilities import remove_ros_args
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options
+from rhs_isac_ros.codebook.command import run as run_command
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import convert, parameters, qos, topics
+from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.resources import default_codebook_file
-from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.ros.run import run
 
 DESCRIPTIONS = {
     'codebook.id': 'Hash of the content; must match it.',
@@ -70,7 +78,72 @@ class OptimizerNode(Node):
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 
 
-main = entry(lambda: [OptimizerNode()])
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable.
+
+    Without options of its own it holds a codebook. With some, it optimises one first and writes
+    its file; ``--push`` then hands it to the optimizer of a running network, instead.
+
+    Parameters
+    ----------
+    args
+        Command line; by default the process's.
+
+    Returns
+    -------
+    int
+        Exit code: 0 after a signal; 1 if a network did not take the codebook; 2 if an argument
+        or a file is wrong.
+    """
+    args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
+    own = remove_ros_args(args)[1:]
+    if not own:
+        return run(lambda: [OptimizerNode()], args)
+    options = _parser().parse_args(own)
+    try:
+        if options.push_file:
+            return _push(Codebook.load(options.push_file), args)
+        codebook, reason = run_command(options)
+    except ERRORS as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    if options.push:
+        return _push(codebook, args)
+    if reason == INTERRUPTED:
+        return 0
+    files = {'codebook_file': options.output, 'scenario_file': options.scenario or ''}
+    return run(lambda: [OptimizerNode(parameter_overrides=[
+        Parameter(name, value=str(file)) for name, file in files.items()])], args)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='optimizer', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        description='Without options: hold a codebook as parameters. With options: optimise one '
+                    'offline, write it, then hold it.')
+    add_options(parser)
+    parser.add_argument('--push', action='store_true',
+                        help='set it on the optimizer of a running network instead, and end')
+    parser.add_argument('--push-file', type=Path, metavar='FILE',
+                        help='optimise nothing: set this codebook on a running network, and end')
+    return parser
+
+
+def _push(codebook: Codebook, args: Sequence[str]) -> int:
+    rclpy.init(args=args)
+    node = Node('codebook_pusher')
+    try:
+        push(node, codebook)
+    except PushError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    print(f'codebook {codebook.id} is set')
+    return 0
 
 
 if __name__ == '__main__':

@@ -228,7 +228,7 @@ def test_a_sketch_that_is_too_small_grows_until_it_suffices(
     expected = make(wide, items, tolerance)
     assert sizes == [min(128, items.shape[0] * items.shape[1])] * 2
     sizes.clear()
-    monkeypatch.setattr(compressed_rows, '_SKETCH', 2)
+    monkeypatch.setattr(compressed_rows, '_first_sketch', lambda scenario: 2)
     grown = make(wide, items, tolerance)
     firsts = [k for k, size in enumerate(sizes) if size == 2]
     assert len(firsts) == 2

@@ -1,38 +1,37 @@
 """The quasi-Newton method, on functions whose minimum is known."""
 
 import numpy as np
+import pytest
 
 from rhs_isac_ros.codebook.lbfgs import minimize_lbfgs
 
 
-def run(max_steps):
-    """Minimise a quadratic with a box for the first half; return the points and the steps."""
-    rng = np.random.default_rng(0)
-    center, weights = rng.normal(size=20) * 2, rng.uniform(1, 50, 20)
-    points, steps = [], []
-
-    def function(x):
-        points.append(np.array(x))
-        return float(np.sum(weights * (x - center)**2)), 2 * weights * (x - center)
-
-    bounds = [(0.0, 1.0)] * 10 + [(None, None)] * 10
-    reason = minimize_lbfgs(
-        function, np.full(20, 0.5), bounds, max_steps, lambda: steps.append(len(points)))
-    best = np.where(np.arange(20) < 10, np.clip(center, 0, 1), center)
-    return points, steps, best, reason
-
-
-def test_finds_the_minimum_and_reports_every_step():
-    points, steps, best, reason = run(200)
-    np.testing.assert_allclose(points[-1], best, atol=1e-3)
-    assert all((0 <= x[:10]).all() and (x[:10] <= 1).all() for x in points)
-    assert 2 < len(steps) < 200
-    assert steps == sorted(steps)
+@pytest.mark.parametrize('seed', range(4))
+def test_finds_the_minimum_and_reports_every_step(quadratic, search_of, seed):
+    problem = quadratic(seed)
+    search = search_of(problem, 200)
+    reason = minimize_lbfgs(search)
+    np.testing.assert_allclose(search.best, problem.best, atol=1e-3)
+    assert search.value_m2 == pytest.approx(1.0, abs=1e-5)
+    assert all((0 <= x[:10]).all() and (x[:10] <= 1).all() for x in problem.points)
+    assert 2 < len(search.history) < 200
+    evaluations = [entry.evaluations for entry in search.history]
+    assert evaluations == sorted(set(evaluations))
+    assert evaluations[-1] == len(problem.points)
     assert 'CONVERGENCE' in reason.upper()
 
 
-def test_stops_at_the_limit_of_steps():
-    points, steps, _, reason = run(3)
-    assert len(steps) == 3
-    assert len(points) <= 60
+def test_stops_at_the_limit_of_steps(quadratic, search_of):
+    problem = quadratic(0)
+    search = search_of(problem, 3)
+    reason = minimize_lbfgs(search)
+    assert len(search.history) == 3
+    assert len(problem.points) <= 60
     assert 'LIMIT' in reason.upper()
+
+
+def test_begins_at_the_start(quadratic, search_of):
+    problem = quadratic(1)
+    start = np.linspace(0.2, 0.7, 20)
+    minimize_lbfgs(search_of(problem, 3, start=start))
+    np.testing.assert_array_equal(problem.points[0], start)

@@ -1,30 +1,64 @@
 """Optimisation of codebooks, on a small scenario."""
 
 import dataclasses
+import functools
+import importlib.util
+import sys
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.codebook import METHODS, Codebook, CodebookError, optimize, random_codebook
+from rhs_isac_ros.codebook import (
+    METHODS,
+    OBJECTIVES,
+    SAMPLINGS,
+    Codebook,
+    CodebookError,
+    Provenance,
+    directional_codebook,
+    optimize,
+    random_codebook,
+)
+from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _Keeper
+from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 STEPS = 30
+NO_PYMOO = importlib.util.find_spec('pymoo') is None
+# Methods that search, each with few steps.
+FEW_STEPS = {'alternating': 24, 'direct': 12, 'genetic': 2, 'lbfgs': 10}
+SEARCHING = [pytest.param(name, marks=pytest.mark.skipif(
+    name == 'genetic' and NO_PYMOO, reason='needs pymoo')) for name in FEW_STEPS]
+# The objective's rows are not exact, see ROW_TOLERANCE.
+ABOUT = 1e-3
 
 
 @pytest.fixture(scope='module')
-def scenario(small) -> Scenario:
-    return dataclasses.replace(small.scenario, roi_center_m=(4, 0, 0), roi_size_m=(2, 4, 2))
+def positions(scenario):
+    return scenario.sample_positions(60, np.random.default_rng(0))
 
 
 @pytest.fixture(scope='module')
-def run(scenario):
+def run(scenario, positions):
     """One optimisation, and what its progress callback was given."""
     seen = []
-    positions = scenario.sample_positions(60, np.random.default_rng(0))
     result = optimize(scenario, positions, seed=3, max_steps=STEPS, progress=seen.append)
     return result, seen, positions
+
+
+@pytest.fixture
+def evaluated(monkeypatch):
+    """All variables that the objective was evaluated for."""
+    seen = []
+    for name in ('value', 'value_and_gradient'):
+        def spy(problem, variables, *, evaluate):
+            seen.append(np.array(variables))
+            return evaluate(problem, variables)
+        monkeypatch.setattr(Problem, name, functools.partialmethod(
+            spy, evaluate=getattr(Problem, name)))
+    return seen
 
 
 def test_bound_falls_strongly_also_on_other_positions(scenario, run):
@@ -42,19 +76,32 @@ def test_best_codebook_is_feasible_and_has_the_value_it_claims(scenario, run, pl
     p = plain(scenario, result.codebook.analog, result.codebook.digital)
     expected = p.crlb(positions, multipath_covariance(scenario)).mean()
     assert result.codebook.average_crlb_m2 == pytest.approx(expected, rel=1e-7)
-    assert result.history[-1].value_m2 == result.codebook.average_crlb_m2
-    assert 'seed 3' in result.codebook.provenance
+    assert result.history[-1].value_m2 == pytest.approx(expected, rel=ABOUT)
+
+
+def test_provenance_tells_how_it_was_made(scenario, run):
+    result, _, _ = run
+    end = result.history[-1]
+    assert Provenance.parse(result.codebook.provenance) == Provenance(
+        method='lbfgs', objective='crlb', seed=3, sampling='given', positions=60,
+        scenario=scenario.changes(), steps=STEPS, evaluations=end.evaluations,
+        value_m2=end.value_m2, reason=result.reason)
+
+
+def assert_consistent(history):
+    assert [entry.step for entry in history] == list(range(len(history)))
+    for before, after in zip(history, history[1:], strict=False):
+        assert after.value_m2 <= before.value_m2
+        assert after.evaluations >= before.evaluations
+        assert after.elapsed_s >= before.elapsed_s
 
 
 def test_history_never_rises_and_is_what_progress_saw(run):
     result, seen, _ = run
-    history = result.history
-    assert list(history) == seen
-    assert [entry.step for entry in history] == list(range(len(history)))
-    for before, after in zip(history, history[1:], strict=False):
-        assert after.value_m2 <= before.value_m2
-        assert after.evaluations > before.evaluations
-        assert after.elapsed_s >= before.elapsed_s
+    assert list(result.history) == seen
+    assert_consistent(result.history)
+    evaluations = [entry.evaluations for entry in seen]
+    assert evaluations == sorted(set(evaluations))
 
 
 def test_stops_at_the_limit_of_steps(run, scenario):
@@ -66,16 +113,171 @@ def test_stops_at_the_limit_of_steps(run, scenario):
     assert short.history[-1].value_m2 == result.history[2].value_m2
 
 
+@pytest.mark.parametrize('objective', OBJECTIVES)
+@pytest.mark.parametrize('method', SEARCHING)
+def test_every_method_lowers_every_objective(scenario, positions, method, objective, evaluated):
+    seen = []
+    result = optimize(scenario, positions, method, objective=objective, seed=3,
+                      max_steps=FEW_STEPS[method], progress=seen.append)
+    assert result.history[-1].value_m2 < 0.9 * result.history[0].value_m2
+    result.codebook.check(scenario)
+    assert list(result.history) == seen
+    assert_consistent(result.history)
+    assert len(result.history) <= FEW_STEPS[method] + 1
+    # Every evaluation is counted, and the best of all is the result.
+    assert result.history[-1].evaluations == len(evaluated)
+    made = Provenance.parse(result.codebook.provenance)
+    assert (made.method, made.objective) == (method, objective)
+    assert made.evaluations == len(evaluated)
+    assert made.value_m2 == result.history[-1].value_m2
+    exact = crlb(scenario, result.codebook, positions).mean()
+    assert result.codebook.average_crlb_m2 == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize('method', SEARCHING)
+def test_equal_seeds_give_equal_results(scenario, method):
+    def run(seed):
+        return optimize(scenario, method=method, n_positions=16, seed=seed,
+                        max_steps=min(FEW_STEPS[method], 16))
+
+    one, same, other = run(5), run(5), run(6)
+    assert one.codebook.id == same.codebook.id
+    assert one.codebook.id != other.codebook.id
+    assert one.codebook.provenance == same.codebook.provenance
+    values, again = ([entry.value_m2 for entry in result.history] for result in (one, same))
+    assert values == again
+
+
+@pytest.mark.parametrize('method', SEARCHING)
+def test_every_method_begins_at_the_start(scenario, positions, method, small, evaluated):
+    result = optimize(scenario, positions, method, start=small.codebook, max_steps=2)
+    np.testing.assert_array_equal(evaluated[0][:32], small.codebook.analog.ravel())
+    exact = crlb(scenario, small.codebook, positions).mean()
+    assert result.history[0].value_m2 == pytest.approx(exact, rel=ABOUT)
+    assert result.history[0].evaluations == 1
+    assert result.codebook.average_crlb_m2 <= exact * (1 + ABOUT)
+
+
+@pytest.mark.parametrize('budget', [1, 2, 5])
+@pytest.mark.parametrize('method', SEARCHING)
+def test_a_budget_of_evaluations_ends_every_method(
+        scenario, positions, method, budget, evaluated):
+    result = optimize(
+        scenario, positions, method, seed=3, max_steps=100, max_evaluations=budget)
+    assert result.reason == 'max_evaluations reached'
+    assert len(evaluated) == budget
+    assert result.history[-1].evaluations == budget
+    assert_consistent(result.history)
+    result.codebook.check(scenario)
+    if budget == 1:
+        start = random_codebook(scenario, np.random.default_rng(0))
+        assert result.codebook.analog.shape == start.analog.shape
+        assert result.history[-1].value_m2 == result.history[0].value_m2
+
+
+def test_a_budget_that_is_not_used_up_changes_nothing(scenario, positions, run):
+    result = optimize(scenario, positions, seed=3, max_steps=STEPS, max_evaluations=10_000)
+    assert result.codebook.id == run[0].codebook.id
+
+
+@pytest.mark.parametrize('method', SEARCHING)
+@pytest.mark.parametrize('at', [2, 4, 12])
+def test_an_interrupt_gives_the_best_so_far(scenario, positions, method, at, monkeypatch):
+    values = []
+    for name in ('value', 'value_and_gradient'):
+        def spy(problem, variables, *, evaluate):
+            if len(values) + 1 == at:
+                raise KeyboardInterrupt
+            outcome = evaluate(problem, variables)
+            values.append((np.min(outcome[0]) if isinstance(outcome, tuple) else outcome,
+                           problem.unpack(variables)))
+            return outcome
+        monkeypatch.setattr(Problem, name, functools.partialmethod(
+            spy, evaluate=getattr(Problem, name)))
+    result = optimize(scenario, positions, method, seed=3, max_steps=100)
+    assert result.reason == 'interrupted'
+    assert len(values) == at - 1
+    assert Provenance.parse(result.codebook.provenance).reason == 'interrupted'
+    best = min(values, key=lambda entry: entry[0])[1]
+    assert result.codebook.id == best.id
+
+
+@pytest.mark.skipif(NO_PYMOO, reason='needs pymoo')
+def test_an_interrupt_is_told_with_what_was_reached(scenario, positions, monkeypatch):
+    calls, evaluate = [], Problem.value
+
+    def spy(problem, variables):
+        if len(calls) == 50:
+            raise KeyboardInterrupt
+        calls.append(evaluate(problem, variables))
+        return calls[-1]
+
+    monkeypatch.setattr(Problem, 'value', spy)
+    result = optimize(scenario, positions, 'genetic', seed=3, max_steps=2)
+    assert result.reason == 'interrupted'
+    made = Provenance.parse(result.codebook.provenance)
+    assert made.value_m2 == result.history[-1].value_m2 == min(calls)
+    assert made.evaluations in (51, 52)
+
+
+def test_an_interrupt_while_progress_is_shown_gives_the_best_so_far(scenario, positions):
+    def interrupt(entry):
+        if entry.step == 3:
+            raise KeyboardInterrupt
+
+    result = optimize(scenario, positions, seed=3, max_steps=20, progress=interrupt)
+    assert result.reason == 'interrupted'
+    assert len(result.history) == 4
+    np.testing.assert_allclose(
+        result.codebook.average_crlb_m2, result.history[-1].value_m2, rtol=ABOUT)
+
+
+def test_keep_is_called_with_the_results_so_far(scenario, positions, monkeypatch):
+    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    kept, seen = [], []
+    result = optimize(scenario, positions, seed=3, max_steps=6, progress=seen.append,
+                      keep=kept.append)
+    assert list(result.history) == seen
+    assert [len(partial.history) for partial in kept] == list(range(1, 8))
+    for partial in kept:
+        assert partial.reason == 'not finished'
+        assert partial.history == result.history[:len(partial.history)]
+        partial.codebook.check(scenario)
+        end = partial.history[-1]
+        made = Provenance.parse(partial.codebook.provenance)
+        assert (made.steps, made.evaluations, made.value_m2, made.reason) == (
+            end.step, end.evaluations, end.value_m2, 'not finished')
+        exact = crlb(scenario, partial.codebook, positions).mean()
+        assert partial.codebook.average_crlb_m2 == pytest.approx(exact, rel=1e-12)
+    assert kept[-1].codebook.id == result.codebook.id
+    assert kept[0].codebook.average_crlb_m2 > kept[-1].codebook.average_crlb_m2
+
+
+def test_keep_is_not_called_all_the_time(scenario, positions):
+    """A run of less than ten seconds keeps nothing in between."""
+    kept = []
+    optimize(scenario, positions, seed=3, max_steps=6, keep=kept.append)
+    assert kept == []
+
+
+def test_keeping_does_not_change_the_result(scenario, positions, run, monkeypatch):
+    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    result = optimize(
+        scenario, positions, seed=3, max_steps=STEPS, keep=lambda partial: None)
+    assert result.codebook.id == run[0].codebook.id
+
+
 def test_keeps_the_best_point_of_a_method_that_wanders(small, monkeypatch):
     """The vectors' codebook is far better than one with nearly all elements switched off."""
-    def wander(function, start, bounds, max_steps, on_step):
-        assert len(bounds) == len(start)
+    def wander(search):
+        assert len(search.bounds) == len(search.start)
         for scale in (0.5, 1.0, 0.01):
-            function(np.concatenate([scale * start[:32], start[32:]]))
-            on_step()
-        return f'wandered, of {max_steps}'
+            search.value_and_gradient(
+                np.concatenate([scale * search.start[:32], search.start[32:]]))
+            search.on_step()
+        return f'wandered, of {search.max_steps}'
 
-    monkeypatch.setitem(METHODS, 'wander', wander)
+    monkeypatch.setitem(METHODS, 'wander', Method(wander, 9))
     result = optimize(small.scenario, small.vectors['positions'], 'wander',
                       start=small.codebook, max_steps=7)
     np.testing.assert_array_equal(result.codebook.analog, small.codebook.analog)
@@ -83,15 +285,44 @@ def test_keeps_the_best_point_of_a_method_that_wanders(small, monkeypatch):
         float(small.vectors['average_crlb']), rel=1e-8)
     assert result.reason == 'wandered, of 7'
     assert len(result.history) == 4
-    assert 'method wander' in result.codebook.provenance
+    assert 'method: wander' in result.codebook.provenance
+    by_default = optimize(small.scenario, small.vectors['positions'], 'wander')
+    assert by_default.reason == 'wandered, of 9'
 
 
 def test_starts_from_the_given_codebook(small):
     result = optimize(
         small.scenario, small.vectors['positions'], start=small.codebook, max_steps=1)
     assert result.history[0].value_m2 == pytest.approx(
-        float(small.vectors['average_crlb']), rel=1e-8)
+        float(small.vectors['average_crlb']), rel=ABOUT)
     assert result.codebook.average_crlb_m2 < small.vectors['average_crlb']
+
+
+@pytest.mark.parametrize('max_steps', [None, 5])
+@pytest.mark.parametrize('method', ['random', 'directional'])
+def test_codebooks_that_need_no_optimisation_come_back_as_they_are(
+        scenario, positions, method, max_steps, small):
+    result = optimize(scenario, positions, method, seed=2, max_steps=max_steps)
+    assert result.reason == 'nothing to optimise'
+    assert len(result.history) == 1
+    assert result.history[0].evaluations == 1
+    if method == 'directional':
+        expected = directional_codebook(scenario)
+    else:
+        # The paper's start of every method.
+        expected = random_codebook(scenario, np.random.default_rng(0))
+        first = optimize(scenario, positions, 'lbfgs', seed=2, max_steps=1).history[0]
+        assert first.value_m2 == result.history[0].value_m2
+        analog = result.codebook.analog
+        assert analog.min() < 0.2
+        assert analog.max() > 0.8
+    np.testing.assert_allclose(result.codebook.digital, expected.digital, rtol=1e-12)
+    if method == 'directional':
+        np.testing.assert_array_equal(result.codebook.analog, expected.analog)
+    exact = crlb(scenario, result.codebook, positions).mean()
+    assert result.codebook.average_crlb_m2 == pytest.approx(exact, rel=1e-12)
+    given = optimize(scenario, positions, method, start=small.codebook)
+    np.testing.assert_array_equal(given.codebook.analog, small.codebook.analog)
 
 
 def test_seed_decides_positions_and_start(scenario):
@@ -99,29 +330,152 @@ def test_seed_decides_positions_and_start(scenario):
     assert one.codebook.id == same.codebook.id
     assert one.codebook.id != other.codebook.id
     assert one.history[0].value_m2 == same.history[0].value_m2 != other.history[0].value_m2
-    # The paper's number of samples.
-    assert '1200 positions' in one.codebook.provenance
+    made = Provenance.parse(one.codebook.provenance)
+    assert (made.seed, made.positions, made.sampling) == (
+        5, DEFAULT_POSITIONS, 'sobol')
 
 
-def test_all_methods_are_named_in_the_error_for_an_unknown_one(scenario):
-    with pytest.raises(ValueError, match="method: 'magic', expected one of") as caught:
-        optimize(scenario, method='magic')
-    for method in METHODS:
-        assert repr(method) in str(caught.value)
+def test_sampling_and_number_decide_the_positions(scenario, small):
+    bounds = set()
+    for sampling in SAMPLINGS:
+        for n in (3, 50):
+            result = optimize(scenario, method='random', sampling=sampling, n_positions=n,
+                              start=small.codebook)
+            made = Provenance.parse(result.codebook.provenance)
+            assert (made.sampling, made.positions) == (sampling, n)
+            bounds.add(result.codebook.average_crlb_m2)
+    assert len(bounds) == 4
+    # Enough of them all sample the same region.
+    one, other = (optimize(scenario, method='random', sampling=sampling, n_positions=4096,
+                           start=small.codebook).codebook.average_crlb_m2
+                  for sampling in SAMPLINGS)
+    assert one == pytest.approx(other, rel=0.1)
+
+
+def steps_of(history):
+    return [(entry.step, entry.evaluations) for entry in history]
+
+
+@pytest.mark.parametrize('method', SEARCHING)
+def test_a_result_can_be_gone_on_from(scenario, positions, method):
+    half = max(FEW_STEPS[method] // 2, 1)
+    first = optimize(scenario, positions, method, seed=3, max_steps=half)
+    saved = Codebook.from_parameters(first.codebook.to_parameters())
+    second = optimize(
+        scenario, positions, method, seed=3, max_steps=3 * half + 13, resume=saved)
+    end, begin = first.history[-1], second.history[0]
+    assert begin.step == end.step
+    # The start was evaluated before, and does not count again.
+    assert begin.evaluations == end.evaluations
+    assert begin.value_m2 == pytest.approx(end.value_m2, rel=1e-7)
+    assert steps_of(second.history) == sorted(steps_of(second.history))
+    assert second.history[-1].step <= 3 * half + 13
+    assert second.history[-1].value_m2 < begin.value_m2
+    assert Provenance.parse(second.codebook.provenance).steps == second.history[-1].step
+
+
+def test_a_result_that_is_complete_comes_back(scenario, positions, run):
+    again = optimize(
+        scenario, positions, seed=3, max_steps=STEPS, resume=run[0].codebook)
+    assert again.reason == 'max_steps reached'
+    assert len(again.history) == 1
+    np.testing.assert_array_equal(again.codebook.analog, run[0].codebook.analog)
+    assert again.codebook.average_crlb_m2 == pytest.approx(
+        run[0].codebook.average_crlb_m2, rel=1e-9)
+
+
+def test_a_budget_counts_what_was_done_before(scenario, positions, evaluated):
+    first = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=5)
+    second = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=9,
+                      resume=first.codebook)
+    assert len(evaluated) == 10
+    assert second.history[-1].evaluations == 9
+    assert second.reason == 'max_evaluations reached'
+
+
+def test_a_result_whose_budget_is_spent_comes_back(scenario, positions):
+    first = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=5)
+    again = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=5,
+                     resume=first.codebook)
+    assert again.reason == 'max_evaluations reached'
+
+
+def test_a_result_of_other_arguments_cannot_be_gone_on_from(scenario, positions, run):
+    codebook = run[0].codebook
+    for arguments, words in [
+            ({'seed': 4}, 'seed: 4, expected 3'),
+            ({'method': 'direct'}, "method: 'direct', expected 'lbfgs'"),
+            ({'objective': 'ambiguity'}, "objective: 'ambiguity', expected 'crlb'"),
+            ({'positions': positions[1:]}, 'positions: 59, expected 60'),
+            ({'positions': None}, "sampling: 'sobol', expected 'given'"),
+            ({'resume': random_codebook(scenario, np.random.default_rng(0))},
+             "resume: provenance 'random', expected that of an optimisation")]:
+        chosen = {'positions': positions, 'seed': 3, 'resume': codebook, 'max_steps': 40}
+        with pytest.raises(ValueError) as caught:
+            optimize(scenario, **(chosen | arguments))
+        assert str(caught.value).startswith(words)
+
+
+@pytest.mark.parametrize(('name', 'known'), [
+    ('method', METHODS), ('objective', OBJECTIVES), ('sampling', SAMPLINGS)])
+def test_all_known_names_are_in_the_error_for_an_unknown_one(scenario, name, known):
+    with pytest.raises(ValueError, match=f"^{name}: 'magic', expected one of") as caught:
+        optimize(scenario, **{name: 'magic'})
+    for one in known:
+        assert repr(one) in str(caught.value)
+
+
+@pytest.mark.parametrize('value', [0, -3])
+@pytest.mark.parametrize('name', ['n_positions', 'max_steps', 'max_evaluations'])
+@pytest.mark.parametrize('method', ['lbfgs', 'direct'])
+def test_numbers_below_one_are_errors(scenario, method, name, value):
+    with pytest.raises(ValueError, match=f'^{name}: {value}, expected at least 1$'):
+        optimize(scenario, method=method, **{name: value})
 
 
 def test_a_start_that_does_not_fit_is_an_error(scenario, table1, small):
-    with pytest.raises(CodebookError, match='analog: shape'):
+    with pytest.raises(CodebookError, match=r'^analog: shape .*, expected \[N_B, F, N_E\] = '):
         optimize(scenario, start=table1.codebook, max_steps=1)
     weak = Codebook(small.codebook.analog, small.codebook.digital / 2)
-    with pytest.raises(CodebookError, match='digital: a frame has power'):
+    with pytest.raises(CodebookError, match='^digital: a frame has power .*, expected max_power'):
         optimize(scenario, start=weak, max_steps=1)
 
 
-@pytest.mark.parametrize('positions', [np.zeros((0, 3)), [[1.0, 2.0]], [[np.nan, 0.0, 0.0]]])
-def test_malformed_positions_are_errors(scenario, positions):
+@pytest.mark.parametrize('objective', OBJECTIVES)
+@pytest.mark.parametrize('positions', [
+    [[1.0, 2.0]], [[np.nan, 0.0, 0.0]], [[4.0, 0.0, np.inf]], [4.0, 0.0, 0.0]])
+def test_malformed_positions_are_errors(scenario, objective, positions):
     with pytest.raises(ValueError, match='^positions: .*, expected '):
-        optimize(scenario, np.array(positions), max_steps=1)
+        optimize(scenario, np.array(positions), objective=objective, max_steps=1)
+
+
+def test_no_positions_are_an_error(scenario):
+    with pytest.raises(ValueError, match='^positions: .*, expected '):
+        optimize(scenario, np.zeros((0, 3)), max_steps=1)
+
+
+def test_no_positions_are_an_error_also_for_ambiguity(scenario):
+    with pytest.raises(ValueError, match='^positions: .*, expected '):
+        optimize(scenario, np.zeros((0, 3)), objective='ambiguity', max_steps=1)
+
+
+def test_a_region_too_small_for_ambiguity_is_an_error(scenario):
+    tiny = dataclasses.replace(scenario, roi_size_m=(0.01, 0.01, 0.01))
+    with pytest.raises(ValueError, match='^roi_size_m: .*, expected a region larger than'):
+        optimize(tiny, n_positions=4, objective='ambiguity', max_steps=1)
+    optimize(tiny, n_positions=4, objective='crlb', max_steps=1).codebook.check(tiny)
+
+
+def test_a_seed_may_be_any_integer(scenario):
+    """What numpy's random numbers give is none of Python's integers."""
+    result = optimize(scenario, n_positions=4, seed=2**31 - 1, max_steps=1)
+    assert Provenance.parse(result.codebook.provenance).seed == 2**31 - 1
+
+
+def test_a_seed_may_be_an_integer_of_numpy(scenario):
+    one, same = (optimize(scenario, n_positions=4, seed=seed, max_steps=1)
+                 for seed in (np.int64(3), 3))
+    assert one.codebook.provenance == same.codebook.provenance
 
 
 def test_an_undetermined_position_is_an_error_that_says_so():
@@ -130,3 +484,13 @@ def test_an_undetermined_position_is_an_error_that_says_so():
                         elements_per_side=3)
     with pytest.raises(ValueError, match='bound|position|infinite'):
         optimize(scenario, max_steps=1)
+
+
+def test_importing_needs_no_pymoo_and_no_slow_part_of_scipy():
+    """Most that use a codebook do not optimise one."""
+    import subprocess
+    code = ("import sys, rhs_isac_ros.codebook\n"
+            "print([n for n in ('pymoo', 'scipy.optimize') if n in sys.modules])")
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          timeout=60, check=True)
+    assert done.stdout.strip() == '[]'

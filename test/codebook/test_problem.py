@@ -1,31 +1,27 @@
-"""Problem P1: its variables, its constraints and its gradient."""
+"""Problem P1: its variables, its constraints and its gradient, with the exact bound."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook.problem import Problem, sampled_objective
+from rhs_isac_ros.bounds import AverageCrlb
+from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 
 @pytest.fixture(scope='module')
 def problem(small):
-    return Problem(small.scenario, sampled_objective(small.scenario, small.vectors['positions']))
+    return Problem(small.scenario, AverageCrlb(small.scenario, small.vectors['positions']))
 
 
-def test_objective_is_the_vectors(case):
-    objective = sampled_objective(case.scenario, case.vectors['positions'])
-    value, by_analog, by_digital = objective(case.codebook)
-    assert value == pytest.approx(float(case.vectors['average_crlb']), rel=1e-8)
-    np.testing.assert_allclose(by_analog, case.vectors['grad_analog'], rtol=1e-7)
-    np.testing.assert_allclose(by_digital, case.vectors['grad_digital'], rtol=1e-7)
-
-
-def test_no_samples_are_an_error(small):
-    with pytest.raises(ValueError, match='positions: none given'):
-        sampled_objective(small.scenario, np.zeros((0, 3)))
+def test_value_is_that_of_the_vectors(case):
+    problem = Problem(case.scenario, AverageCrlb(case.scenario, case.vectors['positions']))
+    variables = problem.pack(case.codebook)
+    expected = pytest.approx(float(case.vectors['average_crlb']), rel=1e-8)
+    assert problem.value(variables) == expected
+    assert problem.value_and_gradient(variables)[0] == expected
 
 
 def test_variables_are_configurations_then_combining_vectors(problem, small):
@@ -77,7 +73,7 @@ def test_gradient_is_the_limit_of_differences_of_plain_bounds(plain, random_beam
         elements_per_side=3, max_power_w=0.02, roi_center_m=(3, 0, 0), roi_size_m=(2, 2, 2))
     positions = scenario.sample_positions(2, rng)
     spatial = multipath_covariance(scenario)
-    problem = Problem(scenario, sampled_objective(scenario, positions))
+    problem = Problem(scenario, AverageCrlb(scenario, positions))
     start = random_beams(scenario, rng)
     # Stay off the box's faces, and give every frame another scale.
     start = dataclasses.replace(start, analog=0.1 + 0.8 * start.analog)

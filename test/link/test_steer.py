@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.link import Beam, capacity, steer
-from rhs_isac_ros.link.steer import matched_configuration
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
 
 
 @pytest.fixture(scope='module')
@@ -53,20 +52,6 @@ def test_a_beam_is_never_worse_than_the_matched_filter(table1, places, link_of, 
         gained.append(rate(scenario, steer(scenario, place, band), place) / start - 1)
     assert min(gained) >= -1e-12
     assert max(gained) > 0.001
-
-
-def test_the_matched_configuration_follows_the_interference(small):
-    scenario = small.scenario
-    los = los_gain(scenario, np.array([[8.0, 1.0, 0.2]]), 0)[0]
-    onboard = onboard_matrix(scenario)[0]
-    matched = matched_configuration(los, onboard)
-    pattern = [sum(los[j, m] * onboard[j, k, m] for j in range(3) for k in range(2)).real
-               for m in range(16)]
-    assert (np.argsort(matched) == np.argsort(pattern)).all()
-    np.testing.assert_allclose(2 * matched - 1, np.array(pattern) / np.abs(pattern).max())
-    assert matched.min() >= 0
-    assert matched.max() <= 1
-    assert np.isclose(matched, 0).any() or np.isclose(matched, 1).any()
 
 
 def test_a_beam_of_a_small_surface_is_close_to_the_best_of_all(small, link_of):

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import yaml
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError
 
@@ -146,6 +147,36 @@ def test_from_yaml_reads_fields_and_keeps_defaults(tmp_path):
         feed_positions_m=((0.0, -0.01, 0.0), (0.0, 0.01, 0.0)))
     assert Scenario.from_yaml(path) == expected
     assert Scenario.from_yaml(str(path)) == expected
+
+
+CHANGES = [
+    {}, {'n_feeds': 2}, {'center_frequencies_hz': [28e9]}, {'max_power_w': 1 / 3},
+    {'roi_center_m': [4.0, 0.1 + 0.2, -1.0], 'roi_size_m': [2.0, 4.0, 1e-6]},
+    {'n_feeds': 2, 'feed_positions_m': [[0.0, -1e-7, 0.0], [0.01, 0.1, 1.0]]},
+    {'delay_spread_s': 0.0, 'noise_psd_dbm_hz': -400.0, 'elements_per_side': 1},
+]
+
+
+@pytest.mark.parametrize('changes', CHANGES, ids=str)
+def test_changes_are_what_differs_from_table_1(changes):
+    found = Scenario(**changes).changes()
+    assert found == changes
+    # Plain lists, not tuples: YAML's safe form has no others.
+    assert yaml.safe_load(yaml.safe_dump(found)) == changes
+
+
+@pytest.mark.parametrize('changes', CHANGES, ids=str)
+def test_changes_make_a_file_of_the_same_scenario(tmp_path, changes):
+    path, scenario = tmp_path / 'scenario.yaml', Scenario(**changes)
+    path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+    assert Scenario.from_yaml(path) == scenario
+
+
+def test_a_default_that_is_given_is_no_change(case):
+    whole = dataclasses.asdict(Scenario())
+    assert Scenario(**whole).changes() == {}
+    assert Scenario(center_frequencies_hz=['2.5e9', 3e9], max_power_w='1e-3').changes() == {}
+    assert Scenario(**case.scenario.changes()) == case.scenario
 
 
 def test_an_empty_file_is_table_1(tmp_path):

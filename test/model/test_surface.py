@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Scenario, surface
+from rhs_isac_ros.model.los import los_gain
 
 
 @pytest.fixture(scope='module')
@@ -105,3 +106,30 @@ def test_feeds_then_combining_equals_a_row_of_the_matrix_form(odd):
                 expected = sum(matrix[band, 2 * j + q, m] * elements[band, q, j, m]
                                for m in range(9))
                 np.testing.assert_allclose(combined[j], expected, rtol=1e-9)
+
+
+def test_the_matched_configuration_follows_the_interference(small):
+    scenario = small.scenario
+    los = los_gain(scenario, np.array([[8.0, 1.0, 0.2]]), 0)[0]
+    onboard = surface.onboard_matrix(scenario)[0]
+    matched = surface.matched_configuration(los, onboard)
+    pattern = [sum(los[j, m] * onboard[j, k, m] for j in range(3) for k in range(2)).real
+               for m in range(16)]
+    assert (np.argsort(matched) == np.argsort(pattern)).all()
+    np.testing.assert_allclose(2 * matched - 1, np.array(pattern) / np.abs(pattern).max())
+    assert matched.min() >= 0
+    assert matched.max() <= 1
+    assert np.isclose(matched, 0).any() or np.isclose(matched, 1).any()
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_matched_configuration_does_not_depend_on_scale_and_spans_the_range(seed):
+    rng = np.random.default_rng(seed)
+    los, onboard = complex_array(rng, 3, 9), complex_array(rng, 3, 2, 9)
+    matched = surface.matched_configuration(los, onboard)
+    assert matched.shape == (9,)
+    np.testing.assert_allclose(surface.matched_configuration(1e-4 * los, onboard), matched)
+    # What agrees on one side is the opposite on the other.
+    np.testing.assert_allclose(surface.matched_configuration(-los, onboard), 1 - matched)
+    np.testing.assert_allclose(surface.matched_configuration(los, -onboard), 1 - matched)
+    assert np.abs(matched - 0.5).max() == pytest.approx(0.5)

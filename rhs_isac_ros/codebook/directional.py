@@ -1,0 +1,68 @@
+"""Focused beams that scan the region of interest: a benchmark of the paper."""
+
+import numpy as np
+
+from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
+
+
+def directional_codebook(
+        scenario: Scenario, rng: np.random.Generator | None = None) -> Codebook:
+    """Focus each of the N_B F frames on a point of its own: the paper's `Directional`.
+
+    The points lie side by side across the middle of the region of interest; bands and frames take
+    turns, so that each band scans the whole width. Every other frame of a band looks above the
+    middle, and the ones between below: beams that are all symmetric in height could not tell up
+    from down. The configuration follows the
+    holographic principle; the weights of each sub-band are the matched filter of what then
+    arrives at the feeds, with the same power in all sub-bands.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    rng
+        Not needed: nothing is random.
+
+    Returns
+    -------
+    Codebook
+        The codebook.
+    """
+    sizes = scenario.sizes
+    analog = np.empty([sizes[s] for s in ('N_B', 'F', 'N_E')])
+    digital = np.empty([sizes[s] for s in ('N_B', 'N_SB', 'F', 'K')], complex)
+    points = focal_points(scenario)
+    for band, onboard in enumerate(onboard_matrix(scenario)):
+        for frame, los in enumerate(los_gain(scenario, points[:, band], band)):
+            analog[band, frame] = matched_configuration(los, onboard)
+            feeds = np.einsum('jkm,jm->jk', onboard, analog[band, frame] * los)
+            digital[band, :, frame] = np.conj(feeds) / np.linalg.norm(
+                feeds, axis=1, keepdims=True)
+    return Codebook(analog, digital * np.sqrt(scenario.max_power_w / sizes['N_SB']),
+                    provenance='directional')
+
+
+def focal_points(scenario: Scenario) -> np.ndarray:
+    """Where the beams focus.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+
+    Returns
+    -------
+    numpy.ndarray
+        Points, float64 [F, N_B, 3] [m].
+    """
+    n_frames, n_bands = scenario.n_frames, scenario.n_bands
+    low, high = scenario.roi_bounds_m
+    points = np.tile((low + high) / 2, (n_frames, n_bands, 1))
+    places = (np.arange(n_frames * n_bands) + 0.5) / (n_frames * n_bands)
+    points[..., 1] = (low[1] + (high[1] - low[1]) * places).reshape(n_frames, n_bands)
+    points[..., 2] = low[2] + (high[2] - low[2]) * np.where(
+        np.arange(n_frames) % 2, 0.75, 0.25)[:, None]
+    return points

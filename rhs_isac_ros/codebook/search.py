@@ -1,0 +1,172 @@
+"""What a method sees of an optimisation, and what is remembered of it."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from rhs_isac_ros.codebook.problem import Problem
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """State of an optimisation after a step.
+
+    Attributes
+    ----------
+    step
+        Update steps so far.
+    evaluations
+        Evaluations of the objective so far, with or without its gradient.
+    value_m2
+        Lowest objective so far [m^2].
+    elapsed_s
+        Time since the start [s].
+    """
+
+    step: int
+    evaluations: int
+    value_m2: float
+    elapsed_s: float
+
+
+class BudgetSpent(Exception):
+    """No evaluation is left; it passes through a method to who set the budget."""
+
+
+class Search:
+    """The objective as a method sees it; remembers the best point and the history.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    start
+        First point, float64 [n].
+    max_steps
+        Limit of update steps; what a step is, the method says.
+    max_evaluations
+        Limit of evaluations; None for no limit.
+    rng
+        Source of randomness for methods that need one.
+    progress
+        Called after each step.
+    done
+        Steps and evaluations of an earlier search that this one goes on from; limits count them.
+
+    Attributes
+    ----------
+    value_m2
+        Lowest objective met [m^2].
+    best
+        Where it was met, float64 [n].
+    history
+        Progress after each step; the first entry is the start.
+    """
+
+    def __init__(
+            self, problem: Problem, start: np.ndarray, max_steps: int,
+            max_evaluations: int | None, rng: np.random.Generator,
+            progress: Callable[[Progress], None] | None,
+            done: tuple[int, int] = (0, 0)) -> None:
+        self._first_step, self._evaluations = done
+        self.start, self.max_steps, self.rng = start, max_steps - self._first_step, rng
+        self.bounds, self.n_analog = problem.bounds, problem.n_analog
+        self._problem, self._progress = problem, progress
+        self._max_evaluations = max_evaluations
+        self._begin = time.perf_counter()
+        self.value_m2, self.best = np.inf, start
+        self.history: list[Progress] = []
+        self._last: tuple[np.ndarray, float, np.ndarray] | None = None
+
+    def begin(self) -> float:
+        """Evaluate the start and note it; what an earlier search evaluated does not count again.
+
+        Returns
+        -------
+        float
+            The objective [m^2].
+
+        Raises
+        ------
+        BudgetSpent
+            If no evaluation is left.
+        """
+        if self._evaluations:
+            self._evaluations -= 1
+        value, _ = self.value_and_gradient(self.start)
+        self.on_step()
+        return value
+
+    def finish(self) -> None:
+        """Note what was reached since the last step, if there is anything."""
+        if self._evaluations > self.history[-1].evaluations:
+            self.on_step()
+
+    def value(self, variables: np.ndarray) -> float:
+        """Evaluate the objective.
+
+        Parameters
+        ----------
+        variables
+            Float64 [n].
+
+        Returns
+        -------
+        float
+            The objective [m^2].
+
+        Raises
+        ------
+        BudgetSpent
+            If no evaluation is left.
+        """
+        self._count()
+        value = self._problem.value(variables)
+        self._remember(value, variables)
+        return value
+
+    def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        """Evaluate the objective and its gradient.
+
+        Parameters
+        ----------
+        variables
+            Float64 [n].
+
+        Returns
+        -------
+        tuple
+            The objective [m^2], and its gradient, float64 [n].
+
+        Raises
+        ------
+        BudgetSpent
+            If no evaluation is left.
+        """
+        # Methods evaluate anew where the one before them, or the start, has been.
+        if self._last is None or not np.array_equal(self._last[0], variables):
+            self._count()
+            value, gradient = self._problem.value_and_gradient(variables)
+            self._remember(value, variables)
+            self._last = np.array(variables), value, gradient
+        return self._last[1:]
+
+    def on_step(self) -> None:
+        """Note that a step is done."""
+        elapsed = time.perf_counter() - self._begin
+        step = self._first_step + len(self.history)
+        entry = Progress(step, self._evaluations, self.value_m2, elapsed)
+        self.history.append(entry)
+        if self._progress:
+            self._progress(entry)
+
+    def _count(self) -> None:
+        if self._max_evaluations is not None and self._evaluations >= self._max_evaluations:
+            raise BudgetSpent
+        self._evaluations += 1
+
+    def _remember(self, value: float, variables: np.ndarray) -> None:
+        if value < self.value_m2:
+            self.value_m2, self.best = value, np.array(variables)

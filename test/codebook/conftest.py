@@ -1,0 +1,85 @@
+"""A small scenario that optimises fast, and problems whose minimum is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook.search import Search
+from rhs_isac_ros.model import Scenario
+
+N_ANALOG = 10
+
+
+class Quadratic:
+    """A separable quadratic of 20 variables, the first 10 of them in a box; records its points.
+
+    As `Problem` does, it takes the nearest point in the box for one outside.
+
+    Attributes
+    ----------
+    best
+        Where its minimum is, which is `floor`.
+    points
+        Where it was evaluated.
+    """
+
+    n_analog = N_ANALOG
+    bounds = [(0.0, 1.0)] * N_ANALOG + [(None, None)] * N_ANALOG
+
+    def __init__(self, seed: int, floor: float = 1.0) -> None:
+        rng = np.random.default_rng(seed)
+        self.weights, self.center = rng.uniform(1, 50, 20), rng.normal(size=20)
+        clipped = np.clip(self.center, 0, 1)
+        self.best = np.where(np.arange(20) < N_ANALOG, clipped, self.center)
+        self.points: list[np.ndarray] = []
+        self._constant = floor - float(np.sum(self.weights * (self.best - self.center)**2))
+
+    def value(self, variables: np.ndarray) -> float:
+        self.points.append(np.array(variables))
+        return self._constant + float(np.sum(self.weights * self._offset(variables)**2))
+
+    def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        return self.value(variables), 2 * self.weights * self._offset(variables)
+
+    def _offset(self, variables: np.ndarray) -> np.ndarray:
+        inside = np.where(np.arange(20) < N_ANALOG, np.clip(variables, 0, 1), variables)
+        return inside - self.center
+
+
+class Flat(Quadratic):
+    """The same value everywhere."""
+
+    def value(self, variables: np.ndarray) -> float:
+        self.points.append(np.array(variables))
+        return 3.0
+
+    def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        return self.value(variables), np.zeros(20)
+
+
+@pytest.fixture(scope='session')
+def scenario(small) -> Scenario:
+    return dataclasses.replace(small.scenario, roi_center_m=(4, 0, 0), roi_size_m=(2, 4, 2))
+
+
+@pytest.fixture
+def quadratic():
+    """Function of a seed: a quadratic."""
+    return Quadratic
+
+
+@pytest.fixture
+def flat() -> Quadratic:
+    return Flat(0)
+
+
+@pytest.fixture
+def search_of():
+    """Function that makes a search of a problem, from the middle of the box."""
+    def make(problem, max_steps=10, max_evaluations=None, *, start=None, seed=0, progress=None,
+             done=(0, 0)) -> Search:
+        start = np.full(20, 0.5) if start is None else start
+        return Search(problem, start, max_steps, max_evaluations, np.random.default_rng(seed),
+                      progress, done)
+    return make

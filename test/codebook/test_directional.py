@@ -1,0 +1,83 @@
+"""The directional codebook: constraints, and where its beams look."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import directional_codebook
+from rhs_isac_ros.codebook.directional import focal_points
+from rhs_isac_ros.model import Scenario
+
+SCENARIOS = [
+    Scenario(max_power_w=0.3),
+    Scenario(center_frequencies_hz=(2e9, 2.3e9, 3.1e9), elements_per_side=16, n_subbands=2,
+             n_frames=3, roi_center_m=(8, 3, 1), roi_size_m=(4, 12, 3)),
+    Scenario(center_frequencies_hz=(2.5e9,), n_feeds=1, n_subbands=1, n_frames=1),
+]
+
+
+@pytest.mark.parametrize('scenario', SCENARIOS)
+def test_constraints_hold_and_sub_bands_share_the_power_evenly(scenario):
+    codebook = directional_codebook(scenario)
+    codebook.check(scenario)
+    assert codebook.analog.min() >= 0
+    assert codebook.analog.max() <= 1
+    power = np.sum(np.abs(codebook.digital)**2, axis=-1)
+    np.testing.assert_allclose(power, scenario.max_power_w / scenario.n_subbands, rtol=1e-12)
+    assert codebook.provenance == 'directional'
+
+
+def test_nothing_is_random():
+    one, other = (directional_codebook(Scenario(), np.random.default_rng(n)) for n in (1, 2))
+    assert one.id == other.id == directional_codebook(Scenario()).id
+
+
+@pytest.mark.parametrize('scenario', SCENARIOS)
+def test_focal_points_scan_the_width_of_the_region(scenario):
+    points = focal_points(scenario)
+    low, high = scenario.roi_bounds_m
+    assert points.shape == (scenario.n_frames, scenario.n_bands, 3)
+    assert ((points > low) & (points < high)).all()
+    np.testing.assert_allclose(points[..., 0], scenario.roi_center_m[0])
+    across = np.sort(points[..., 1].ravel())
+    step = (high[1] - low[1]) / across.size
+    np.testing.assert_allclose(across, low[1] + step * (np.arange(across.size) + 0.5))
+    # Each band scans the whole width.
+    assert (np.ptp(points[..., 1], axis=0) >= step * across.size * (
+        1 - 1 / scenario.n_frames) - 1e-9).all()
+    if scenario.n_frames > 1:
+        heights = points[..., 2] - scenario.roi_center_m[2]
+        assert (heights[::2] < 0).all()
+        assert (heights[1::2] > 0).all()
+
+
+@pytest.mark.parametrize('scenario', SCENARIOS[:2])
+def test_each_beam_is_strongest_nearly_where_it_is_focused(scenario, plain):
+    """Received power without the loss of the path, at all focal points."""
+    codebook = directional_codebook(scenario)
+    p = plain(scenario, codebook.analog, codebook.digital)
+    points = focal_points(scenario).reshape(-1, 3)
+    for band in range(scenario.n_bands):
+        mean = p.mean(points, band).reshape(len(points), scenario.n_subbands, -1)
+        power = np.sum(np.abs(mean)**2, axis=1) * np.sum(points**2, axis=1, keepdims=True)
+        for frame in range(scenario.n_frames):
+            own = power[frame * scenario.n_bands + band, frame]
+            assert own > 0.9 * power[:, frame].max()
+            assert own > 2 * power[:, frame].mean()
+
+
+@pytest.mark.parametrize('scenario', SCENARIOS[:2])
+def test_no_other_weights_of_a_sub_band_collect_more(scenario, plain):
+    codebook, rng = directional_codebook(scenario), np.random.default_rng(0)
+    points = focal_points(scenario)
+    for band, frame, j in [(0, 0, 0), (1, 2, 1)]:
+        los = np.array([plain(scenario).los(points[frame, band], band, j, m)
+                        for m in range(scenario.n_elements)])
+        feeds = np.array([
+            sum(plain(scenario).onboard(band, j, k, m) * codebook.analog[band, frame, m] * los[m]
+                for m in range(scenario.n_elements)) for k in range(scenario.n_feeds)])
+        best = abs(codebook.digital[band, j, frame] @ feeds)
+        share = scenario.max_power_w / scenario.n_subbands
+        assert best == pytest.approx(np.sqrt(share) * np.linalg.norm(feeds), rel=1e-9)
+        for _ in range(20):
+            other = rng.normal(size=(scenario.n_feeds, 2)) @ [1, 1j]
+            assert abs(other @ feeds) * np.sqrt(share) / np.linalg.norm(other) <= best

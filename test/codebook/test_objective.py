@@ -1,0 +1,109 @@
+"""What a codebook is optimised for: values by plain equations, and gradients."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import PairConfusion, crlb
+from rhs_isac_ros.codebook import OBJECTIVES, objective, optimize, random_codebook
+from rhs_isac_ros.codebook.objective import ambiguity, average_bound
+from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.codebook.sampling import confusable
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.multipath import multipath_covariance
+
+
+def test_average_bound_is_that_of_the_vectors(case):
+    """As exact as its rows: six positions do not average their errors out."""
+    bound = average_bound(
+        case.scenario, case.vectors['positions'], np.random.default_rng(0))
+    value, by_analog, by_digital = bound(case.codebook)
+    assert value == bound.value(case.codebook)
+    assert value == pytest.approx(float(case.vectors['average_crlb']), rel=3e-3)
+    for gradient, name in ((by_analog, 'grad_analog'), (by_digital, 'grad_digital')):
+        wanted = case.vectors[name]
+        assert np.linalg.norm(gradient - wanted) < 0.03 * np.linalg.norm(wanted)
+
+
+def test_average_bound_errs_by_less_than_a_thousandth(table1, shipped):
+    scenario = table1.scenario
+    positions = scenario.sample_positions(200, np.random.default_rng(0))
+    bound = average_bound(scenario, positions, np.random.default_rng(0))
+    for codebook in (shipped, random_codebook(scenario, np.random.default_rng(1))):
+        exact = crlb(scenario, codebook, positions).mean()
+        assert bound.value(codebook) == pytest.approx(exact, rel=1e-3)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_ambiguity_is_the_plain_confusion_of_pairs(
+        scenario, plain, random_beams, seed, monkeypatch):
+    """|p - p'|^2 Q(sqrt(q / 2)), with five others for each position."""
+    monkeypatch.setattr(objective, '_PAIRS_A_POSITION', 5)
+    rng = np.random.default_rng(seed)
+    codebook, positions = random_beams(scenario, rng), scenario.sample_positions(4, rng)
+    value = ambiguity(scenario, positions, np.random.default_rng(seed)).value(codebook)
+    firsts = np.array([position for position in positions for _ in range(5)])
+    seconds = confusable(scenario, firsts, np.random.default_rng(seed))
+    p = plain(scenario, codebook.analog, codebook.digital)
+    inverse = np.linalg.inv(p.covariance(0, multipath_covariance(scenario)[0]))
+    total = 0.0
+    for a, b in zip(firsts, seconds, strict=True):
+        difference = p.mean(a, 0) - p.mean(b, 0)
+        q = (difference.conj() @ inverse @ difference).real
+        total += np.sum((a - b)**2) * math.erfc(math.sqrt(q / 2) / math.sqrt(2)) / 2
+    assert value == pytest.approx(total / 20, rel=1e-3)
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('name', OBJECTIVES)
+def test_gradients_are_the_limit_of_differences(name, random_beams, seed):
+    rng = np.random.default_rng(seed)
+    scenario = Scenario(
+        center_frequencies_hz=(1.8e9, 2.9e9), n_subbands=2, n_frames=2, n_feeds=2,
+        elements_per_side=3, max_power_w=0.02, roi_center_m=(3, 0, 0), roi_size_m=(2, 2, 2))
+    problem = Problem(scenario, OBJECTIVES[name](
+        scenario, scenario.sample_positions(12, rng), rng))
+    variables = problem.pack(random_beams(scenario, rng))
+    # Off the box's faces, and with another scale in every frame.
+    variables[:problem.n_analog] = 0.1 + 0.8 * variables[:problem.n_analog]
+    variables[problem.n_analog:] *= 1.9
+    value, gradient = problem.value_and_gradient(variables)
+    assert value == pytest.approx(problem.value(variables), rel=1e-12)
+    for _ in range(4):
+        way = rng.normal(size=variables.shape)
+        difference = (problem.value(variables + 1e-5 * way)
+                      - problem.value(variables - 1e-5 * way)) / 2e-5
+        assert gradient @ way == pytest.approx(
+            difference, abs=1e-5 * np.linalg.norm(gradient) * np.linalg.norm(way))
+
+
+def test_optimising_ambiguity_confuses_fewer_pairs_also_of_others(scenario):
+    result = optimize(scenario, method='lbfgs', objective='ambiguity', n_positions=128, seed=1,
+                      max_steps=30)
+    rng = np.random.default_rng(99)
+    firsts = scenario.sample_positions(1500, rng)
+    held_out = PairConfusion(scenario, firsts, confusable(scenario, firsts, rng))
+    start = random_codebook(scenario, np.random.default_rng(1))
+    bound = optimize(scenario, n_positions=128, seed=1, max_steps=30)
+    found = held_out.value(result.codebook)
+    assert found < 0.8 * held_out.value(start)
+    # What the bound is optimised for is something else.
+    assert found < held_out.value(bound.codebook)
+    assert bound.codebook.average_crlb_m2 < result.codebook.average_crlb_m2
+
+
+@pytest.mark.parametrize('name', ['ambiguity', 'crlb'])
+def test_the_generator_decides_what_is_random(scenario, small, name):
+    positions = scenario.sample_positions(5, np.random.default_rng(0))
+    one, same, other = (
+        OBJECTIVES[name](scenario, positions, np.random.default_rng(seed)).value(small.codebook)
+        for seed in (1, 1, 2))
+    assert one == same
+    assert (one == other) == (name == 'crlb')
+
+
+@pytest.mark.parametrize('name', OBJECTIVES)
+def test_no_samples_are_an_error(small, name):
+    with pytest.raises(ValueError, match='expected .*at least one'):
+        OBJECTIVES[name](small.scenario, np.zeros((0, 3)), np.random.default_rng(0))

@@ -1,0 +1,155 @@
+"""Samples of the region of interest, and positions that are taken for one another."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import SAMPLINGS
+from rhs_isac_ros.codebook.sampling import confusable, monte_carlo, sobol
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
+
+LOPSIDED = Scenario(roi_center_m=(4, 1, -2), roi_size_m=(2, 6, 1))
+# So large that the lags of a position in its middle are not cut off.
+WIDE = Scenario(roi_center_m=(50, 0, 0), roi_size_m=(90, 90, 90))
+BANDS = {'two': (2.5e9, 3.0e9), 'one': (2.5e9,), 'three': (2.0e9, 2.3e9, 3.1e9)}
+
+
+@pytest.mark.parametrize('n', [1, 2, 3, 64, 100, 1000])
+@pytest.mark.parametrize('name', SAMPLINGS)
+def test_samples_are_in_the_region_and_the_generators(name, n):
+    low, high = LOPSIDED.roi_bounds_m
+    one, same, other = (
+        SAMPLINGS[name](LOPSIDED, n, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert one.shape == (n, 3)
+    assert one.dtype == np.float64
+    assert ((one >= low) & (one <= high)).all()
+    assert len(np.unique(one, axis=0)) == n
+    np.testing.assert_array_equal(one, same)
+    assert not np.isin(one, other).any()
+
+
+@pytest.mark.parametrize('name', SAMPLINGS)
+def test_samples_are_uniform(name):
+    low, high = LOPSIDED.roi_bounds_m
+    unit = (SAMPLINGS[name](LOPSIDED, 8000, np.random.default_rng(0)) - low) / (high - low)
+    np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.015)
+    np.testing.assert_allclose(np.cov(unit.T), np.eye(3) / 12, atol=0.004)
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('n', [1, 2, 128])
+def test_sobol_puts_one_point_in_each_slice(n, seed):
+    low, high = LOPSIDED.roi_bounds_m
+    unit = (sobol(LOPSIDED, n, np.random.default_rng(seed)) - low) / (high - low)
+    np.testing.assert_array_equal(
+        np.sort(np.floor(unit * n), axis=0), np.tile(np.arange(n)[:, None], 3))
+
+
+@pytest.mark.parametrize('n', [100, 256])
+def test_sobol_integrates_a_smooth_function_better(n):
+    """(1 + sin x)(2 + y^2) exp(z / 2), whose mean over the region is known."""
+    def function(points):
+        x, y, z = points.T
+        return (1 + np.sin(x)) * (2 + y**2) * np.exp(z / 2)
+
+    (x0, y0, z0), (x1, y1, z1) = LOPSIDED.roi_bounds_m
+    exact = (1 + (np.cos(x0) - np.cos(x1)) / (x1 - x0)) * (
+        2 + (y1**3 - y0**3) / 3 / (y1 - y0)) * (
+        2 * (np.exp(z1 / 2) - np.exp(z0 / 2)) / (z1 - z0))
+    spread = {}
+    for sample in (monte_carlo, sobol):
+        errors = [function(sample(LOPSIDED, n, np.random.default_rng(seed))).mean() / exact - 1
+                  for seed in range(20)]
+        spread[sample] = np.sqrt(np.mean(np.square(errors)))
+    assert spread[sobol] < 0.3 * spread[monte_carlo]
+    assert spread[monte_carlo] < 0.2
+
+
+@pytest.mark.parametrize('bands', BANDS)
+@pytest.mark.parametrize('region', [LOPSIDED, Scenario()], ids=['lopsided', 'table1'])
+def test_confusable_positions_are_other_ones_in_the_region(region, bands):
+    scenario = dataclasses.replace(region, center_frequencies_hz=BANDS[bands])
+    low, high = scenario.roi_bounds_m
+    positions = np.vstack([
+        scenario.sample_positions(300, np.random.default_rng(0)), scenario.roi_bounds_m])
+    before = positions.copy()
+    one, same, other = (
+        confusable(scenario, positions, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(positions, before)
+    assert one.shape == positions.shape
+    assert ((one >= low) & (one <= high)).all()
+    np.testing.assert_array_equal(one, same)
+    assert (one != other).all(axis=1).all()
+    lags = np.abs(np.linalg.norm(one, axis=1) - np.linalg.norm(positions, axis=1))
+    assert lags.min() > 0.99 * SPEED_OF_LIGHT_MPS / max(BANDS[bands]) / 2
+
+
+def lags_of(bands, n=20_000):
+    """Range lags of positions in the middle of a wide region, up to 20 m."""
+    scenario = dataclasses.replace(WIDE, center_frequencies_hz=BANDS[bands])
+    positions = np.tile([50.0, 0, 0], (n, 1))
+    others = confusable(scenario, positions, np.random.default_rng(3))
+    lags = np.linalg.norm(others, axis=1) - 50
+    # Beyond, some were out of the region.
+    return lags[np.abs(lags) < 20]
+
+
+@pytest.mark.parametrize(('bands', 'period'), [
+    ('two', 0.5996), ('one', 0.119917), ('three', 2.99792)])
+def test_lags_cluster_at_the_period_of_the_bands(bands, period):
+    """Ranges repeat where all bands have gone through whole turns."""
+    lags = np.abs(lags_of(bands))
+    lags = lags[lags > period / 2]
+    away = np.abs((lags / period + 0.5) % 1 - 0.5) * period
+    # An eighth of a wavelength off on either side, and half a wavelength off: equally wide.
+    wavelength = SPEED_OF_LIGHT_MPS / max(BANDS[bands])
+    near = np.sum(away < wavelength / 8)
+    beside = np.sum((away >= wavelength * 3 / 8) & (away < wavelength / 2))
+    assert near > 4 * beside
+
+
+@pytest.mark.parametrize('bands', BANDS)
+def test_lags_have_the_density_they_should(bands):
+    """exp(-sum_i (1 - cos 2 pi f_i lag / v_0)) from half a wavelength on, on both sides."""
+    lags = lags_of(bands)
+    count = len(lags)
+    assert count > 3000
+    assert np.mean(lags > 0) == pytest.approx(0.5, abs=3 / np.sqrt(count))
+    frequencies = np.array(BANDS[bands])[:, None]
+    grid = np.linspace(SPEED_OF_LIGHT_MPS / frequencies.max() / 2, 20, 200_000)
+    density = np.exp(-np.sum(
+        1 - np.cos(2 * np.pi * frequencies * grid / SPEED_OF_LIGHT_MPS), axis=0))
+    expected = np.cumsum(density) / density.sum()
+    found = np.searchsorted(np.sort(np.abs(lags)), grid, side='right') / count
+    # Kolmogorov and Smirnov: 1.95 is exceeded once in a thousand times.
+    assert np.abs(found - expected).max() < 1.95 / np.sqrt(count)
+    # Within one period, where the clusters are.
+    phase = np.exp(2j * np.pi * frequencies * np.abs(lags) / SPEED_OF_LIGHT_MPS).mean(axis=1)
+    wanted = (np.exp(2j * np.pi * frequencies * grid / SPEED_OF_LIGHT_MPS) * density).sum(
+        axis=1) / density.sum()
+    np.testing.assert_allclose(phase, wanted, atol=4 / np.sqrt(count))
+    assert (phase.real > 0.3).all()
+
+
+@pytest.mark.parametrize('side', [5, 20])
+def test_confusable_positions_lie_within_a_beam(side):
+    """Narrower surfaces have wider beams; 0.3 wavelengths an element."""
+    scenario = dataclasses.replace(WIDE, elements_per_side=side)
+    positions = np.tile([50.0, 0, 0], (5000, 1))
+    others = confusable(scenario, positions, np.random.default_rng(3))
+    angles = np.arctan2(np.linalg.norm(others[:, 1:], axis=1), others[:, 0])
+    wavelengths = SPEED_OF_LIGHT_MPS / np.array([2.5e9, 3e9])
+    width = wavelengths.min() / (side * 0.3 * wavelengths.mean())
+    assert np.quantile(angles, 0.02) < 0.1 * width
+    assert 0.05 * width < np.median(angles) < 0.3 * width
+    assert 0.3 * width < angles.max() < 1.7 * width
+    # Along y and z alike.
+    np.testing.assert_allclose(np.std(others[:, 1]), np.std(others[:, 2]), rtol=0.1)
+
+
+@pytest.mark.parametrize('size', [(0.02, 0.02, 0.02), (0.049, 1e-3, 1e-3)])
+def test_a_region_smaller_than_half_a_wavelength_is_an_error(size):
+    scenario = Scenario(roi_size_m=size)
+    with pytest.raises(ValueError, match='^roi_size_m: .*, expected a region larger than half'):
+        confusable(scenario, np.array([[10.0, 0, 0]]), np.random.default_rng(0))

@@ -1,0 +1,115 @@
+"""What methods see of an optimisation, and what is remembered."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook.search import BudgetSpent, Progress
+
+START = np.full(20, 0.5)
+
+
+def test_a_search_has_what_methods_need(quadratic, search_of):
+    search = search_of(quadratic(0), 7, seed=3)
+    assert search.max_steps == 7
+    assert search.n_analog == 10
+    assert search.bounds == [(0.0, 1.0)] * 10 + [(None, None)] * 10
+    np.testing.assert_array_equal(search.start, START)
+    assert search.rng.integers(1000) == np.random.default_rng(3).integers(1000)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_remembers_the_best_point_however_it_was_evaluated(quadratic, search_of, seed):
+    problem, rng = quadratic(seed), np.random.default_rng(seed)
+    search = search_of(problem)
+    reference = quadratic(seed)
+    best = None
+    for n in range(30):
+        point = rng.normal(size=20)
+        if n % 2:
+            value = search.value(point)
+        else:
+            value, gradient = search.value_and_gradient(point)
+            np.testing.assert_array_equal(gradient, reference.value_and_gradient(point)[1])
+        assert value == reference.value(point)
+        if best is None or value < best[0]:
+            best = value, point.copy()
+        # A method may go on in the same array.
+        point[:] = 0
+        assert search.value_m2 == best[0]
+        np.testing.assert_array_equal(search.best, best[1])
+
+
+def test_before_any_evaluation_the_start_is_the_best(quadratic, search_of):
+    search = search_of(quadratic(0))
+    assert search.value_m2 == np.inf
+    np.testing.assert_array_equal(search.best, START)
+
+
+def test_a_value_that_is_none_is_never_the_best(flat, search_of):
+    search = search_of(flat)
+    search.value(START)
+    flat.value = lambda variables: np.nan
+    assert np.isnan(search.value(START + 1))
+    assert search.value_m2 == 3.0
+    np.testing.assert_array_equal(search.best, START)
+
+
+def test_the_same_point_again_is_not_evaluated_again(quadratic, search_of):
+    problem = quadratic(0)
+    search = search_of(problem)
+    point = START.copy()
+    first = search.value_and_gradient(point)
+    again = search.value_and_gradient(START)
+    assert len(problem.points) == 1
+    assert first[0] == again[0]
+    np.testing.assert_array_equal(first[1], again[1])
+    # Another point in the same array is another point.
+    point[3] = 0.25
+    moved = search.value_and_gradient(point)
+    assert len(problem.points) == 2
+    assert moved[0] == quadratic(0).value(point)
+
+
+def test_history_counts_steps_and_evaluations(quadratic, search_of):
+    seen = []
+    search = search_of(quadratic(0), progress=seen.append)
+    search.value(START)
+    search.on_step()
+    search.value_and_gradient(START - 0.1)
+    search.value(START + 0.1)
+    search.on_step()
+    assert search.history == seen
+    assert all(isinstance(entry, Progress) for entry in seen)
+    assert [entry.step for entry in seen] == [0, 1]
+    assert [entry.evaluations for entry in seen] == [1, 3]
+    assert seen[0].value_m2 == quadratic(0).value(START)
+    assert seen[1].value_m2 == search.value_m2 <= seen[0].value_m2
+    assert 0 <= seen[0].elapsed_s <= seen[1].elapsed_s < 60
+
+
+@pytest.mark.parametrize('budget', [1, 2, 5])
+@pytest.mark.parametrize('name', ['value', 'value_and_gradient'])
+def test_no_evaluation_is_done_beyond_the_budget(quadratic, search_of, budget, name):
+    problem = quadratic(0)
+    search = search_of(problem, max_evaluations=budget)
+    for n in range(budget):
+        getattr(search, name)(START + n)
+    for _ in range(2):
+        with pytest.raises(BudgetSpent):
+            getattr(search, name)(START - 1)
+    assert len(problem.points) == budget
+    search.on_step()
+    assert search.history[-1].evaluations == budget
+
+
+def test_limits_count_what_an_earlier_search_has_done(quadratic, search_of):
+    search = search_of(quadratic(0), 10, 7, done=(4, 5))
+    assert search.max_steps == 6
+    search.value(START)
+    search.on_step()
+    search.value(START)
+    with pytest.raises(BudgetSpent):
+        search.value(START)
+    search.on_step()
+    assert [entry.step for entry in search.history] == [4, 5]
+    assert [entry.evaluations for entry in search.history] == [6, 7]
