@@ -1,0 +1,93 @@
+"""Positioning error with codebooks that were made in different ways.
+
+Problem: the average Cramer-Rao bound is local. Two bands repeat themselves every so many metres of
+range, and a codebook with a low bound may still leave these ranges alike. Which codebook locates
+users best? All face the same positions, multipath and noise, and the posterior mean of each.
+"""
+
+import os
+
+# One thread, as in the positioner node. This must come before NumPy is loaded.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
+from rhs_isac_ros.model import Scenario, simulate_received, streams
+from rhs_isac_ros.positioning import make_estimator
+
+CONFIG = Path(__file__).parents[2] / 'config'
+BATCH = 50
+
+
+def main() -> None:
+    """Locate, compare, and print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument('--positions', type=int, default=1000)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--codebook', type=Path, action='append', default=[],
+                        help='one more codebook to compare; may be repeated')
+    parser.add_argument('--json', type=Path, help='file for the figures')
+    options = parser.parse_args()
+    scenario = Scenario()
+    codebooks = {
+        'ambiguity': Codebook.load(CONFIG / 'codebook_ambiguity.yaml'),
+        'crlb': Codebook.load(CONFIG / 'codebook_crlb.yaml'),
+        'directional': directional_codebook(scenario),
+        'random': random_codebook(scenario, streams.generator(options.seed, streams.START)),
+        **{path.stem: Codebook.load(path) for path in options.codebook}}
+    errors = {name: squared_errors(scenario, codebook, options.positions, options.seed)
+              for name, codebook in codebooks.items()}
+    print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
+    print('| codebook | mean squared error [m^2] | standard error | median | average CRLB [m^2] |')
+    print('|---|---|---|---|---|')
+    figures = {}
+    for name, codebook in codebooks.items():
+        bound = crlb(scenario, codebook, places(scenario, options.positions, options.seed)).mean()
+        figures[name] = {
+            'id': codebook.id, 'mse_m2': errors[name].mean(),
+            'standard_error_m2': errors[name].std() / np.sqrt(options.positions),
+            'median_m2': np.median(errors[name]), 'average_crlb_m2': bound}
+        print('| {} | {mse_m2:.3f} | {standard_error_m2:.3f} | {median_m2:.3f} | '
+              '{average_crlb_m2:.4f} |'.format(name, **figures[name]))
+    print()
+    for rival in ('crlb', 'directional', 'random'):
+        less, spread = reduction(errors['ambiguity'], errors[rival])
+        figures[f'reduction_{rival}_percent'] = less
+        print(f'ambiguity is {less:.1f} % below {rival} (standard error {spread:.1f})')
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+
+
+def places(scenario: Scenario, n: int, seed: int) -> np.ndarray:
+    """Draw the positions, the same for all codebooks."""
+    return scenario.sample_positions(n, np.random.default_rng(seed))
+
+
+def squared_errors(scenario: Scenario, codebook: Codebook, n: int, seed: int) -> np.ndarray:
+    """Squared error of the posterior mean at every position [m^2]."""
+    positions = places(scenario, n, seed)
+    # The same draws of multipath and noise, whatever the codebook makes of them.
+    received = simulate_received(scenario, codebook, positions, np.random.default_rng(seed + 1))
+    estimator = make_estimator('bayes', scenario, codebook)
+    means = np.concatenate([estimator.estimate(received[start:start + BATCH]).mean
+                            for start in range(0, n, BATCH)])
+    return np.sum((means - positions)**2, axis=1)
+
+
+def reduction(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
+    """How far one mean lies below another, and its standard error by paired resampling [%]."""
+    rng = np.random.default_rng(0)
+    picks = rng.integers(len(ours), size=(2000, len(ours)))
+    samples = 1 - ours[picks].mean(axis=1) / theirs[picks].mean(axis=1)
+    return 100 * float(1 - ours.mean() / theirs.mean()), 100 * float(samples.std())
+
+
+if __name__ == '__main__':
+    main()

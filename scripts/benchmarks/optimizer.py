@@ -1,0 +1,336 @@
+"""Speed of the codebook optimiser.
+
+Problem: minimise the average Cramer-Rao bound over sampled positions. (a) What do one value and
+its gradient cost, beside automatic differentiation of the same objective, and beside the matrix
+products that they cannot do without? (b) How long until the average bound on positions that were
+not sampled is 0.0415 m^2, and who gets there? (c) How do time and memory grow with the numbers of
+positions, elements and bands?
+"""
+
+import argparse
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from peers.jax_crlb import JaxAverageCrlb
+from scipy.optimize import minimize
+
+from rhs_isac_ros.bounds import AverageCrlb, crlb
+from rhs_isac_ros.codebook import METHODS, random_codebook
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
+from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
+from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.codebook.sampling import monte_carlo, sobol
+from rhs_isac_ros.codebook.search import BudgetSpent, Search
+from rhs_isac_ros.model import Scenario, streams
+
+HAVE_JAX = importlib.util.find_spec('jax') is not None
+TARGET_M2 = 0.0415
+POSITIONS = 1200
+HELD_OUT = 2000
+# Sides of the surface, numbers of positions and of bands of part (c).
+GROWTH = {'N_sam': (100, 300, 1000, 3000, 10000), 'N_E': (100, 256, 484, 1024),
+          'N_B': (1, 2, 4, 8)}
+LARGE = {'N_sam': POSITIONS, 'N_E': 1024, 'N_B': 4}
+
+
+def main() -> None:
+    """Measure, print and draw."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument('--threads', type=int, default=1, help='cores and threads for everybody')
+    parser.add_argument('--limit', type=float, default=120.0, help='seconds for each rival in (b)')
+    parser.add_argument('--parts', default='abc', help='which parts to run')
+    parser.add_argument('--json', type=Path, help='file for the figures')
+    parser.add_argument('--picture', type=Path, help='file for a picture')
+    parser.add_argument('--growth', help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    pin(options.threads)
+    if options.growth:
+        print(json.dumps(grow(json.loads(options.growth))))
+        return
+    if not HAVE_JAX:
+        print('JAX is not installed, so its figures are left out: '
+              'python -m pip install --no-deps -r requirements-peers.txt\n', file=sys.stderr)
+    figures: dict = {'threads': options.threads}
+    for part, measure in (('a', gradient), ('b', lambda: target(options.limit)), ('c', growth)):
+        if part in options.parts:
+            figures |= measure()
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+    if options.picture:
+        draw(figures, options.picture)
+
+
+def pin(n: int) -> None:
+    """Start anew on n cores with n threads, which libraries read when they are loaded."""
+    if threads() != n:
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:n])
+        os.environ['OPENBLAS_NUM_THREADS'] = str(n)
+        os.execv(sys.executable, [sys.executable, *sys.argv])
+
+
+def threads() -> int:
+    """Threads that everybody has; 0 if it was not decided yet."""
+    return int(os.environ.get('OPENBLAS_NUM_THREADS', 0))
+
+
+def gradient() -> dict:
+    """Part (a)."""
+    scenario = Scenario()
+    positions = monte_carlo(scenario, POSITIONS, streams.generator(0, streams.SAMPLES))
+    start = random_codebook(scenario, streams.generator(0, streams.START))
+    fast = Problem(scenario, AverageCrlb(scenario, positions, ROW_TOLERANCE))
+    exact = Problem(scenario, AverageCrlb(scenario, positions))
+    variables = fast.pack(start)
+    contenders: dict[str, Callable] = {
+        'ours': lambda: fast.value_and_gradient(variables),
+        'ours, exact rows': lambda: exact.value_and_gradient(variables),
+        'matrix products alone': products(fast, scenario)}
+    if HAVE_JAX:
+        peer = JaxAverageCrlb(scenario, positions)
+        contenders['JAX'] = lambda: peer(variables)
+    times_s = side_by_side(contenders)
+    value = {name: contenders[name]()[0] for name in ('ours', 'ours, exact rows')}
+    ours = times_s['ours']
+    print(f'(a) value and gradient, Table I, {POSITIONS} positions, {threads()} thread(s)\n')
+    print('| what | ms | ours is faster by |\n|---|---|---|')
+    for name, time_s in times_s.items():
+        print(f'| {name} | {1e3 * time_s:.2f} | {time_s / ours:.2f} |')
+    print(f'\nrelative error of the value: {value["ours"] / value["ours, exact rows"] - 1:.1e}; '
+          f'ranks {fast.objective.rows.ranks}\n')
+    return {
+        'gradient_ms': {name: 1e3 * time_s for name, time_s in times_s.items()},
+        'gradient_speedup_vs_jax': times_s['JAX'] / ours if HAVE_JAX else None,
+        'gradient_ratio_to_matrix_products': ours / times_s['matrix products alone']}
+
+
+def products(problem: Problem, scenario: Scenario) -> Callable[[], list]:
+    """Return the products that value and gradient cannot do without: rows by patterns and back."""
+    rng = np.random.default_rng(0)
+    size = scenario.n_subbands * scenario.n_frames
+    pairs = []
+    for rows in problem.objective.rows.coefficients:
+        pairs.append((rows, rng.normal(size=(rows.shape[1], size)) + 0j,
+                      rng.normal(size=(len(rows), size)) + 0j))
+    return lambda: [(rows @ right, rows.T @ left) for rows, right, left in pairs]
+
+
+def side_by_side(contenders: dict[str, Callable], rounds: int = 25) -> dict[str, float]:
+    """Median times, taken in turn so that a disturbance meets everybody [s]."""
+    times: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(rounds):
+        for name, function in contenders.items():
+            begin = time.perf_counter()
+            function()
+            times[name].append(time.perf_counter() - begin)
+    return {name: float(np.median(values[3:])) for name, values in times.items()}
+
+
+def target(limit_s: float) -> dict:
+    """Part (b)."""
+    scenario = Scenario()
+    held_out = monte_carlo(scenario, HELD_OUT, streams.generator(0, streams.HELD_OUT))
+    runs = {f'lbfgs, {DEFAULT_POSITIONS} Sobol': run(scenario, 'lbfgs', sobol, limit_s),
+            'lbfgs, 1024 Sobol': run(scenario, 'lbfgs', sobol, limit_s, 1024),
+            f'lbfgs, {POSITIONS} random': run(scenario, 'lbfgs', monte_carlo, limit_s, POSITIONS)}
+    for method in ('alternating', 'direct', 'genetic'):
+        runs[f'{method}, {POSITIONS} random'] = run(
+            scenario, method, monte_carlo, limit_s, POSITIONS)
+    compiled_s = 0.0
+    if HAVE_JAX:
+        runs['JAX + L-BFGS-B'], compiled_s = run_peer(scenario, limit_s)
+    print(f'(b) time to an average bound of {TARGET_M2} m^2 on {HELD_OUT} held-out positions\n')
+    print('| method | s | evaluations | at the end [m^2] | after [s] |\n|---|---|---|---|---|')
+    reached = {}
+    for name, trace in runs.items():
+        at = first_below(scenario, trace, held_out)
+        end_m2 = held_out_crlb(scenario, trace[-1], held_out)
+        reached[name] = {
+            'target_s': at and at[0], 'evaluations': at and at[1], 'final_m2': end_m2,
+            'final_s': trace[-1][0]}
+        when = f'{at[0]:.2f} | {at[1]}' if at else 'not reached | '
+        print(f'| {name} | {when} | {end_m2:.5f} | {trace[-1][0]:.1f} |')
+    ours = reached[f'lbfgs, {DEFAULT_POSITIONS} Sobol']
+    peer = reached.get('JAX + L-BFGS-B', {}).get('target_s')
+    figures = {
+        'target': reached, 'final_average_crlb_m2': ours['final_m2'],
+        'target_speedup_vs_jax': peer and ours['target_s'] and peer / ours['target_s'],
+        'target_speedup_vs_jax_with_compilation':
+            peer and ours['target_s'] and (peer + compiled_s) / ours['target_s'],
+        'jax_compilation_s': compiled_s}
+    if peer:
+        print(f'\nlbfgs is {figures["target_speedup_vs_jax"]:.1f} times as fast as JAX; '
+              f'{figures["target_speedup_vs_jax_with_compilation"]:.1f} with its compilation '
+              f'of {compiled_s:.1f} s')
+    print()
+    return figures
+
+
+# Time [s], evaluations and best variables after each step.
+Trace = list[tuple[float, int, np.ndarray]]
+
+
+def run(scenario: Scenario, method: str, sample: Callable, limit_s: float,
+        n_positions: int = DEFAULT_POSITIONS) -> Trace:
+    """Run a method with its default steps, from the sampling on."""
+    begin = time.perf_counter()
+    positions = sample(scenario, n_positions, streams.generator(0, streams.SAMPLES))
+    problem = Problem(scenario, AverageCrlb(scenario, positions, ROW_TOLERANCE))
+    start = problem.pack(random_codebook(scenario, streams.generator(0, streams.START)))
+    trace: Trace = []
+
+    def note(progress: object) -> None:
+        elapsed_s = time.perf_counter() - begin
+        trace.append((elapsed_s, progress.evaluations, search.best))
+        if elapsed_s > limit_s:
+            raise BudgetSpent
+
+    search = Search(problem, start, METHODS[method].steps, None,
+                    streams.generator(0, streams.METHOD), note)
+    try:
+        METHODS[method].minimize(search)
+    except BudgetSpent:
+        pass
+    return trace
+
+
+def run_peer(scenario: Scenario, limit_s: float) -> tuple[Trace, float]:
+    """Run SciPy's L-BFGS-B on the objective in JAX; compilation is timed apart."""
+    begin = time.perf_counter()
+    positions = monte_carlo(scenario, POSITIONS, streams.generator(0, streams.SAMPLES))
+    peer = JaxAverageCrlb(scenario, positions)
+    problem = Problem(scenario, None)
+    start = problem.pack(random_codebook(scenario, streams.generator(0, streams.START)))
+    before = time.perf_counter()
+    peer(start)
+    first_s = time.perf_counter() - before
+    before = time.perf_counter()
+    peer(start)
+    compiled_s = first_s - (time.perf_counter() - before)
+    begin += time.perf_counter() - before + compiled_s
+    trace: Trace = []
+    evaluations = 0
+
+    def function(variables: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal evaluations
+        evaluations += 1
+        return peer(variables)
+
+    def note(variables: np.ndarray) -> None:
+        trace.append((time.perf_counter() - begin, evaluations, np.array(variables)))
+        if trace[-1][0] > limit_s:
+            raise BudgetSpent
+
+    try:
+        minimize(function, start, jac=True, method='L-BFGS-B', bounds=problem.bounds,
+                 callback=note, options={'maxiter': METHODS['lbfgs'].steps, 'maxfun': 10**6})
+    except BudgetSpent:
+        pass
+    return trace, compiled_s
+
+
+def held_out_crlb(scenario: Scenario, entry: tuple, held_out: np.ndarray) -> float:
+    """Average bound of an entry of a trace on held-out positions [m^2]."""
+    return float(crlb(scenario, Problem(scenario, None).unpack(entry[2]), held_out).mean())
+
+
+def first_below(scenario: Scenario, trace: Trace, held_out: np.ndarray) -> tuple | None:
+    """First entry of a trace that reaches the target, by bisection; None if the last does not."""
+    if held_out_crlb(scenario, trace[-1], held_out) > TARGET_M2:
+        return None
+    low, high = 0, len(trace) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if held_out_crlb(scenario, trace[middle], held_out) <= TARGET_M2:
+            high = middle
+        else:
+            low = middle + 1
+    return trace[high]
+
+
+def growth() -> dict:
+    """Part (c); every size in a process of its own, for its peak memory."""
+    print('(c) growth: set-up, one value and gradient, peak memory of the process\n')
+    print('| size | set-up [s] | evaluation [ms] | peak [MiB] | ranks |\n|---|---|---|---|---|')
+    base = {'N_sam': POSITIONS, 'N_E': 100, 'N_B': 2}
+    rows = {}
+    for symbol, values in GROWTH.items():
+        for value in values:
+            rows[f'{symbol} = {value}'] = measured(base | {symbol: value})
+    large = ', '.join(f'{symbol} = {value}' for symbol, value in LARGE.items())
+    rows[large] = measured(LARGE)
+    for name, row in rows.items():
+        print(f'| {name} | {row["setup_s"]:.2f} | {row["evaluation_ms"]:.1f} | '
+              f'{row["peak_mib"]:.0f} | {", ".join(map(str, row["ranks"]))} |')
+    def to_linear(symbol: str, a: int, b: int) -> float:
+        first, second = (rows[f'{symbol} = {n}']['evaluation_ms'] for n in (a, b))
+        return second / first * a / b
+
+    whole = {symbol: to_linear(symbol, values[0], values[-1])
+             for symbol, values in GROWTH.items()}
+    step = {symbol: max(to_linear(symbol, *pair) for pair in zip(values, values[1:], strict=False))
+            for symbol, values in GROWTH.items()}
+    print('\nrelative to linear growth, from end to end (and in the steepest step): '
+          + ', '.join(f'{s} {whole[s]:.2f} ({step[s]:.2f})' for s in GROWTH) + '\n')
+    return {'growth': rows, 'growth_to_linear': whole, 'growth_to_linear_steepest': step,
+            'large_peak_mib': rows[large]['peak_mib']}
+
+
+def measured(sizes: dict[str, int]) -> dict:
+    """Measure one size in a new process."""
+    done = subprocess.run(
+        [sys.executable, __file__, '--threads', str(threads()), '--growth', json.dumps(sizes)],
+        stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def grow(sizes: dict[str, int]) -> dict:
+    """Set-up time, time of an evaluation, and peak memory of this process."""
+    scenario = Scenario(
+        center_frequencies_hz=tuple(2e9 + 0.5e9 * (i + 1) for i in range(sizes['N_B'])),
+        elements_per_side=round(sizes['N_E']**0.5))
+    positions = monte_carlo(scenario, sizes['N_sam'], streams.generator(0, streams.SAMPLES))
+    codebook = random_codebook(scenario, streams.generator(0, streams.START))
+    begin = time.perf_counter()
+    average = AverageCrlb(scenario, positions, ROW_TOLERANCE)
+    setup_s = time.perf_counter() - begin
+    average(codebook)
+    seconds = side_by_side({'evaluation': lambda: average(codebook)}, 15)['evaluation']
+    # Not getrusage, which also counts the process that this one was forked from.
+    peak = re.search(r'VmHWM:\s*(\d+) kB', Path('/proc/self/status').read_text(encoding='ascii'))
+    return {'setup_s': setup_s, 'evaluation_ms': 1e3 * seconds, 'peak_mib': int(peak[1]) / 1024,
+            'ranks': average.rows.ranks}
+
+
+def draw(figures: dict, path: Path) -> None:
+    """Draw what was measured."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout='constrained')
+    left, middle, right = figure.subplots(1, 3)
+    if 'gradient_ms' in figures:
+        left.barh(list(figures['gradient_ms']), list(figures['gradient_ms'].values()))
+        left.set(title='(a) Value and gradient', xlabel='ms')
+    if 'target' in figures:
+        names = [name for name, row in figures['target'].items() if row['target_s']]
+        middle.barh(names, [figures['target'][name]['target_s'] for name in names])
+        middle.set(title=f'(b) Time to {TARGET_M2} m$^2$', xlabel='s', xscale='log')
+    if 'growth' in figures:
+        for symbol, values in GROWTH.items():
+            times = [figures['growth'][f'{symbol} = {n}']['evaluation_ms'] for n in values]
+            right.loglog(np.array(values) / values[0], times, 'o-', label=symbol)
+        right.set(title='(c) Growth of an evaluation', xlabel='size, relative', ylabel='ms')
+        right.legend()
+    figure.savefig(path, dpi=120)
+
+
+if __name__ == '__main__':
+    main()
