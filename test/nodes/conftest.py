@@ -46,12 +46,13 @@ EXECUTABLES = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros'
 class Process:
     """One executable; what it prints goes to a file."""
 
-    def __init__(self, executable, arguments, log):
+    def __init__(self, executable, own, arguments, log):
         self._log = log
         with open(log, 'wb') as stream:
             self._popen = subprocess.Popen(
-                [EXECUTABLES / executable, '--ros-args', *arguments], stdin=subprocess.DEVNULL,
-                stdout=stream, stderr=stream, env={**os.environ, 'ROS_LOG_DIR': str(log.parent)})
+                [EXECUTABLES / executable, *own, '--ros-args', *arguments],
+                stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
+                env={**os.environ, 'ROS_LOG_DIR': str(log.parent)})
 
     @property
     def log(self):
@@ -90,8 +91,8 @@ class Processes:
         self._folder = folder
         self._all = []
 
-    def start(self, executable, *arguments, name='', namespace='/', **parameters):
-        """Start an executable with a node name, a namespace and parameters."""
+    def start(self, executable, *arguments, name='', namespace='/', own=(), **parameters):
+        """Start an executable with options of its own, a node name, a namespace, parameters."""
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             arguments += ('-p', f'{key}:={text}')
@@ -100,7 +101,7 @@ class Processes:
         if namespace != '/':
             arguments += ('-r', f'__ns:={namespace}')
         log = self._folder / f'{len(self._all)}_{name or executable}.log'
-        process = Process(executable, arguments, log)
+        process = Process(executable, own, arguments, log)
         self._all.append(process)
         return process
 

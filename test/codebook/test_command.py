@@ -1,0 +1,264 @@
+"""The optimiser as a command: files, and what happens to them when something goes wrong."""
+
+import argparse
+import errno
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook import Codebook, Provenance, command, directional_codebook
+from rhs_isac_ros.codebook.__main__ import main
+from rhs_isac_ros.codebook.optimize import INTERRUPTED, _Keeper
+from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.model import Scenario, streams
+
+
+@pytest.fixture
+def files(scenario, tmp_path):
+    """A folder with the file of the small scenario."""
+    (tmp_path / 'scenario.yaml').write_text(
+        yaml.safe_dump(scenario.changes()), encoding='utf-8')
+    return tmp_path
+
+
+@pytest.fixture
+def call(files):
+    """Function that calls the command in that folder with few samples, and returns its code."""
+    def run(*arguments, output='codebook.yaml'):
+        return main(['--scenario', str(files / 'scenario.yaml'), '--positions', '16', '--quiet',
+                     '--output', str(files / output), *map(str, arguments)])
+    return run
+
+
+@pytest.fixture
+def interrupted_after(monkeypatch):
+    """Function that sets after how many evaluations Ctrl-C comes."""
+    def arrange(n):
+        evaluate, calls = Problem.value_and_gradient, []
+
+        def spy(problem, variables):
+            calls.append(None)
+            if len(calls) > n:
+                raise KeyboardInterrupt
+            return evaluate(problem, variables)
+        monkeypatch.setattr(Problem, 'value_and_gradient', spy)
+    return arrange
+
+
+def test_writes_the_codebook_that_it_describes(call, files, scenario, capsys):
+    assert call('--steps', 8, '--seed', 3) == 0
+    codebook = Codebook.load(files / 'codebook.yaml')
+    codebook.check(scenario)
+    held_out = scenario.sample_positions(
+        command.HELD_OUT_POSITIONS, streams.generator(3, streams.HELD_OUT))
+    average = crlb(scenario, codebook, held_out).mean()
+    assert codebook.average_crlb_m2 == pytest.approx(average, rel=1e-9)
+    assert f'average CRLB {average:.5f} m^2 over 2000 held-out' in capsys.readouterr().out
+    made = Provenance.parse(codebook.provenance)
+    assert (made.method, made.seed, made.positions, made.steps) == ('lbfgs', 3, 16, 8)
+    assert made.scenario == scenario.changes()
+    assert sorted(os.listdir(files)) == ['codebook.yaml', 'scenario.yaml']
+
+
+def test_table_1_is_the_default_scenario(files):
+    output = files / 'codebook.yaml'
+    assert main(['--method', 'random', '--output', str(output), '--quiet']) == 0
+    Codebook.load(output).check(Scenario())
+
+
+def test_what_is_started_from(call, files, scenario):
+    expected = directional_codebook(scenario)
+    expected.save(files / 'mine.yaml')
+    for start in ('directional', files / 'mine.yaml'):
+        assert call('--method', 'random', '--start', start) == 0
+        codebook = Codebook.load(files / 'codebook.yaml')
+        np.testing.assert_array_equal(codebook.analog, expected.analog)
+
+
+def test_ctrl_c_keeps_the_best_and_says_so(call, files, interrupted_after, capsys):
+    interrupted_after(6)
+    assert call('--steps', 30) == 0
+    assert INTERRUPTED in capsys.readouterr().out
+    made = Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance)
+    assert made.reason == INTERRUPTED
+    assert 2 <= made.steps <= 6
+
+
+def test_resume_goes_on_from_the_output(call, files):
+    assert call('--steps', 5) == 0
+    first = Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance)
+    assert call('--steps', 12, '--resume') == 0
+    second = Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance)
+    assert (first.steps, second.steps) == (5, 12)
+    assert second.evaluations > first.evaluations
+    assert second.value_m2 < first.value_m2
+
+
+def test_resume_prefers_what_a_stopped_run_left(call, files, monkeypatch):
+    """A run that is killed leaves OUTPUT.part, and the last good file as it was."""
+    assert call('--steps', 5) == 0
+    good = (files / 'codebook.yaml').read_bytes()
+    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+
+    class KilledError(BaseException):
+        """What no code of ours sees."""
+
+    evaluate, calls = Problem.value_and_gradient, []
+
+    def spy(problem, variables):
+        calls.append(None)
+        if len(calls) > 9:
+            raise KilledError
+        return evaluate(problem, variables)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Problem, 'value_and_gradient', spy)
+        with pytest.raises(KilledError):
+            call('--steps', 20, '--seed', 1)
+    assert (files / 'codebook.yaml').read_bytes() == good
+    left = Provenance.parse(Codebook.load(files / 'codebook.yaml.part').provenance)
+    assert left.seed == 1 and left.steps > 2
+    assert call('--steps', 20, '--seed', 1, '--resume') == 0
+    made = Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance)
+    assert (made.seed, made.steps) == (1, 20)
+    assert not (files / 'codebook.yaml.part').exists()
+
+
+def fails_with(call, capsys, words, *arguments, **options):
+    assert call(*arguments, **options) == 2
+    captured = capsys.readouterr()
+    assert 'error: ' in captured.err
+    assert 'Traceback' not in captured.err
+    for word in words:
+        assert word in captured.err
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--positions', '0'], ['n_positions: 0', 'at least 1']),
+    (['--steps', '-1'], ['max_steps: -1']),
+    (['--start', '/no/file.yaml'], ['/no/file.yaml']),
+    (['--resume', '--seed', '7'], ['seed: 7', 'as in the codebook to resume from'])])
+def test_wrong_arguments_leave_the_last_good_file(call, files, capsys, arguments, words):
+    assert call('--steps', 3) == 0
+    good = (files / 'codebook.yaml').read_bytes()
+    fails_with(call, capsys, words, *arguments)
+    assert (files / 'codebook.yaml').read_bytes() == good
+
+
+@pytest.mark.parametrize('option', ['--method', '--objective', '--sampling'])
+def test_unknown_names_are_errors_of_the_command_line(call, capsys, option):
+    with pytest.raises(SystemExit) as caught:
+        call(option, 'magic')
+    assert caught.value.code == 2
+    assert "'magic'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('spoil', ['other scenario', 'nan', 'power', 'cut off'])
+def test_a_start_that_cannot_be_used_is_an_error(call, files, capsys, table1, small, spoil):
+    bad = files / 'bad.yaml'
+    (table1 if spoil == 'other scenario' else small).codebook.save(bad)
+    text = bad.read_text(encoding='utf-8')
+    if spoil == 'cut off':
+        bad.write_text(text[:len(text) // 2], encoding='utf-8')
+    elif spoil in ('nan', 'power'):
+        data = yaml.safe_load(text)
+        values = next(iter(data.values()))['ros__parameters']['codebook']['digital_re']
+        values[0] = float('nan') if spoil == 'nan' else 7.0
+        bad.write_text(yaml.safe_dump(data), encoding='utf-8')
+    words = {'other scenario': ['analog: shape'], 'nan': ['digital'], 'power': ['codebook'],
+             'cut off': ['bad.yaml']}
+    fails_with(call, capsys, [] if spoil == 'power' else words[spoil], '--start', bad)
+    assert not (files / 'codebook.yaml').exists()
+
+
+@pytest.mark.parametrize(('text', 'word'), [
+    ('n_feedz: 3', 'n_feedz'), ('n_feeds: .nan', 'n_feeds'), ('n_feeds: [', 'scenario.yaml')])
+def test_a_wrong_scenario_is_an_error(call, files, capsys, text, word):
+    (files / 'scenario.yaml').write_text(text, encoding='utf-8')
+    fails_with(call, capsys, [word])
+
+
+def test_a_place_that_cannot_be_written_is_known_before_the_work(call, files, capsys):
+    fails_with(call, capsys, ['none/codebook.yaml', 'can be written'],
+               output='none/codebook.yaml')
+    fails_with(call, capsys, ['none/p.png'], '--plot', files / 'none' / 'p.png')
+
+
+def full_disk(monkeypatch, path):
+    """No room for what is written beside `path`."""
+    save = Codebook.save
+
+    def save_or_not(codebook, target):
+        if os.path.dirname(target) == str(path.parent):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(codebook, target)
+    monkeypatch.setattr(Codebook, 'save', save_or_not)
+
+
+def test_a_full_disk_loses_neither_the_last_file_nor_the_result(
+        call, files, capsys, monkeypatch, tmp_path_factory):
+    assert call('--steps', 3) == 0
+    good = (files / 'codebook.yaml').read_bytes()
+    rescue = tmp_path_factory.mktemp('rescue')
+    monkeypatch.setattr('tempfile.tempdir', str(rescue))
+    full_disk(monkeypatch, files / 'codebook.yaml')
+    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    fails_with(call, capsys, ['codebook.yaml', 'No space left', str(rescue)], '--steps', 4)
+    assert (files / 'codebook.yaml').read_bytes() == good
+    (saved,) = rescue.glob('*/codebook.yaml')
+    assert Provenance.parse(Codebook.load(saved).provenance).steps == 4
+
+
+def test_a_full_disk_on_the_way_is_a_warning(call, files, capsys, monkeypatch):
+    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    save = Codebook.save
+
+    def save_or_not(codebook, target):
+        if str(target).endswith('.part'):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(codebook, target)
+    monkeypatch.setattr(Codebook, 'save', save_or_not)
+    assert call('--steps', 3) == 0
+    assert 'warning: ' in capsys.readouterr().err
+    assert Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance).steps == 3
+
+
+def test_progress_shows_value_and_step(files, capfd):
+    for steps in (60, 3):
+        assert main(['--scenario', str(files / 'scenario.yaml'), '--positions', '16',
+                     '--steps', str(steps), '--output', str(files / 'codebook.yaml')]) == 0
+        assert 'm^2' in capfd.readouterr().err
+
+
+def test_without_tqdm_there_is_progress_all_the_same(files, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tqdm', None)
+    assert main(['--scenario', str(files / 'scenario.yaml'), '--positions', '16',
+                 '--steps', '3', '--output', str(files / 'codebook.yaml')]) == 0
+    assert 'step 0: ' in capsys.readouterr().err
+
+
+def test_the_picture_is_drawn(call, files):
+    pytest.importorskip('matplotlib')
+    assert call('--steps', 3, '--plot', files / 'picture.png') == 0
+    assert (files / 'picture.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_it_is_a_command_of_its_own(files):
+    done = subprocess.run(
+        [sys.executable, '-m', 'rhs_isac_ros.codebook', '--scenario', files / 'scenario.yaml',
+         '--method', 'random', '--positions', '4', '--output', files / 'codebook.yaml'],
+        capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert 'average CRLB' in done.stdout
+
+
+def test_options_can_be_added_to_another_parser():
+    parser = argparse.ArgumentParser()
+    command.add_options(parser)
+    options = parser.parse_args([])
+    assert (options.method, options.objective, options.seed) == ('lbfgs', 'crlb', 0)

@@ -1,0 +1,50 @@
+"""The picture of an optimisation."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import Progress, directional_codebook, plot
+from rhs_isac_ros.codebook.directional import focal_points
+from rhs_isac_ros.codebook.plot import beam_powers, draw_optimisation
+from rhs_isac_ros.model import Scenario
+
+HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    monkeypatch.setattr(plot, '_ROI_POINTS', 6)
+
+
+@pytest.mark.parametrize('n_bands', [1, 2, 4])
+def test_any_number_of_bands_is_drawn(scenario, n_bands, tmp_path):
+    pytest.importorskip('matplotlib')
+    some = Scenario(**scenario.changes() | {
+        'center_frequencies_hz': [2.5e9 + 1e8 * i for i in range(n_bands)]})
+    draw_optimisation(some, directional_codebook(some), HISTORY, tmp_path / 'p.png')
+    assert (tmp_path / 'p.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_an_unknown_format_is_an_error(scenario, tmp_path):
+    pytest.importorskip('matplotlib')
+    with pytest.raises(ValueError, match='xyz'):
+        draw_optimisation(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.xyz')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_matplotlib_the_error_says_so(scenario, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
+    with pytest.raises(ValueError, match='^plot: needs matplotlib'):
+        draw_optimisation(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.png')
+
+
+def test_beams_point_where_they_are_focused():
+    scenario = Scenario()
+    codebook, points = directional_codebook(scenario), focal_points(scenario)
+    for band in range(scenario.n_bands):
+        azimuths, powers = beam_powers(scenario, codebook, band)
+        assert powers.shape == (scenario.n_frames, len(azimuths))
+        wanted = np.arctan2(points[:, band, 1], points[:, band, 0])
+        np.testing.assert_allclose(azimuths[powers.argmax(axis=1)], wanted, atol=0.12)

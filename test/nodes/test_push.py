@@ -1,0 +1,109 @@
+"""The optimizer as a command: it optimises and holds, or hands a codebook to a network."""
+
+import signal
+
+import pytest
+import rclpy
+import yaml
+from rclpy.context import Context
+from rclpy.node import Node
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.push import PushError, push
+
+
+@pytest.fixture(scope='module')
+def network(make_watch, module_processes, small_files):
+    """A running optimizer, and what it publishes latched."""
+    process = module_processes.start(
+        'optimizer', namespace='/push', scenario_file=small_files / 'scenario.yaml',
+        codebook_file=small_files / 'first.yaml')
+    watch, ids = make_watch('/push'), []
+    watch.node.create_subscription(
+        ros.Codebook, topics.CODEBOOK, lambda message: ids.append(message.codebook_id),
+        qos.LATCHED)
+    watch.until(lambda: ids, 'the codebook', [process])
+    return process, watch, ids
+
+
+def call(processes, network, *own):
+    process = processes.start('optimizer', namespace='/push', own=own)
+    network[1].until(lambda: not process.running, 'the end of the command', [network[0]])
+    return process.wait(), process.log
+
+
+def test_a_file_is_pushed_to_a_running_network(processes, network, small_files):
+    _, watch, ids = network
+    wanted = Codebook.load(small_files / 'second.yaml').id
+    code, log = call(processes, network, '--push-file', small_files / 'second.yaml')
+    assert code == 0, log
+    assert f'codebook {wanted} is set' in log
+    watch.until(lambda: ids[-1] == wanted, 'the new codebook')
+
+
+def test_what_is_optimised_is_pushed_and_the_command_ends(
+        processes, network, small_files, tmp_path):
+    _, watch, ids = network
+    output = tmp_path / 'new.yaml'
+    code, log = call(processes, network, '--push', '--method', 'lbfgs', '--steps', '3', '--quiet',
+                     '--positions', '16', '--scenario', small_files / 'scenario.yaml',
+                     '--output', output)
+    assert code == 0, log
+    watch.until(lambda: ids[-1] == Codebook.load(output).id, 'the new codebook')
+
+
+def test_a_codebook_of_another_scenario_is_refused_and_nothing_changes(
+        processes, network, table1, tmp_path):
+    process, _, ids = network
+    before = ids[-1]
+    table1.codebook.save(tmp_path / 'large.yaml')
+    code, log = call(processes, network, '--push-file', tmp_path / 'large.yaml')
+    assert code == 1, log
+    assert 'error: /push/optimizer: refused: analog: shape' in log
+    assert ids[-1] == before
+    assert process.running
+
+
+@pytest.mark.parametrize('spoil', ['nan', 'missing'])
+def test_a_bad_file_is_not_sent(processes, network, small_files, tmp_path, spoil, crashed):
+    before = list(network[2])
+    bad = tmp_path / 'bad.yaml'
+    if spoil == 'nan':
+        data = yaml.safe_load((small_files / 'first.yaml').read_text(encoding='utf-8'))
+        next(iter(data.values()))['ros__parameters']['codebook']['analog'][0] = float('nan')
+        bad.write_text(yaml.safe_dump(data), encoding='utf-8')
+    code, log = call(processes, network, '--push-file', bad)
+    assert code == 2, log
+    assert log.startswith('error: ') and not crashed(log), log
+    assert network[2] == before
+
+
+def test_without_an_optimizer_the_error_says_so(small_files):
+    context = Context()
+    rclpy.init(args=[], context=context)
+    node = Node('pusher', namespace='/nobody', context=context)
+    try:
+        with pytest.raises(PushError, match='^/nobody/optimizer: not there within 0.2 s'):
+            push(node, Codebook.load(small_files / 'first.yaml'), patience_s=0.2)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_with_options_it_optimises_writes_and_then_holds(
+        processes, make_watch, small_files, tmp_path, crashed):
+    output = tmp_path / 'new.yaml'
+    process = processes.start('optimizer', namespace='/hold', own=(
+        '--method', 'directional', '--positions', '8', '--quiet', '--output', output,
+        '--scenario', small_files / 'scenario.yaml'))
+    watch, heard = make_watch('/hold'), []
+    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, heard.append, qos.LATCHED)
+    watch.until(lambda: heard, 'the codebook', [process])
+    written = Codebook.load(output)
+    assert heard[0].codebook_id == written.id
+    assert convert.codebook_from_ros(heard[0]).id == written.id
+    process.signal(signal.SIGINT)
+    assert process.wait() == 0
+    assert not crashed(process.log), process.log
