@@ -35,7 +35,11 @@ setup(
     python_requires='>=3.10',
     # What it runs on is in package.xml: rosdep or requirements.txt install it.
     install_requires=['setuptools'],
-    extras_require={'test': ['pytest']},
+    extras_require={
+        'experiments': ['dask', 'distributed', 'joblib'],
+        'genetic': ['pymoo'],
+        'test': ['pytest'],
+    },
     zip_safe=False,
     entry_points={
         'console_scripts': [f'{node} = {NAME}.nodes.{node}:main' for node in NODES],

@@ -99,12 +99,13 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
             keep=lambda result: _keep(result, partial))
     held_out = scenario.sample_positions(
         HELD_OUT_POSITIONS, streams.generator(options.seed, streams.HELD_OUT))
-    average = float(crlb(scenario, result.codebook, held_out).mean())
+    bounds = crlb(scenario, result.codebook, held_out)
+    average, error = float(bounds.mean()), float(bounds.std() / HELD_OUT_POSITIONS**0.5)
     codebook = dataclasses.replace(result.codebook, average_crlb_m2=average)
     _save(codebook, output)
     partial.unlink(missing_ok=True)
-    print(f'{output}: average CRLB {average:.5f} m^2 over {HELD_OUT_POSITIONS} held-out '
-          f'positions; {result.reason}')
+    print(f'{output}: average CRLB {average:.5f} m^2 (standard error {error:.5f}) over '
+          f'{HELD_OUT_POSITIONS} held-out positions; {result.reason}')
     if options.plot:
         draw_optimisation(scenario, codebook, result.history, options.plot)
     return codebook, result.reason

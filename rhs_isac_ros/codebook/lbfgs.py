@@ -27,4 +27,4 @@ def minimize_lbfgs(search: Search) -> str:
         bounds=search.bounds, callback=lambda _: search.on_step(),
         options={'maxiter': search.max_steps, 'maxfun': 20 * search.max_steps,
                  'maxcor': _MEMORY, 'ftol': 1e-10, 'gtol': 1e-10})
-    return str(result.message)
+    return 'max_steps reached' if result.status == 1 else str(result.message)

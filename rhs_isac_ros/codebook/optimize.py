@@ -22,7 +22,7 @@ from rhs_isac_ros.codebook.start import random_codebook
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.los import checked_positions
 
-# Of Sobol; these give what 1200 independent ones do, and better.
+# Of Sobol; these give what 1200 independent ones do.
 DEFAULT_POSITIONS = 256
 # Why a search stopped that Ctrl-C ended.
 INTERRUPTED = 'interrupted'
@@ -51,7 +51,7 @@ METHODS: Mapping[str, Method] = {
     'direct': Method(minimize_direct, 400),
     'directional': Method(None, 0),
     'genetic': Method(minimize_genetic, 10),
-    'lbfgs': Method(minimize_lbfgs, 600),
+    'lbfgs': Method(minimize_lbfgs, 3000),
     'random': Method(None, 0),
 }
 

@@ -49,6 +49,8 @@ PROPOSED, RIVALS = 'alternating', ('direct', 'genetic')
 METHODS = (PROPOSED, *RIVALS, 'lbfgs')
 SAMPLES, HELD_OUT, HELD_OUT_SEED = 10, 500, 0
 TRIALS, QUICK_TRIALS = 30, 3
+# As many update steps for it as the paper's method and `direct` have.
+LBFGS_STEPS = 400
 
 
 def trial(method: str, n_bands: int, seed: int, samples: int, held_out: int,
@@ -61,6 +63,8 @@ def trial(method: str, n_bands: int, seed: int, samples: int, held_out: int,
     optimize(scenario, **how, max_evaluations=1)
     # Time of this thread: what else the machine does should not count.
     begin = time.thread_time()
+    if method == 'lbfgs':
+        max_steps = max_steps or LBFGS_STEPS
     result = optimize(scenario, **how, max_steps=max_steps)
     seconds = time.thread_time() - begin
     if result.reason == 'interrupted':  # a result, but not the method's

@@ -58,7 +58,7 @@ def test_writes_the_codebook_that_it_describes(call, files, scenario, capsys):
         command.HELD_OUT_POSITIONS, streams.generator(3, streams.HELD_OUT))
     average = crlb(scenario, codebook, held_out).mean()
     assert codebook.average_crlb_m2 == pytest.approx(average, rel=1e-9)
-    assert f'average CRLB {average:.5f} m^2 over 2000 held-out' in capsys.readouterr().out
+    assert f'average CRLB {average:.5f} m^2 (standard error ' in capsys.readouterr().out
     made = Provenance.parse(codebook.provenance)
     assert (made.method, made.seed, made.positions, made.steps) == ('lbfgs', 3, 16, 8)
     assert made.scenario == scenario.changes()
