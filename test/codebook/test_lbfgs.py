@@ -27,7 +27,7 @@ def test_stops_at_the_limit_of_steps(quadratic, search_of):
     reason = minimize_lbfgs(search)
     assert len(search.history) == 3
     assert len(problem.points) <= 60
-    assert 'LIMIT' in reason.upper()
+    assert reason == 'max_steps reached'
 
 
 def test_begins_at_the_start(quadratic, search_of):
