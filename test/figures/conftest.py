@@ -1,0 +1,22 @@
+"""The scripts that reproduce the paper's figures, as modules."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / 'scripts' / 'figures'
+
+
+@pytest.fixture(scope='session')
+def load_figure():
+    """Function that imports a script by its name."""
+    def load(name):
+        spec = importlib.util.spec_from_file_location(f'figures_{name}', FOLDER / f'{name}.py')
+        module = importlib.util.module_from_spec(spec)
+        # Jobs find their function by the name of its module.
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+        return module
+    return load

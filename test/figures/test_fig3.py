@@ -1,0 +1,90 @@
+"""Fig. 3 with few steps: every method and every number of bands, and what is said of them."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.model import Scenario, streams
+
+pytest.importorskip('pymoo')
+pytest.importorskip('joblib')
+pytest.importorskip('matplotlib')
+
+
+@pytest.fixture(scope='module')
+def fig3(load_figure):
+    return load_figure('fig3')
+
+
+@pytest.fixture(scope='module')
+def entries(fig3):
+    """Made-up trials in which everything is as the paper says."""
+    level = {'alternating': 1.0, 'direct': 2.0, 'genetic': 3.0, 'lbfgs': 0.5}
+    return [{'method': method, 'n_bands': n, 'seed': seed, 'seconds': level[method],
+             'crlb_m2': level[method] * (1 + 0.01 * seed) - (method == 'alternating') * n / 10,
+             'held_out_m2': level[method], 'evaluations': 1}
+            for seed in range(3) for n in fig3.BANDS for method in fig3.METHODS]
+
+
+def verdicts(summary):
+    return [': holds' in claim for claim in summary.claims()]
+
+
+def test_claims_hold_where_they_do(fig3, entries):
+    assert verdicts(fig3.Summary(entries)) == [True] * 4
+
+
+@pytest.mark.parametrize(('changes', 'expected'), [
+    ({'crlb_m2': 5.0}, [False, True, False, False]),
+    ({'seconds': 2.5}, [True, False, True, True])])
+def test_claims_do_not_hold_where_one_number_of_bands_says_otherwise(
+        fig3, entries, changes, expected):
+    changed = [entry | changes if (entry['method'], entry['n_bands']) == ('alternating', 4)
+               else entry for entry in entries]
+    assert verdicts(fig3.Summary(changed)) == expected
+
+
+def test_table_has_every_method_and_number_of_bands(fig3, entries):
+    rows = fig3.Summary(entries).table().splitlines()[2:]
+    assert len(rows) == len(fig3.METHODS) * len(fig3.BANDS)
+    first = [cell.strip() for cell in rows[0].strip('|').split('|')]
+    assert first == ['alternating', '1', '0.910 ± 0.010', '1.00 ± 0.00', '1.00', '1.00 ± 0.00',
+                     '1.00 ± 0.00']
+
+
+def test_a_trial_is_what_it_says(fig3):
+    result = fig3.trial('lbfgs', 2, 5, samples=6, held_out=50, max_steps=3)
+    assert (result['steps'], result['reason']) == (3, 'max_steps reached')
+    scenario = Scenario(center_frequencies_hz=(2.5e9, 3.0e9), n_frames=4)
+    samples = scenario.sample_positions(6, streams.generator(5, streams.SAMPLES))
+    start = random_codebook(scenario, streams.generator(5, streams.START))
+    assert result['crlb_m2'] < crlb(scenario, start, samples).mean()
+    assert result['seconds'] > 0
+
+
+def test_the_command_writes_everything_and_goes_on_where_it_ended(
+        fig3, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(fig3, 'METHODS', ('alternating', 'direct', 'genetic'))
+    monkeypatch.setattr(fig3, 'BANDS', (1, 2))
+    made = []
+
+    def trial(method, n_bands, seed, samples, held_out, max_steps):
+        made.append((method, n_bands, seed))
+        return {'crlb_m2': 1.0 / n_bands, 'held_out_m2': 1.0, 'seconds': 1.0}
+    monkeypatch.setattr(fig3, 'trial', trial)
+    call = ['--jobs', '1', '--output', str(tmp_path)]
+    assert fig3.main(['--trials', '1', *call]) == 0
+    assert len(made) == 6
+    assert fig3.main(['--trials', '2', *call]) == 0
+    # Six more: those of the first trial are kept.
+    assert len(made) == len(set(made)) == 12
+    assert {'fig3.json', 'fig3.md', 'fig3.png'} <= set(os.listdir(tmp_path))
+    figures = json.loads((tmp_path / 'fig3.json').read_text(encoding='utf-8'))
+    assert len(figures['trials']) == 12
+    out = capsys.readouterr().out
+    assert '(1) alternating reaches a lower CRLB' in out
+    assert np.all([entry['samples'] == 10 for entry in figures['trials']])
