@@ -13,7 +13,7 @@ from rhs_isac_ros.model import Scenario
 # less than the sampling does, and gradients belong to that value.
 ROW_TOLERANCE = 3e-5
 # Confusable positions for each sampled one: rare close pairs make most of the mean.
-_PAIRS_A_POSITION = 32
+_PAIRS_A_POSITION = 128
 
 
 def average_bound(
@@ -63,7 +63,7 @@ def ambiguity(
     Raises
     ------
     ValueError
-        If `positions` is empty or not a finite [N, 3] array, or the region is too small.
+        If `positions` is empty or not a finite [N, 3] array.
     """
     firsts = np.repeat(positions, _PAIRS_A_POSITION, axis=0)
     return PairConfusion(

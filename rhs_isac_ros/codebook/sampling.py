@@ -11,6 +11,10 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 _LAGS_A_WAVELENGTH = 64
 # Scales of the displacement across the line of sight, in widths of the narrowest beam.
 _ACROSS = 0.03, 0.3
+# Share of the pairs that differ in direction alone.
+_NO_LAG = 0.3
+# How often to draw again what is outside of the region.
+_ROUNDS = 200
 
 
 def monte_carlo(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -67,8 +71,9 @@ def confusable(
 
     Two positions are hard to tell apart where their ranges differ by about a whole number of
     wavelengths in every band: lags are drawn with a density of exp(-sum_i (1 - cos 2 pi f_i lag /
-    v_0)), beyond half a wavelength. Across the line of sight they lie within a beam, on scales
-    from well below its width up to its side lobes.
+    v_0)). Of a share of the positions the lag is 0: these differ in direction alone. Across the
+    line of sight the others lie within a beam, on scales from well below its width up to its side
+    lobes.
 
     Parameters
     ----------
@@ -86,22 +91,30 @@ def confusable(
     """
     low, high = scenario.roi_bounds_m
     lags, cumulative = _lag_distribution(scenario)
+    lagging = rng.uniform(size=len(positions)) >= _NO_LAG
     others = np.array(positions)
     left = np.arange(len(positions))
-    while len(left):
-        ranges = np.linalg.norm(positions[left], axis=1, keepdims=True)
-        sight = positions[left] / np.maximum(ranges, 1e-9)
-        n = len(left)
-        lag = np.interp(rng.uniform(size=n), cumulative, lags) * rng.choice([-1, 1], size=n)
-        scale = np.exp(rng.uniform(*np.log(_ACROSS), size=(n, 1))) * _beam_width(scenario) * ranges
-        across = rng.normal(size=(n, 3)) * scale
-        across -= sight * np.sum(across * sight, axis=1, keepdims=True)
-        moved = positions[left] + across
-        moved *= (ranges + lag[:, None]) / np.linalg.norm(moved, axis=1, keepdims=True)
-        inside = ((moved >= low) & (moved <= high)).all(axis=1)
-        others[left[inside]] = moved[inside]
-        left = left[~inside]
+    for _ in range(_ROUNDS):
+        lag = np.interp(rng.uniform(size=len(left)), cumulative, lags) * lagging[left]
+        moved = _displaced(scenario, positions[left], lag, rng)
+        # What is never inside ends at the rim: a region may be much thinner than a beam.
+        others[left] = np.clip(moved, low, high)
+        left = left[~((moved >= low) & (moved <= high)).all(axis=1)]
     return others
+
+
+def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
+               rng: np.random.Generator) -> np.ndarray:
+    """Move positions by range lags of either sign, and at random across the line of sight."""
+    n = len(positions)
+    ranges = np.linalg.norm(positions, axis=1, keepdims=True)
+    sight = positions / np.maximum(ranges, 1e-9)
+    scale = np.exp(rng.uniform(*np.log(_ACROSS), size=(n, 1))) * _beam_width(scenario) * ranges
+    across = rng.normal(size=(n, 3)) * scale
+    across -= sight * np.sum(across * sight, axis=1, keepdims=True)
+    lags = lags * rng.choice([-1, 1], size=n)
+    moved = positions + across
+    return moved * (ranges + lags[:, None]) / np.linalg.norm(moved, axis=1, keepdims=True)
 
 
 def _lag_distribution(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -109,14 +122,11 @@ def _lag_distribution(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     low, high = scenario.roi_bounds_m
     frequencies = np.array(scenario.center_frequencies_hz)[:, None]
     shortest = SPEED_OF_LIGHT_MPS / frequencies.max()
-    lags = np.arange(shortest / 2, np.linalg.norm(high - low), shortest / _LAGS_A_WAVELENGTH)
-    if not len(lags):
-        raise ValueError(
-            f'roi_size_m: {scenario.roi_size_m}, expected a region larger than half a wavelength '
-            'for the objective ambiguity')
+    longest = np.linalg.norm(high - low)
+    lags = np.linspace(0, longest, 2 + int(longest / shortest * _LAGS_A_WAVELENGTH))
     mismatch = np.sum(1 - np.cos(2 * np.pi * frequencies * lags / SPEED_OF_LIGHT_MPS), axis=0)
     cumulative = np.cumsum(np.exp(-mismatch))
-    return lags, cumulative / cumulative[-1]
+    return lags, (cumulative - cumulative[0]) / (cumulative[-1] - cumulative[0])
 
 
 def _beam_width(scenario: Scenario) -> float:

@@ -1,0 +1,64 @@
+"""How many Sobol points are worth 1200 random ones.
+
+Problem: the optimiser sees the region of interest through samples. Too few, and it fits these
+alone. How good is the codebook on the whole region, after the same number of steps, by the number
+of samples and by how they are drawn? All are measured on the same Sobol points, which none saw.
+"""
+
+import os
+
+# One thread. This must come before NumPy is loaded.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook import optimize
+from rhs_isac_ros.codebook.sampling import sobol
+from rhs_isac_ros.model import Scenario, streams
+
+CHOICES = (('monte_carlo', 300), ('monte_carlo', 600), ('monte_carlo', 1200), ('sobol', 64),
+           ('sobol', 128), ('sobol', 256), ('sobol', 1024))
+HELD_OUT, HELD_OUT_SEED = 16384, 1 << 20
+
+
+def main() -> None:
+    """Optimise, measure, and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument('--seeds', type=int, default=5, help='how many runs of each')
+    parser.add_argument('--steps', type=int, default=600, help='update steps of each')
+    parser.add_argument('--json', type=Path, help='file for the figures')
+    options = parser.parse_args()
+    scenario = Scenario()
+    held_out = sobol(scenario, HELD_OUT, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))
+    print(f'average CRLB on {HELD_OUT} held-out points after {options.steps} steps of L-BFGS, '
+          f'{options.seeds} seeds\n')
+    print('| samples | mean [m^2] | standard deviation [m^2] | time of a run [s] |')
+    print('|---|---|---|---|')
+    figures = {}
+    for sampling, n in CHOICES:
+        bounds, times_s = [], []
+        for seed in range(options.seeds):
+            begin = time.thread_time()
+            result = optimize(scenario, sampling=sampling, n_positions=n, seed=seed,
+                              max_steps=options.steps)
+            times_s.append(time.thread_time() - begin)
+            bounds.append(np.mean([crlb(scenario, result.codebook, part).mean()
+                                   for part in np.split(held_out, 16)]))
+        name = f'{n} {sampling}'
+        figures[name] = {'mean_m2': np.mean(bounds), 'std_m2': np.std(bounds, ddof=1),
+                         'time_s': np.mean(times_s)}
+        print('| {} | {mean_m2:.5f} | {std_m2:.5f} | {time_s:.1f} |'.format(name, **figures[name]),
+              flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
