@@ -14,7 +14,8 @@ _INTERRUPTED = 130
 
 def parse_options(
         description: str, name: str, trials: int, quick_trials: int,
-        arguments: Sequence[str] | None = None) -> argparse.Namespace:
+        arguments: Sequence[str] | None = None,
+        add: Callable[[argparse.ArgumentParser], None] | None = None) -> argparse.Namespace:
     """Read the command line of an experiment.
 
     Parameters
@@ -27,25 +28,24 @@ def parse_options(
         How many trials there are, and how many with ``--quick``.
     arguments
         Command line; by default the process's.
+    add
+        Adds options that only this experiment has.
 
     Returns
     -------
     argparse.Namespace
-        ``trials``, ``steps``, ``jobs``, ``dask`` and ``output``.
+        ``trials``, ``quick``, ``jobs``, ``dask`` and ``output``, and what `add` adds.
     """
     parser = argparse.ArgumentParser(
         prog=f'scripts/reproduce {name}', description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     count = parser.add_mutually_exclusive_group()
-    count.add_argument('--quick', dest='trials', action='store_const', const=quick_trials,
-                       help=f'{quick_trials} trials only')
-    count.add_argument('--trials', type=_positive, metavar='N',
+    count.add_argument('--quick', action='store_true', help=f'{quick_trials} trials only')
+    count.add_argument('--trials', type=positive, metavar='N',
                        help=f'how many trials (default: {trials})')
-    # Not with the option: the one before, of the same name, would have its own say.
-    parser.set_defaults(trials=trials)
-    parser.add_argument('--steps', type=_positive, metavar='N',
-                        help="limit of update steps (default: each method's own)")
-    parser.add_argument('--jobs', type=_positive, default=-1, metavar='N',
+    if add:
+        add(parser)
+    parser.add_argument('--jobs', type=positive, default=-1, metavar='N',
                         help='how many at a time (default: one on each core)')
     parser.add_argument('--dask', metavar='ADDRESS',
                         help='scheduler of a Dask cluster to use instead of this machine; '
@@ -53,7 +53,9 @@ def parse_options(
     parser.add_argument('--output', type=Path, default=Path('results', name), metavar='DIR',
                         help='folder of the results (default: %(default)s); a run goes on from '
                              'what is there')
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    options.trials = quick_trials if options.quick else options.trials or trials
+    return options
 
 
 def run_command(experiment: Callable[[], None]) -> int:
@@ -81,7 +83,24 @@ def run_command(experiment: Callable[[], None]) -> int:
     return 0
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
+    """Read a whole number above 0 from a command line.
+
+    Parameters
+    ----------
+    text
+        The argument.
+
+    Returns
+    -------
+    int
+        Its value.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError, ValueError
+        If it is something else.
+    """
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f'{text}, expected at least 1')

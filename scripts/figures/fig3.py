@@ -20,6 +20,7 @@ import os
 # One thread for each job. This must come before NumPy is loaded.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+import argparse
 import io
 import json
 import time
@@ -37,6 +38,7 @@ from rhs_isac_ros.experiments import (
     mean_and_std,
     parse_options,
     plus_minus,
+    positive,
     run_command,
     run_jobs,
     write_whole,
@@ -195,9 +197,15 @@ def reproduce(trials: int, steps: int | None, n_jobs: int, dask: str | None,
     print(f'{report}\n\nwritten: {output}/fig3.png, fig3.md and fig3.json')
 
 
+def add_steps(parser: argparse.ArgumentParser) -> None:
+    """Add the option that cuts every method short."""
+    parser.add_argument('--steps', type=positive, metavar='N',
+                        help="limit of update steps (default: each method's own)")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse_options(__doc__, 'fig3', TRIALS, QUICK_TRIALS, arguments)
+    options = parse_options(__doc__, 'fig3', TRIALS, QUICK_TRIALS, arguments, add_steps)
     return run_command(lambda: reproduce(
         options.trials, options.steps, options.jobs, options.dask, options.output))
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rhs_isac_ros.experiments import JobError, parse_options, run_command
+from rhs_isac_ros.experiments import JobError, parse_options, positive, run_command
 
 
 def parse(*arguments):
@@ -13,7 +13,7 @@ def parse(*arguments):
 
 def test_defaults_are_those_of_the_full_run():
     options = parse()
-    assert (options.trials, options.steps, options.jobs, options.dask) == (30, None, -1, None)
+    assert (options.trials, options.quick, options.jobs, options.dask) == (30, False, -1, None)
     assert options.output == Path('results/fig0')
 
 
@@ -22,8 +22,14 @@ def test_quick_and_trials_change_the_number_of_trials():
     assert parse('--trials', '7').trials == 7
 
 
+def test_an_experiment_may_have_options_of_its_own():
+    options = parse_options('About.', 'fig0', 30, 3, ['--more', '4'],
+                            lambda parser: parser.add_argument('--more', type=positive))
+    assert options.more == 4
+
+
 @pytest.mark.parametrize('arguments', [
-    ['--trials', '0'], ['--jobs', '-2'], ['--steps', '0'], ['--trials', 'x'],
+    ['--trials', '0'], ['--jobs', '-2'], ['--trials', 'x'],
     ['--quick', '--trials', '3'], ['--magic']])
 def test_wrong_options_end_with_code_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
