@@ -77,7 +77,7 @@ class Transmission(PlainRole):
         actual = perfect = math.nan
         if truth and (truth.cycle_id, truth.user) == (beam.cycle_id, beam.user):
             used = Beam(applied.analog[0], beam.digital, beam.band)
-            best = steer(self._scenario, truth.position, beam.band, rival=used.analog)
+            best = steer(self._scenario, truth.position, beam.band)
             actual = self._capacity(used, truth.position)
             perfect = self._capacity(best, truth.position)
         loss = perfect - actual

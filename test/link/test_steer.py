@@ -69,7 +69,7 @@ def test_a_beam_of_a_small_surface_is_close_to_the_best_of_all(small, link_of):
             rates = rates + np.log2(1 + np.linalg.eigvalsh(channels)[:, -1] * shares)
         best = rate(scenario, link.best_digital(corners[rates.argmax()], place), place)
         found = rate(scenario, steer(scenario, place), place)
-        assert 0.95 * best < found <= best * (1 + 1e-9)
+        assert 0.999 * best < found <= best * (1 + 1e-9)
 
 
 def test_a_beam_beats_a_random_search(table1, link_of):
@@ -129,32 +129,14 @@ def test_the_true_position_beats_one_five_metres_away(table1, places):
         assert rate(scenario, wrong, away) > rate(scenario, right, away)
 
 
-def test_the_outcome_is_at_least_that_of_the_rival(small, link_of):
-    scenario, link, rng = small.scenario, link_of(small), np.random.default_rng(4)
-    better = 0
-    for place in scenario.sample_positions(4, rng):
-        alone = rate(scenario, steer(scenario, place), place)
-        for rival in [*rng.uniform(size=(5, 16)), *rng.integers(0, 2, (5, 16)).astype(float),
-                      steer(scenario, place + [0.1, 0.3, 0]).analog]:
-            beam = steer(scenario, place, rival=rival)
-            assert_valid(scenario, beam)
-            found = rate(scenario, beam, place)
-            assert found >= rate(scenario, link.best_digital(rival, place), place) * (1 - 1e-12)
-            assert found >= alone
-            better += found > alone
-    assert better
-
-
-def test_a_rival_is_left_as_it_is(small):
-    rival = np.linspace(0, 1, 16)
-    steer(small.scenario, (8.0, 0.0, 0.0), rival=rival)
-    np.testing.assert_array_equal(rival, np.linspace(0, 1, 16))
-
-
-def test_a_rival_that_is_off_is_no_rival(table1):
-    place = (8.0, 0.0, 0.0)
-    beam = steer(table1.scenario, place, rival=np.zeros(100))
-    np.testing.assert_array_equal(beam.analog, steer(table1.scenario, place).analog)
+def test_no_beam_for_a_place_nearby_is_better(table1):
+    """Steering does not stop so low that the beam for an estimate carries more than its own."""
+    scenario, rng = table1.scenario, np.random.default_rng(4)
+    for place in scenario.sample_positions(20, rng):
+        found = rate(scenario, steer(scenario, place), place)
+        for spread_m in (0.02, 0.2, 1.0):
+            near = place + rng.normal(scale=spread_m, size=3)
+            assert rate(scenario, steer(scenario, near), place) < found * (1 + 5e-4)
 
 
 @pytest.mark.parametrize('position', [

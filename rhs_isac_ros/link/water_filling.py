@@ -1,0 +1,30 @@
+"""Water-filling: how much power each of several parallel channels gets."""
+
+import numpy as np
+
+
+def water_filling(gains: np.ndarray, power: float) -> np.ndarray:
+    """Share power over parallel channels so that the sum of log(1 + gain * share) is highest.
+
+    Parameters
+    ----------
+    gains
+        Gain over noise of each channel, float64 [N] [1/W]. Without a positive one, all get the
+        same.
+    power
+        Power to share [W].
+
+    Returns
+    -------
+    numpy.ndarray
+        Shares, float64 [N] [W], none negative, with the sum `power`.
+    """
+    useful = gains > 0
+    if not useful.any():
+        return np.full(len(gains), power / len(gains))
+    floors = np.sort(1 / gains[useful])
+    levels = (power + np.cumsum(floors)) / np.arange(1, len(floors) + 1)
+    level = levels[np.nonzero(levels > floors)[0][-1]]
+    shares = np.zeros(len(gains))
+    shares[useful] = np.maximum(level - 1 / gains[useful], 0.0)
+    return shares
