@@ -1,6 +1,10 @@
-"""The transmission phase: capacity and beam steering."""
+"""The transmission phase: capacity, beam steering and the choice of the band."""
 
 from rhs_isac_ros.link.capacity import Beam, capacity
+from rhs_isac_ros.link.choice import Choice, choose_beam
+from rhs_isac_ros.link.expected import expected_capacity
+from rhs_isac_ros.link.quartiles import RunningQuartiles
 from rhs_isac_ros.link.steer import steer
 
-__all__ = ['Beam', 'capacity', 'steer']
+__all__ = [
+    'Beam', 'Choice', 'RunningQuartiles', 'capacity', 'choose_beam', 'expected_capacity', 'steer']

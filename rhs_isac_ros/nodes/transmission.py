@@ -22,13 +22,14 @@ class TransmissionNode(RoleNode):
         super().__init__('transmission', (), **node_options)
         band, n_bands = self.values.band, self.scenario.n_bands
         if band >= n_bands:
-            raise ParameterError(f'band: {band}, expected 0 to {n_bands - 1} of the scenario')
-        self.start(Transmission(self.scenario, band), ())
+            raise ParameterError(
+                f'band: {band}, expected 0 to {n_bands - 1} of the scenario, or -1')
+        self.start(Transmission(self.scenario, None if band < 0 else band), ())
         self._codebook = CodebookSource(self, self.scenario, self._on_codebook)
 
     def _on_codebook(self, codebook: Codebook) -> None:
         self.tell(CodebookOffered(codebook))
-        self.advertise((m.Beam, m.Capacity))
+        self.advertise((m.Beam, m.Capacity, m.CapacityStatistics))
         self.listen(RECEIVES)
 
 

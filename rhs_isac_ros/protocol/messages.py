@@ -207,6 +207,19 @@ class Capacity(Message):
     perfect_bps: float = open_float()
     loss_bps: float = open_float()
     loss_percent: float = open_float()
+    at_estimate_bps: float = number(0, _MOST_BITS)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CapacityStatistics(Message):
+    """Lower quartile, median and upper quartile of what the newest beams carry."""
+
+    n_reports: int = number(1, 2**32 - 1)
+    expected_bps: np.ndarray = array('3', low=0, high=_MOST_BITS)
+    actual_bps: np.ndarray = array('3', low=0, high=_MOST_BITS)
+    perfect_bps: np.ndarray = array('3', low=0, high=_MOST_BITS)
+    loss_bps: np.ndarray = array('3')
+    loss_percent: np.ndarray = array('3')
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

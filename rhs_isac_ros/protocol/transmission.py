@@ -4,12 +4,15 @@ import math
 
 import numpy as np
 
-from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.link import Beam, RunningQuartiles, capacity, choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.protocol.shelf import Shelf
+
+# Figures of a report that statistics are kept of; `CapacityStatistics` has the same names.
+_FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
 
 
 class Transmission(PlainRole):
@@ -22,15 +25,21 @@ class Transmission(PlainRole):
     scenario
         The scenario.
     band
-        Band of the transmission, from 0.
+        Band of the transmission, from 0; none: in each cycle the one of the best expected
+        capacity.
     """
 
-    def __init__(self, scenario: Scenario, band: int) -> None:
+    def __init__(self, scenario: Scenario, band: int | None = None) -> None:
         super().__init__()
-        self._scenario, self._band = scenario, band
+        self._scenario = scenario
+        self._bands = range(scenario.n_bands) if band is None else (band,)
         self._codebooks: Shelf[None] = Shelf()
         self._beam: m.Beam | None = None
+        self._at_estimate_bps = math.nan
         self._truth: m.GroundTruth | None = None
+        # The true position whose report is in the statistics already.
+        self._counted: m.GroundTruth | None = None
+        self._quartiles = RunningQuartiles(len(_FIGURES))
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
         """Take a codebook, a position estimate, a reported configuration or a true position.
@@ -45,7 +54,7 @@ class Transmission(PlainRole):
         Returns
         -------
         list of Action
-            The beam, or the capacity.
+            The beam, or the capacity and what has become of the statistics.
         """
         match event:
             case CodebookOffered(codebook):
@@ -62,11 +71,13 @@ class Transmission(PlainRole):
 
     def _steer(self, estimate: m.PositionEstimate) -> list[Action]:
         self._codebooks.take(estimate.codebook_id)
-        beam = steer(self._scenario, estimate.position, self._band)
-        expected = self._capacity(beam, estimate.position)
+        choice = choose_beam(
+            self._scenario, estimate.position, estimate.covariance_m2, self._bands)
+        beam = choice.beam
         self._beam = m.Beam(
             estimate.cycle_id, estimate.user, estimate.codebook_id, beam.band, beam.analog,
-            beam.digital, expected)
+            beam.digital, choice.expected_bps)
+        self._at_estimate_bps = self._capacity(beam, estimate.position)
         return [Send(self._beam)]
 
     def _report(self, applied: m.RhsConfiguration) -> list[Action]:
@@ -77,13 +88,22 @@ class Transmission(PlainRole):
         actual = perfect = math.nan
         if truth and (truth.cycle_id, truth.user) == (beam.cycle_id, beam.user):
             used = Beam(applied.analog[0], beam.digital, beam.band)
-            best = steer(self._scenario, truth.position, beam.band)
             actual = self._capacity(used, truth.position)
-            perfect = self._capacity(best, truth.position)
+            perfect = choose_beam(self._scenario, truth.position, bands=self._bands).expected_bps
         loss = perfect - actual
-        return [Send(m.Capacity(
+        report = m.Capacity(
             beam.cycle_id, beam.user, beam.codebook_id, beam.band, beam.expected_bps, actual,
-            perfect, loss, 100 * loss / perfect))]
+            perfect, loss, 100 * loss / perfect if perfect else math.nan, self._at_estimate_bps)
+        return [Send(report), *self._summarise(report)]
+
+    def _summarise(self, report: m.Capacity) -> list[Action]:
+        """Bring the statistics up to date, once for each true position."""
+        if not math.isfinite(report.loss_percent) or self._truth is self._counted:
+            return []
+        self._counted = self._truth
+        self._quartiles.add([getattr(report, name) for name in _FIGURES])
+        figures = dict(zip(_FIGURES, self._quartiles.quartiles(), strict=True))
+        return [Send(m.CapacityStatistics(report.cycle_id, len(self._quartiles), **figures))]
 
     def _capacity(self, beam: Beam, position: np.ndarray) -> float:
         return float(capacity(self._scenario, beam, position[None])[0])

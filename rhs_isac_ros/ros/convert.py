@@ -204,6 +204,7 @@ _CODECS: dict[str, tuple[Callable, Callable]] = {
     'rhs_isac_msgs/ComplexArray': (_encode_complex, _decode_complex),
     'geometry_msgs/Point': (functools.partial(_encode_vector, Point), _decode_vector),
     'geometry_msgs/Vector3': (functools.partial(_encode_vector, Vector3), _decode_vector),
+    'double[3]': (np.ascontiguousarray, np.asarray),
     'double[9]': (np.ravel, lambda values: np.reshape(values, (3, 3))),
 }
 

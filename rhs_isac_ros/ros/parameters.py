@@ -115,7 +115,8 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     ),
     'transmission': (
         SCENARIO,
-        Parameter('band', 0, 'Band of the transmission, from 0.', low=0, high=4095),
+        Parameter('band', -1, 'Band of the transmission, from 0; -1: in each cycle the best.',
+                  low=-1, high=4095),
     ),
     'optimizer': (
         SCENARIO,

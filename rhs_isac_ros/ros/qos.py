@@ -2,6 +2,8 @@
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from rhs_isac_ros.protocol import messages as m
+
 # Handshakes and signals: each counts, none is of use to who joins later. The depth takes the
 # pilots of a band, or the acks of many users, at once.
 EXCHANGE = QoSProfile(
@@ -12,3 +14,21 @@ EXCHANGE = QoSProfile(
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+_LATCHED_MESSAGES = {m.CapacityStatistics}
+
+
+def of(kind: type[m.Message]) -> QoSProfile:
+    """Return the quality of service of a message's topic.
+
+    Parameters
+    ----------
+    kind
+        Class of the message.
+
+    Returns
+    -------
+    rclpy.qos.QoSProfile
+        `LATCHED` for what is the present value of something, else `EXCHANGE`.
+    """
+    return LATCHED if kind in _LATCHED_MESSAGES else EXCHANGE

@@ -102,7 +102,7 @@ class RoleNode(Node):
         for kind in sends:
             if kind not in self._outlets:
                 self._outlets[kind] = self.create_publisher(
-                    convert.ros_type(kind), topics.NAMES[kind], qos.EXCHANGE)
+                    convert.ros_type(kind), topics.NAMES[kind], qos.of(kind))
 
     def listen(self, receives: Iterable[type[m.Message]]) -> None:
         """Subscribe to messages; the graph then shows that the role is ready for them.
@@ -117,7 +117,7 @@ class RoleNode(Node):
                 self._listening.add(kind)
                 self.create_subscription(
                     convert.ros_type(kind), topics.NAMES[kind], self._receiver(kind),
-                    qos.EXCHANGE, event_callbacks=SubscriptionEventCallbacks(
+                    qos.of(kind), event_callbacks=SubscriptionEventCallbacks(
                         use_default_callbacks=False))
 
     @staticmethod

@@ -18,6 +18,7 @@ NAMES: Mapping[type[m.Message], str] = {
     m.Beam: 'beam',
     m.Data: 'data',
     m.Capacity: 'capacity',
+    m.CapacityStatistics: 'capacity_statistics',
     m.GroundTruth: 'ground_truth',
     m.ProtocolState: 'protocol_state',
 }

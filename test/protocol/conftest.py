@@ -312,7 +312,7 @@ class Network:
             case 'positioner':
                 return Positioner(scenario, self._make, lambda: self.now_s)
             case 'transmission':
-                return Transmission(scenario, 0)
+                return Transmission(scenario)
         raise ValueError(name)
 
     def _receive(self, codebook, feeds, user: int, cycle_id: int) -> np.ndarray:

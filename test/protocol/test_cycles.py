@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rhs_isac_ros
-from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.bs_table import State
@@ -18,7 +18,7 @@ OF_A_BAND = [m.RhsCommand, m.RhsConfiguration, m.PilotRequest, m.Pilot, m.Pilot,
              m.FeedSignals]
 OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, *OF_A_BAND, *OF_A_BAND, m.ReceivedSignals,
               m.PositionEstimate, m.Beam, m.RhsConfiguration, m.Data, m.Data, m.Data, m.Data]
-BESIDES = (m.ProtocolState, m.GroundTruth, m.Capacity)
+BESIDES = (m.ProtocolState, m.GroundTruth, m.Capacity, m.CapacityStatistics)
 
 
 def of_cycle(network, cycle_id):
@@ -33,8 +33,8 @@ def test_the_messages_of_a_cycle_come_in_the_order_of_the_protocol(network):
         assert [type(s) for s in sent if not isinstance(s, BESIDES)] == OF_A_CYCLE
         besides = [s for s in sent if isinstance(s, BESIDES)]
         assert [type(s) for s in besides] == [
-            m.ProtocolState, m.GroundTruth, m.ProtocolState, m.Capacity, m.ProtocolState,
-            m.ProtocolState]
+            m.ProtocolState, m.GroundTruth, m.ProtocolState, m.Capacity,
+            m.CapacityStatistics, m.ProtocolState, m.ProtocolState]
         assert [s.phase for s in besides if isinstance(s, m.ProtocolState)] == [
             m.Phase.POSITIONING, m.Phase.ESTIMATING, m.Phase.TRANSMITTING, m.Phase.BEACONING]
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'served'), (3, 1, 'served')]
@@ -90,7 +90,8 @@ def test_the_estimate_is_what_the_estimator_finds(network, scenario):
     assert estimate.estimator == 'corner'
     np.testing.assert_array_equal(seen[0], signals.signals.reshape(2, 6))
     (beam,) = net.sent(m.Beam)
-    expected = steer(scenario, estimate.position)
+    expected = choose_beam(scenario, estimate.position, estimate.covariance_m2).beam
+    assert beam.band == expected.band
     np.testing.assert_array_equal(beam.analog, expected.analog)
     np.testing.assert_array_equal(beam.digital, expected.digital)
 
@@ -99,9 +100,13 @@ def test_the_capacities_are_those_of_the_beam(network, scenario, places):
     net = network()
     net.run_cycles(1)
     (sent,), (report,) = net.sent(m.Beam), net.sent(m.Capacity)
-    beam = Beam(sent.analog, sent.digital, 0)
-    estimate = np.array(scenario.roi_center_m)
-    assert report.expected_bps == pytest.approx(capacity(scenario, beam, estimate[None])[0])
+    (estimate,) = net.sent(m.PositionEstimate)
+    beam = Beam(sent.analog, sent.digital, sent.band)
+    assert report.band == sent.band
+    assert report.expected_bps == sent.expected_bps == pytest.approx(
+        expected_capacity(scenario, beam, estimate.position, estimate.covariance_m2))
+    assert report.at_estimate_bps == pytest.approx(
+        capacity(scenario, beam, estimate.position[None])[0])
     assert report.actual_bps == pytest.approx(capacity(scenario, beam, places[:1])[0])
     assert report.perfect_bps >= report.actual_bps
     assert report.perfect_bps >= capacity(scenario, steer(scenario, places[0]), places[:1])[0]
@@ -113,7 +118,8 @@ def test_a_perfect_estimate_loses_nothing(network, scenario):
     net = network({1: scenario.roi_center_m})
     net.run_cycles(1)
     (report,) = net.sent(m.Capacity)
-    assert report.actual_bps == pytest.approx(report.expected_bps)
+    assert report.actual_bps == pytest.approx(report.at_estimate_bps)
+    assert report.expected_bps < report.at_estimate_bps
     assert report.loss_bps == pytest.approx(0, abs=1e-6 * report.perfect_bps)
 
 
@@ -235,7 +241,7 @@ def test_a_moving_user_stands_still_within_a_cycle(network, scenario):
     net.verify()
     for truth, report, sent in zip(
             truths, net.sent(m.Capacity), net.sent(m.Beam), strict=True):
-        beam = Beam(sent.analog, sent.digital, 0)
+        beam = Beam(sent.analog, sent.digital, sent.band)
         actual = capacity(scenario, beam, truth.position[None])[0]
         assert report.actual_bps == pytest.approx(actual)
 

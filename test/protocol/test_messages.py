@@ -72,6 +72,8 @@ SHAPES = [
     (m.PositionEstimate, 'covariance_m2', (3, 2), '[3, 3]'),
     (m.Beam, 'analog', (1, 16), '[N_E = 16]'),
     (m.Beam, 'digital', (3, 3), '[N_SB = 3, K = 2]'),
+    (m.CapacityStatistics, 'actual_bps', (2,), '[3]'),
+    (m.CapacityStatistics, 'loss_percent', (3, 1), '[3]'),
     (m.GroundTruth, 'position', (), '[3]'),
     (m.GroundTruth, 'velocity', (4,), '[3]'),
 ]
@@ -200,7 +202,10 @@ def test_users_count_from_one_and_amounts_are_not_negative():
         for field in dataclasses.fields(kind):
             if field.name == 'user':
                 assert ranges[kind, 'user'] == (0 if kind is m.ProtocolState else 1)
-            elif field.name in ('duration_s', 'latency_s', 'bits', 'expected_bps'):
+            elif 'dims' in field.metadata:
+                continue
+            elif field.name in ('duration_s', 'latency_s', 'bits', 'expected_bps',
+                                'at_estimate_bps'):
                 assert ranges[kind, field.name] == 0
 
 

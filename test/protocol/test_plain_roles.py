@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.positioning import Estimate
@@ -227,7 +227,7 @@ def test_the_positioner_makes_one_estimator_for_a_codebook(positioner, codebooks
 
 @pytest.fixture
 def transmission(scenario, codebooks):
-    role = Transmission(scenario, 0)
+    role = Transmission(scenario)
     role.handle(CodebookOffered(codebooks[0]), 0.0)
     return role
 
@@ -244,7 +244,7 @@ def test_the_transmission_reports_what_the_applied_beam_carries(
     assert (beam.cycle_id, beam.user, beam.codebook_id) == (3, 1, estimate.codebook_id)
     weaker = m.RhsConfiguration(
         3, m.Mode.TRANSMISSION, 0, beam.codebook_id, beam.analog[None] / 2)
-    (_, (report,)) = feed(transmission, [truth, weaker])
+    (_, (report, _)) = feed(transmission, [truth, weaker])
     used = Beam(beam.analog / 2, beam.digital)
     assert report.actual_bps == pytest.approx(capacity(scenario, used, PLACE[None])[0])
     assert report.actual_bps < report.perfect_bps
@@ -261,7 +261,7 @@ def test_no_beam_is_better_than_the_perfect_one(transmission, scenario, codebook
         ((beam,),) = feed(transmission, [estimate])
         truth = m.GroundTruth(3, 1, place, np.zeros(3))
         applied = m.RhsConfiguration(3, m.Mode.TRANSMISSION, 0, 'x', beam.analog[None])
-        (_, (report,)) = feed(transmission, [truth, applied])
+        (_, (report, _)) = feed(transmission, [truth, applied])
         assert -0.05 <= report.loss_percent < 100
 
 
@@ -282,6 +282,77 @@ def test_a_report_without_a_beam_is_counted(transmission, applied):
     assert transmission.counters == {'wrong_cycle': 1}
 
 
+def reported(transmission, scenario, example, codebook, places, cycle_id=1):
+    """What it sends for one cycle at each of the places, the estimates being half a metre off."""
+    sent = []
+    for n, place in enumerate(places, cycle_id):
+        estimate = example(m.PositionEstimate, cycle_id=n, user=1, codebook_id=codebook.id,
+                           position=place + [0.0, 0.5, 0.0], covariance_m2=0.1 * np.eye(3))
+        ((beam,),) = feed(transmission, [estimate])
+        applied = m.RhsConfiguration(
+            n, m.Mode.TRANSMISSION, beam.band, codebook.id, beam.analog[None])
+        sent.append(feed(transmission, [m.GroundTruth(n, 1, place, np.zeros(3)), applied])[1])
+    return sent
+
+
+def test_the_statistics_are_the_quartiles_of_the_reports(
+        transmission, scenario, example, codebooks):
+    places = scenario.sample_positions(12, np.random.default_rng(5))
+    sent = reported(transmission, scenario, example, codebooks[0], places)
+    for n, (report, statistics) in enumerate(sent, 1):
+        assert (statistics.cycle_id, statistics.n_reports) == (report.cycle_id, n)
+        for name in ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent'):
+            values = [getattr(earlier, name) for earlier, _ in sent[:n]]
+            np.testing.assert_allclose(
+                getattr(statistics, name), np.percentile(values, [25, 50, 75]), rtol=1e-12)
+    assert sent[-1][1].loss_percent[1] > 0
+
+
+def test_a_report_that_is_repeated_counts_once(transmission, scenario, example, codebooks):
+    (place,) = scenario.sample_positions(1, np.random.default_rng(5))
+    ((report, statistics),) = reported(transmission, scenario, example, codebooks[0], [place])
+    assert statistics.n_reports == 1
+    applied = m.RhsConfiguration(1, m.Mode.TRANSMISSION, report.band, 'x', np.ones((1, 16)))
+    ((again,),) = feed(transmission, [applied])
+    assert isinstance(again, m.Capacity)
+    ((_, statistics),) = reported(
+        transmission, scenario, example, codebooks[0], [place], cycle_id=2)
+    assert statistics.n_reports == 2
+
+
+def test_without_a_true_position_there_are_no_statistics(transmission, estimate):
+    ((beam,),) = feed(transmission, [estimate])
+    applied = m.RhsConfiguration(3, m.Mode.TRANSMISSION, beam.band, 'x', beam.analog[None])
+    ((report,),) = feed(transmission, [applied])
+    assert isinstance(report, m.Capacity)
+
+
+def test_the_transmission_chooses_the_band_by_the_posterior(scenario, codebooks, example):
+    covariance = np.diag([0.5, 2.0, 0.3])
+    for position in scenario.sample_positions(5, np.random.default_rng(2)):
+        estimate = example(m.PositionEstimate, cycle_id=3, user=1, position=position,
+                           codebook_id=codebooks[0].id, covariance_m2=covariance)
+        (_, (beam,)) = feed(Transmission(scenario), [CodebookOffered(codebooks[0]), estimate])
+        choice = choose_beam(scenario, position, covariance)
+        assert (beam.band, beam.expected_bps) == (choice.beam.band, choice.expected_bps)
+        for band in range(scenario.n_bands):
+            other = steer(scenario, position, band)
+            assert expected_capacity(scenario, other, position, covariance) <= beam.expected_bps
+
+
+def test_the_perfect_position_has_the_choice_of_the_same_bands(
+        scenario, codebooks, truth, estimate):
+    for band in (None, 0, 1):
+        role = Transmission(scenario, band)
+        (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
+        applied = m.RhsConfiguration(
+            3, m.Mode.TRANSMISSION, beam.band, 'x', beam.analog[None])
+        (_, (report, _)) = feed(role, [truth, applied])
+        bands = range(2) if band is None else [band]
+        assert report.perfect_bps == pytest.approx(max(
+            capacity(scenario, steer(scenario, PLACE, b), PLACE[None])[0] for b in bands))
+
+
 def test_the_transmission_takes_its_band(scenario, codebooks, estimate):
     role = Transmission(scenario, 1)
     (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
@@ -297,7 +368,7 @@ def test_no_sequence_of_messages_breaks_them(
         scenario, codebooks, subscriptions, example, name, seed):
     role = {'channel': lambda: Channel(scenario, 0),
             'positioner': lambda: Positioner(scenario, Fixed, lambda: 0.0),
-            'transmission': lambda: Transmission(scenario, 0)}[name]()
+            'transmission': lambda: Transmission(scenario)}[name]()
     rng = np.random.default_rng(seed)
     kinds = subscriptions[name]
     sent = 0

@@ -53,3 +53,10 @@ def test_who_joins_late_gets_the_last_of_what_is_latched_and_nothing_of_the_exch
                 'what comes next')
     assert [ack.user for ack in heard['latched']] == [2, 3]
     assert [ack.user for ack in heard['exchange']] == [3]
+
+
+def test_the_statistics_are_latched_and_nothing_else_of_the_protocol():
+    assert {kind for kind in topics.NAMES if qos.of(kind) is qos.LATCHED} == {
+        m.CapacityStatistics}
+    assert {kind for kind in topics.NAMES if qos.of(kind) is qos.EXCHANGE} == set(
+        topics.NAMES) - {m.CapacityStatistics}
