@@ -21,7 +21,8 @@ SCENARIO = Scenario()
 SIZES = SCENARIO.sizes
 # How many messages of each kind one cycle has.
 WHOLE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
-         m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'], m.RhsConfiguration: SIZES['N_B'] + 1,
+         m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'],
+         m.RhsConfiguration: SIZES['N_B'] + 1,
          m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'] * SIZES['F'],
          m.FeedSignals: SIZES['N_B'] * SIZES['F'], m.Data: 4, m.ProtocolState: 4}
 # In another order than those of test_life.
