@@ -2,9 +2,7 @@
 
 import math
 
-import numpy as np
-
-from rhs_isac_ros.link import Beam, RunningQuartiles, capacity, choose_beam
+from rhs_isac_ros.link import Beam, Outcome, RunningQuartiles, capacity, choose_beam, outcome
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send
@@ -77,7 +75,8 @@ class Transmission(PlainRole):
         self._beam = m.Beam(
             estimate.cycle_id, estimate.user, estimate.codebook_id, beam.band, beam.analog,
             beam.digital, choice.expected_bps)
-        self._at_estimate_bps = self._capacity(beam, estimate.position)
+        self._at_estimate_bps = float(
+            capacity(self._scenario, beam, estimate.position[None])[0])
         return [Send(self._beam)]
 
     def _report(self, applied: m.RhsConfiguration) -> list[Action]:
@@ -85,15 +84,14 @@ class Transmission(PlainRole):
         if beam is None or applied.cycle_id != beam.cycle_id:
             self.counters['wrong_cycle'] += 1
             return []
-        actual = perfect = math.nan
+        result = Outcome(math.nan, math.nan)
         if truth and (truth.cycle_id, truth.user) == (beam.cycle_id, beam.user):
             used = Beam(applied.analog[0], beam.digital, beam.band)
-            actual = self._capacity(used, truth.position)
-            perfect = choose_beam(self._scenario, truth.position, bands=self._bands).expected_bps
-        loss = perfect - actual
+            result = outcome(self._scenario, used, truth.position, self._bands)
         report = m.Capacity(
-            beam.cycle_id, beam.user, beam.codebook_id, beam.band, beam.expected_bps, actual,
-            perfect, loss, 100 * loss / perfect if perfect else math.nan, self._at_estimate_bps)
+            beam.cycle_id, beam.user, beam.codebook_id, beam.band, beam.expected_bps,
+            result.actual_bps, result.perfect_bps, result.loss_bps, result.loss_percent,
+            self._at_estimate_bps)
         return [Send(report), *self._summarise(report)]
 
     def _summarise(self, report: m.Capacity) -> list[Action]:
@@ -104,6 +102,3 @@ class Transmission(PlainRole):
         self._quartiles.add([getattr(report, name) for name in _FIGURES])
         figures = dict(zip(_FIGURES, self._quartiles.quartiles(), strict=True))
         return [Send(m.CapacityStatistics(report.cycle_id, len(self._quartiles), **figures))]
-
-    def _capacity(self, beam: Beam, position: np.ndarray) -> float:
-        return float(capacity(self._scenario, beam, position[None])[0])

@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Note, Send, Tick
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.role_node import RoleNode
 
 
@@ -258,3 +258,18 @@ def test_topic_of_every_message_is_the_listed_one(bench, start, probe):
     start(bench, Scripted(), sends=topics.NAMES)
     for name in topics.NAMES.values():
         bench.until(lambda name=name: probe.count_publishers(f'/{name}'), name)
+
+
+def test_who_joins_late_hears_the_present_statistics(bench, start):
+    node = start(bench, Scripted(), sends=(m.CapacityStatistics,))
+    for n in (1, 2):
+        assert node.publish(m.CapacityStatistics(
+            n, n, *(number * np.arange(3.0) for number in (3, 2, 4, 1, 5))))
+    late, heard = bench.add(Node, 'late'), []
+    late.create_subscription(
+        convert.ros_type(m.CapacityStatistics), topics.NAMES[m.CapacityStatistics], heard.append,
+        qos.LATCHED)
+    bench.until(lambda: heard, 'the statistics')
+    (message,) = heard
+    assert message.n_reports == 2
+    assert list(message.loss_percent) == [0, 5, 10]
