@@ -11,8 +11,9 @@ _STARTS = 192
 _SURVIVORS = (192, 192, 192, 48, 48, 48, 48, 48, 48)
 _TINY = 1e-300
 # How far the phases of two sub-bands may drift apart over the surface before they are searched
-# separately.
+# separately, and how many are at most.
 _DRIFT_RAD = 1.0
+_MOST_SUBBANDS = 16
 
 
 def promising(link: BandLink, count: int) -> np.ndarray:
@@ -97,7 +98,7 @@ def _representatives(link: BandLink) -> np.ndarray:
     # Across the whole band, what its last sub-band turns against the first, beyond a common turn.
     turn = link.onboard[-1] * link.los[-1] * np.conj(link.onboard[0] * link.los[0])
     spread = np.angle(turn * np.conj(turn.sum()))
-    n = int(min(n_subbands, 1 + np.ptp(spread) // _DRIFT_RAD))
+    n = int(min(n_subbands, 1 + np.ptp(spread) // _DRIFT_RAD, _MOST_SUBBANDS))
     return ((np.arange(n) + 0.5) * n_subbands / n).astype(int)
 
 
