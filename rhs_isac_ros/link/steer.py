@@ -9,16 +9,18 @@ from rhs_isac_ros.link.search import promising
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface import matched_configuration
 
-# Configurations of the search that are compared over all sub-bands and modes.
-_COMPARED = 3
+# Configurations of the search that are compared over all sub-bands and modes, and of those that
+# are improved.
+_COMPARED = 6
+_IMPROVED = 3
 
 
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
     """Find a beam that maximises Eq. (11) for a user at a position.
 
-    A search from many starts finds promising configurations. The best of these and of the matched
-    filter's is then improved together with the digital part, so that the outcome is never worse
-    than the matched filter. The same position always gives the same beam.
+    A search from many starts finds promising configurations. The best few of these and of the
+    matched filter's are then improved together with the digital part, so that the outcome is never
+    worse than the matched filter. The same position always gives the same beam.
 
     Parameters
     ----------
@@ -43,4 +45,6 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
         raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
     link = BandLink.to(scenario, position, band)
     starts = [matched_configuration(link.los, link.onboard), *promising(link, _COMPARED)]
-    return Beam(*ascend(link, max(starts, key=link.best_rate)), band)
+    starts.sort(key=link.best_rate, reverse=True)
+    ends = [ascend(link, start) for start in starts[:_IMPROVED]]
+    return Beam(*max(ends, key=lambda end: link.best_rate(end[0])), band)
