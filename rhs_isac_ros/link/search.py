@@ -6,9 +6,9 @@ import numpy as np
 
 from rhs_isac_ros.link.band_link import BandLink
 
-_STARTS = 192
+_STARTS = 320
 # How many of them are left after each round.
-_SURVIVORS = (192, 192, 96, 96, 32, 32, 32, 32, 32, 32)
+_SURVIVORS = (320, 320, 160, 80, 80, 80, 80, 80, 80)
 _TINY = 1e-300
 # How far the phases of two sub-bands may drift apart over the surface before they are searched
 # separately, and how many are at most.

@@ -11,8 +11,8 @@ from rhs_isac_ros.model.surface import matched_configuration
 
 # Configurations of the search that are compared over all sub-bands and modes, and of those that
 # are improved.
-_COMPARED = 6
-_IMPROVED = 3
+_COMPARED = 8
+_IMPROVED = 4
 
 
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
