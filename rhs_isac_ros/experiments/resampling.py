@@ -1,0 +1,46 @@
+"""How sure a comparison is, by resampling."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+_RESAMPLES = 2000
+_INTERVAL = (2.5, 97.5)
+
+
+def reduction(
+        ours: np.ndarray, theirs: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray],
+        paired: bool = True) -> tuple[float, float, float]:
+    """How far a statistic lies below another, with its 95 % interval.
+
+    The interval is the percentile bootstrap's, with a fixed seed.
+
+    Parameters
+    ----------
+    ours, theirs
+        Samples, float64 [N]; entry by entry of the same case if they are paired.
+    statistic
+        Function of samples, float64 [..., N], that returns float64 [...].
+    paired
+        Whether cases are drawn together.
+
+    Returns
+    -------
+    tuple of float
+        The reduction and the ends of its interval [%].
+
+    Raises
+    ------
+    ValueError
+        If a sample is empty, or paired ones differ in length.
+    """
+    ours, theirs = np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)
+    if not len(ours) or not len(theirs) or (paired and len(ours) != len(theirs)):
+        raise ValueError(f'ours, theirs: {len(ours)} and {len(theirs)} values, expected some, '
+                         'and as many of both if they are paired')
+    rng = np.random.default_rng(0)
+    picks = rng.integers(len(ours), size=(_RESAMPLES, len(ours)))
+    others = picks if paired else rng.integers(len(theirs), size=(_RESAMPLES, len(theirs)))
+    samples = 1 - statistic(ours[picks]) / statistic(theirs[others])
+    low, high = np.percentile(100 * samples, _INTERVAL)
+    return 100 * float(1 - statistic(ours) / statistic(theirs)), float(low), float(high)

@@ -1,0 +1,44 @@
+"""Comparisons and how sure they are."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.experiments.resampling import reduction
+
+
+def mean(values):
+    return values.mean(axis=-1)
+
+
+def test_the_reduction_is_that_of_the_statistics():
+    less, low, high = reduction([1.0, 2.0, 3.0], [4.0, 4.0, 4.0], mean)
+    assert less == pytest.approx(50)
+    assert low < 50 < high
+
+
+def test_pairs_that_go_together_are_surer_than_the_same_values_apart():
+    rng = np.random.default_rng(0)
+    theirs = rng.exponential(size=500)
+    ours = 0.6 * theirs
+    less, low, high = reduction(ours, theirs, mean)
+    assert (less, low, high) == pytest.approx((40, 40, 40))
+    less, low, high = reduction(ours, theirs, mean, paired=False)
+    assert less == pytest.approx(40)
+    assert high - low > 5
+
+
+def test_intervals_contain_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(1)
+    inside = 0
+    for _ in range(100):
+        ours, theirs = rng.normal(3.0, 1.0, 60), rng.normal(4.0, 1.0, 60)
+        _, low, high = reduction(ours, theirs, mean)
+        inside += low <= 25 <= high
+    assert 88 <= inside <= 99
+
+
+@pytest.mark.parametrize(('ours', 'theirs', 'paired'), [
+    ([], [1.0], False), ([1.0], [], False), ([1.0], [1.0, 2.0], True)])
+def test_samples_that_cannot_be_compared_are_an_error(ours, theirs, paired):
+    with pytest.raises(ValueError, match='^ours, theirs: '):
+        reduction(ours, theirs, mean, paired)
