@@ -3,7 +3,7 @@
 import numpy as np
 
 (CHANNEL, RECEIVER, USER, BASE_STATION, SAMPLES, START, HELD_OUT, SKETCH, PAIRS,
- METHOD) = range(10)
+ METHOD, PHASES, TRAINING) = range(12)
 
 
 def generator(seed: int, stream: int, *key: int) -> np.random.Generator:
