@@ -82,13 +82,46 @@ def los_and_derivative(
     ValueError
         If `positions` is not a finite [N, 3] array.
     """
-    offsets, distances = _separation(scenario, positions)
+    gain, rate = los_and_rate(scenario, positions, band)
+    offsets = np.moveaxis(_separation(scenario, positions)[0], 2, 1)
+    return gain, rate[:, None] * offsets[:, :, None, :]
+
+
+def los_and_rate(
+        scenario: Scenario, positions: np.ndarray, band: int) -> tuple[np.ndarray, np.ndarray]:
+    """`los_gain` and what its derivative is besides the way from the element to the user.
+
+    The derivative by the user's position p is dh/dp = a (p - p_m): who only needs its products
+    with weights of the elements can draw p - p_m out of them.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    positions
+        Positions of the user, float64 [N, 3] [m].
+    band
+        Index of the band, from 0.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        h^LoS, complex128 [N, N_SB, N_E], and a of the same shape [1/m^2].
+
+    Raises
+    ------
+    ValueError
+        If `positions` is not a finite [N, 3] array.
+    """
+    _, distances = _separation(scenario, positions)
     gain = _gain(scenario, distances, band)
     wavenumbers = 2 * np.pi * subband_frequencies_hz(scenario)[band] / SPEED_OF_LIGHT_MPS
-    slope = -1j * wavenumbers[:, None] - 1 / distances[:, None, :]
-    slope *= gain
-    directions = np.moveaxis(offsets / distances[..., None], 2, 1)
-    return gain, slope[:, None] * directions[:, :, None, :]
+    inverse = (1 / distances)[:, None, :]
+    rate = np.empty_like(gain)
+    rate.real = -inverse**2
+    rate.imag = -wavenumbers[:, None] * inverse
+    rate *= gain
+    return gain, rate
 
 
 def checked_positions(positions: np.ndarray) -> np.ndarray:
@@ -128,11 +161,11 @@ def _gain(scenario: Scenario, distances: np.ndarray, band: int) -> np.ndarray:
     # Sub-bands are equally spaced: two exponentials and a running product replace N_SB of them.
     rate = -2j * np.pi / SPEED_OF_LIGHT_MPS * distances
     phasors = np.empty((len(distances), scenario.n_subbands, distances.shape[1]), complex)
-    phasors[:, 0] = np.exp(rate * frequencies[0])
-    if scenario.n_subbands > 1:
-        phasors[:, 1:] = np.exp(rate * scenario.subband_width_hz)[:, None]
-        np.cumprod(phasors, axis=1, out=phasors)
     amplitude = SPEED_OF_LIGHT_MPS * scenario.element_gain * scenario.user_gain / (4 * np.pi)
-    phasors *= (amplitude / frequencies)[:, None]
-    phasors /= distances[:, None, :]
+    phasors[:, 0] = np.exp(rate * frequencies[0])
+    phasors[:, 0] *= amplitude / distances
+    step = np.exp(rate * scenario.subband_width_hz)
+    for subband in range(1, scenario.n_subbands):
+        np.multiply(phasors[:, subband - 1], step, out=phasors[:, subband])
+    phasors /= frequencies[:, None]
     return phasors

@@ -7,11 +7,16 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning.bayes import BayesEstimator
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError
+from rhs_isac_ros.positioning.exhaustive import exhaustive_posterior
+from rhs_isac_ros.positioning.ml import MlEstimator
+from rhs_isac_ros.positioning.simulate import simulate_pairs
 
-ESTIMATORS: Mapping[str, type] = {BayesEstimator.name: BayesEstimator}
+ESTIMATORS: Mapping[str, type] = {
+    kind.name: kind for kind in (BayesEstimator, MlEstimator)}
 
 __all__ = [
-    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'SignalError', 'make_estimator',
+    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator', 'SignalError',
+    'exhaustive_posterior', 'make_estimator', 'simulate_pairs',
 ]
 
 

@@ -1,6 +1,7 @@
 """What an estimator returns, and what it must offer."""
 
 import dataclasses
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 import numpy as np
@@ -18,18 +19,26 @@ class SignalError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Estimate:
-    """Position and its uncertainty.
+    """Position and its uncertainty, or that there is none.
 
     Attributes
     ----------
     mean
-        Posterior mean, float64 [3] or [N, 3] [m].
+        Position, float64 [3] or [N, 3] [m]; NaN where the signals tell none.
     covariance
-        Posterior covariance, float64 [3, 3] or [N, 3, 3] [m^2].
+        Its covariance, float64 [3, 3] or [N, 3, 3] [m^2]; NaN where there is no position.
+    reason
+        Why there is no position, and empty where there is one: a string, or N of them.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
+    reason: str | tuple[str, ...] = ''
+
+    @property
+    def fix(self) -> np.ndarray:
+        """Whether there is a position, bool [] or [N]."""
+        return np.isfinite(self.mean).all(axis=-1)
 
 
 class Estimator(Protocol):
@@ -48,7 +57,7 @@ class Estimator(Protocol):
         Returns
         -------
         Estimate
-            With a leading N if the signals have one.
+            With a leading N if the signals have one; without a position where they tell none.
 
         Raises
         ------
@@ -56,6 +65,45 @@ class Estimator(Protocol):
             If the shape is another one or a value is not finite.
         """
         ...
+
+
+def estimate_each(
+        scenario: Scenario, codebook: Codebook, received: np.ndarray,
+        locate: Callable[[np.ndarray], Iterable[tuple[np.ndarray, np.ndarray, str]]]) -> Estimate:
+    """Check signals, locate every phase, and give the result the form of the signals.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    codebook
+        The codebook they were taken with.
+    received
+        Complex128 [N_B, N_SB F] or [N, N_B, N_SB F].
+    locate
+        Function of checked signals [N, N_B, N_SB F] that yields mean, covariance and reason of
+        each of them; if there is a reason, the others do not count.
+
+    Returns
+    -------
+    Estimate
+        With a leading N if the signals have one.
+
+    Raises
+    ------
+    SignalError
+        If the shape is another one or a value is not finite.
+    """
+    batch = checked_received(scenario, codebook, received)
+    mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
+    reasons = []
+    for row, (position, spread, reason) in enumerate(locate(batch)):
+        reasons.append(reason)
+        if not reason:
+            mean[row], covariance[row] = position, spread
+    if np.ndim(received) == 2:
+        return Estimate(mean[0], covariance[0], reasons[0])
+    return Estimate(mean, covariance, tuple(reasons))
 
 
 def checked_received(scenario: Scenario, codebook: Codebook, received: np.ndarray) -> np.ndarray:

@@ -21,9 +21,12 @@ def to_positions(points: np.ndarray) -> np.ndarray:
     numpy.ndarray
         Float64 [..., 3] [m].
     """
-    distance, u, v = np.moveaxis(points, -1, 0)
-    w = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
-    return distance[..., None] * np.stack([w, u, v], axis=-1)
+    distance, u, v = points[..., 0], points[..., 1], points[..., 2]
+    positions = np.empty(points.shape)
+    positions[..., 0] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
+    positions[..., 1:] = points[..., 1:]
+    positions *= distance[..., None]
+    return positions
 
 
 def to_polar(positions: np.ndarray) -> np.ndarray:
@@ -39,9 +42,10 @@ def to_polar(positions: np.ndarray) -> np.ndarray:
     numpy.ndarray
         (r [m], u, v), float64 [..., 3].
     """
-    distance = np.linalg.norm(positions, axis=-1)
-    return np.stack(
-        [distance, positions[..., 1] / distance, positions[..., 2] / distance], axis=-1)
+    points = np.empty(positions.shape)
+    points[..., 0] = np.sqrt(np.sum(positions**2, axis=-1))
+    points[..., 1:] = positions[..., 1:] / points[..., :1]
+    return points
 
 
 def jacobian(points: np.ndarray) -> np.ndarray:
@@ -60,7 +64,7 @@ def jacobian(points: np.ndarray) -> np.ndarray:
     distance, u, v = points.T
     w = np.sqrt(np.maximum(1 - u**2 - v**2, 1e-9))
     matrix = np.zeros((len(points), 3, 3))
-    matrix[:, :, 0] = np.stack([w, u, v], axis=1)
-    matrix[:, :, 1] = distance[:, None] * np.stack([-u / w, np.ones_like(u), 0 * u], axis=1)
-    matrix[:, :, 2] = distance[:, None] * np.stack([-v / w, 0 * v, np.ones_like(v)], axis=1)
+    matrix[:, 0, 0], matrix[:, 1, 0], matrix[:, 2, 0] = w, u, v
+    matrix[:, 0, 1], matrix[:, 0, 2] = -distance * u / w, -distance * v / w
+    matrix[:, 1, 1] = matrix[:, 2, 2] = distance
     return matrix

@@ -102,11 +102,14 @@ def test_strong_signals_give_the_position(clear):
     assert np.linalg.norm(quiet.mean - positions, axis=1).max() < 0.02
 
 
-def test_a_position_outside_the_region_gives_one_inside(clear):
+def test_a_position_just_outside_the_region_gives_one_inside(clear):
     scenario, codebook, estimator = clear
-    outside = np.array([[4.0, 0.0, 1.5], [4.0, -3.0, 0.0], [7.0, 0.0, 0.0]])
-    estimate = estimator.estimate(mean_received(scenario, codebook, outside))
     low, high = scenario.roi_bounds_m
+    outside = np.array([[4.0, 0.0, high[2] + 0.01], [4.0, low[1] - 0.01, 0.0]] * 5)
+    received = simulate_received(scenario, codebook, outside, np.random.default_rng(3))
+    estimate = estimator.estimate(received)
+    assert estimate.fix.all()
+    assert np.linalg.norm(estimate.mean - outside, axis=1).max() < 0.1
     assert (estimate.mean >= low - 1e-9).all()
     assert (estimate.mean <= high + 1e-9).all()
     assert np.linalg.eigvalsh(estimate.covariance).min() > 0

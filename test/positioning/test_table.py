@@ -7,12 +7,8 @@ from scipy.spatial import cKDTree
 from rhs_isac_ros.model import Scenario, mean_received, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning.polar import to_polar
-from rhs_isac_ros.positioning.table import (
-    DIRECTION_STEP,
-    RANGE_CELL_M,
-    TemplateTable,
-    separate,
-)
+from rhs_isac_ros.positioning.table import TemplateTable, separate
+from rhs_isac_ros.positioning.templates import DIRECTION_STEP, RANGE_CELL_M, polar_grid, tabulate
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
@@ -30,8 +26,8 @@ def model(scenario, random_beams) -> WhitenedModel:
 
 
 @pytest.fixture(scope='module')
-def table(model) -> TemplateTable:
-    return TemplateTable(model)
+def table(scenario, model) -> TemplateTable:
+    return TemplateTable(scenario, tabulate(model))
 
 
 def test_range_steps_resolve_the_shortest_wavelength(scenario, table):
@@ -52,11 +48,10 @@ def test_range_steps_resolve_the_shortest_wavelength(scenario, table):
     # So near that ranges reach almost zero.
     {'roi_center_m': (1, 0, 0), 'roi_size_m': (1.9, 2, 2)},
 ], ids=['small', 'Table I', 'wide', 'near'])
-def test_grid_covers_the_region(region, random_beams):
+def test_grid_covers_the_region(region):
     """Every position has a grid point within half a step in range and direction."""
     scenario = Scenario(n_subbands=1, n_frames=2, elements_per_side=2, **region)
-    codebook = random_beams(scenario, np.random.default_rng(0))
-    points = TemplateTable(WhitenedModel(scenario, codebook)).points
+    points = polar_grid(scenario)
     steps = np.array([RANGE_CELL_M, DIRECTION_STEP, DIRECTION_STEP])
     wanted = to_polar(scenario.sample_positions(4000, np.random.default_rng(1))) / steps
     distance, _ = cKDTree(points / steps).query(wanted, p=np.inf)
@@ -117,7 +112,7 @@ def test_modes_are_sorted_separate_and_within_depth(scenario, model, table, plai
         scenario, model.codebook, scenario.sample_positions(1, rng), rng)[0]
     y = model.whiten(received[None])[0]
     many, few, shallow, deep = (
-        table.modes(y, n, depth) for n, depth in ((30, 8.0), (3, 8.0), (30, 0.0), (1000, 30.0)))
+        table.modes(y, n, depth) for n, depth in ((30, 2.0), (3, 2.0), (30, 0.0), (1000, 30.0)))
     assert 3 < len(many)
     assert len(shallow) < len(many) < len(deep)
     np.testing.assert_array_equal(few, many[:3])
@@ -130,7 +125,7 @@ def test_modes_are_sorted_separate_and_within_depth(scenario, model, table, plai
     # The table is good to one Gauss-Newton step and some share of the energy.
     slack = 4 + 0.05 * energy.max()
     assert exact[0] > exact.max() - slack
-    assert exact.min() > exact.max() - 8 - slack
+    assert exact.min() > exact.max() - 2 - slack
 
 
 def test_separate_is_first_come_first_served():

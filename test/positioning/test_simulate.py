@@ -1,0 +1,79 @@
+"""Pairs of positions and signals."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.model import Scenario, mean_received, simulate_received
+from rhs_isac_ros.positioning import simulate_pairs
+
+
+@pytest.fixture(scope='module')
+def setting(random_beams):
+    scenario = Scenario(n_subbands=2, n_frames=2, elements_per_side=3, n_feeds=2)
+    return scenario, random_beams(scenario, np.random.default_rng(0))
+
+
+def test_a_seed_stands_for_one_sequence_however_it_is_cut(setting):
+    positions, received = simulate_pairs(*setting, 1500, 3)
+    for size in (1, 400, 512, 700):
+        parts = [simulate_pairs(*setting, min(size, 1500 - first), 3, first)
+                 for first in range(0, 1500, size)[:3]]
+        for whole, part in zip((positions, received), zip(*parts, strict=True), strict=True):
+            part = np.concatenate(part)
+            assert part.tobytes() == whole[:len(part)].tobytes()
+
+
+def test_pairs_are_the_same_in_later_versions(setting):
+    """What a seed means may not change: the first draws of NumPy's generator say what it is."""
+    scenario = setting[0]
+    rng = np.random.default_rng([11, 10, 0])
+    expected = rng.uniform(*scenario.roi_bounds_m, (512, 3))
+    np.testing.assert_array_equal(simulate_pairs(*setting, 5, 11)[0], expected[:5])
+
+
+def test_seeds_and_chunks_differ(setting):
+    first, second = simulate_pairs(*setting, 1024, 0)[0], simulate_pairs(*setting, 1024, 1)[0]
+    assert len(np.unique(np.concatenate([first, second]), axis=0)) == 2048
+
+
+def test_signals_have_the_distribution_of_eq_8(setting):
+    """Noise and multipath against those that `simulate_received` draws element by element."""
+    positions, received = simulate_pairs(*setting, 20_000, 0)
+    scattered = received - mean_received(*setting, positions)
+    fixed = np.tile(positions[:1], (20_000, 1))
+    reference = simulate_received(*setting, fixed, np.random.default_rng(1))
+    reference -= mean_received(*setting, positions[:1])
+    moments = []
+    for sample in (scattered, reference):
+        flat = sample.reshape(len(sample), -1)
+        moments.append((flat.T @ flat.conj() / len(flat), flat.T @ flat / len(flat),
+                        flat.mean(axis=0)))
+    scale = np.sqrt(np.diag(moments[1][0]).real)
+    for own, expected in zip(*moments, strict=True):
+        unit = np.multiply.outer(scale, scale) if own.ndim == 2 else scale
+        # Twice the 1 / sqrt(20 000) of either side, times five.
+        assert np.abs((own - expected) / unit).max() < 0.05
+
+
+def test_positions_fill_the_region(setting):
+    low, high = setting[0].roi_bounds_m
+    unit = (simulate_pairs(*setting, 20_000, 0)[0] - low) / (high - low)
+    assert unit.min() > 0
+    assert unit.max() < 1
+    np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.01)
+    np.testing.assert_allclose(np.cov(unit.T), np.eye(3) / 12, atol=0.003)
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    ((-1, 0), 'n: -1, expected 0 or more'), ((1, -2), 'seed: -2'), ((1, 0, -3), 'first: -3')])
+def test_negative_numbers_are_errors(setting, arguments, words):
+    with pytest.raises(ValueError, match=words):
+        simulate_pairs(*setting, *arguments)
+
+
+def test_no_pairs_and_a_codebook_that_does_not_fit(setting, small):
+    positions, received = simulate_pairs(*setting, 0, 0)
+    assert (positions.shape, received.shape) == ((0, 3), (0, 2, 4))
+    with pytest.raises(CodebookError):
+        simulate_pairs(setting[0], small.codebook, 1, 0)
