@@ -43,6 +43,14 @@ def table1() -> Case:
     return load_case('table1')
 
 
+@pytest.fixture(scope='session', autouse=True)
+def own_cache(tmp_path_factory):
+    """Tables that nodes keep go where the tests' other files go, also those of processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('XDG_CACHE_HOME', str(tmp_path_factory.mktemp('cache')))
+        yield
+
+
 @pytest.fixture(scope='session')
 def small() -> Case:
     return load_case('small')

@@ -20,7 +20,8 @@ from rhs_isac_ros.ros.run import entry
 
 SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
          m.ProtocolState)
-RECEIVES = (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.Beam, m.Data)
+RECEIVES = (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.NoFix, m.Beam,
+            m.Data)
 
 
 class BsNode(RoleNode):

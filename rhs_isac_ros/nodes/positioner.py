@@ -1,17 +1,27 @@
 """The executable ``positioner``: estimates the user's position."""
 
+import functools
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import Estimator, make_estimator
+from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import CodebookOffered
-from rhs_isac_ros.protocol.positioner import Positioner
+from rhs_isac_ros.protocol.events import (
+    Action,
+    CodebookOffered,
+    EstimatorFailed,
+    EstimatorMade,
+    MakeEstimator,
+)
+from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.background import Background
 from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -21,18 +31,44 @@ class PositionerNode(RoleNode):
     """The positioner; it listens to received signals once its tables are built."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('positioner', (m.PositionEstimate,), **node_options)
+        super().__init__('positioner', (m.PositionEstimate, m.NoFix), **node_options)
+        self._background = Background(self)
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
-        self.start(Positioner(self.scenario, self._make, time.perf_counter), ())
-        self._codebook = CodebookSource(self, self.scenario, self._on_codebook)
+        self.start(Positioner(self.scenario, time.perf_counter), ())
+        self._codebook = CodebookSource(
+            self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
 
     def _make(self, codebook: Codebook) -> Estimator:
-        return make_estimator(self.values.estimator, self.scenario, codebook)
+        folder = self.values.table_folder
+        return make_estimator(
+            self.values.estimator, self.scenario, codebook,
+            table_folder=Path(folder) if folder else default_folder())
 
-    def _on_codebook(self, codebook: Codebook) -> None:
-        self.tell(CodebookOffered(codebook))
-        self.listen((m.ReceivedSignals,))
+    def perform(self, action: Action) -> None:
+        """Make an estimator, in the background.
+
+        Parameters
+        ----------
+        action
+            What the role asks for.
+
+        Raises
+        ------
+        TypeError
+            If it asks for anything else.
+        """
+        if not isinstance(action, MakeEstimator):
+            super().perform(action)
+        self._background.run(
+            functools.partial(
+                make_estimator_for, action.codebook, self._make, time.perf_counter),
+            self._on_estimator)
+
+    def _on_estimator(self, event: EstimatorMade | EstimatorFailed) -> None:
+        self.tell(event)
+        if isinstance(event, EstimatorMade):
+            self.listen((m.ReceivedSignals,))
 
     def publish(self, message: m.Message) -> bool:
         """Publish an estimate, and the same as a standard pose.
@@ -40,7 +76,7 @@ class PositionerNode(RoleNode):
         Parameters
         ----------
         message
-            The estimate.
+            The estimate, or that there is none.
 
         Returns
         -------
@@ -48,9 +84,14 @@ class PositionerNode(RoleNode):
             Whether it was published.
         """
         sent = super().publish(message)
-        if sent:
+        if sent and isinstance(message, m.PositionEstimate):
             self._pose.publish(convert.pose(message, self.get_clock().now().to_msg()))
         return sent
+
+    def destroy_node(self) -> None:
+        """End the background thread, then the node."""
+        self._background.close()
+        super().destroy_node()
 
 
 main = entry(lambda: [PositionerNode()])

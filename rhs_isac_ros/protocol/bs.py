@@ -91,6 +91,8 @@ class BaseStation(Machine):
                 return self._classify_frame(event)
             case m.PositionEstimate():
                 return Input.ESTIMATE
+            case m.NoFix():
+                return Input.NO_FIX
             case m.Beam():
                 return Input.BEAM_READY if self._applied else Input.BEAM
         raise TypeError(f'{type(event).__name__} is no event of a base station')
@@ -215,7 +217,7 @@ class BaseStation(Machine):
         self._roster.forget(self._user)
 
     def _abandon(self, event: Event, now_s: float) -> list[Action]:
-        reason = TABLE[self.state, Input.TIMEOUT].counts
+        reason = TABLE[self.state, self._classify(event)].counts
         return [*self._announce(m.Phase.BEACONING, reason),
                 Note(f'cycle {self._cycle_id}: user {self._user} given up: {reason}', True)]
 

@@ -36,6 +36,7 @@ class Input(enum.Enum):
     LAST_FRAME_OF_BAND = 'last_frame_of_band'
     LAST_FRAME = 'last_frame'
     ESTIMATE = 'estimate'
+    NO_FIX = 'no_fix'
     BEAM = 'beam'
     BEAM_APPLIED = 'beam_applied'
     BEAM_READY = 'beam_ready'
@@ -96,6 +97,7 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (S.SOUNDING, I.LAST_FRAME): Step(S.ESTIMATING, ('keep_frame', 'deliver')),
     (S.SOUNDING, I.TIMEOUT): Step(S.RESTING, ('forget_user', 'abandon'), counts='user_gone'),
     (S.ESTIMATING, I.ESTIMATE): Step(S.STEERING),
+    (S.ESTIMATING, I.NO_FIX): Step(S.RESTING, ('abandon',), counts='no_fix'),
     (S.ESTIMATING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='positioner_silent'),
     # Transmission. Beam and configuration come from two nodes, in either order.
     (S.ESTIMATING, I.BEAM): Step(S.STEERING, ('keep_beam',)),

@@ -3,6 +3,7 @@
 import dataclasses
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.positioning import Estimator
 from rhs_isac_ros.protocol.messages import Message
 
 
@@ -25,7 +26,24 @@ class PeersChanged:
     missing: tuple[str, ...]
 
 
-Event = Message | Tick | CodebookOffered | PeersChanged
+@dataclasses.dataclass(frozen=True, eq=False)
+class EstimatorMade:
+    """What `MakeEstimator` asked for is there; it took `elapsed_s`."""
+
+    codebook: Codebook
+    estimator: Estimator
+    elapsed_s: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EstimatorFailed:
+    """What `MakeEstimator` asked for cannot be had."""
+
+    codebook: Codebook
+    reason: str
+
+
+Event = Message | Tick | CodebookOffered | PeersChanged | EstimatorMade | EstimatorFailed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,4 +61,11 @@ class Note:
     warning: bool = False
 
 
-Action = Send | Note
+@dataclasses.dataclass(frozen=True, eq=False)
+class MakeEstimator:
+    """Make an estimator for a codebook, meanwhile, and answer with one of two events."""
+
+    codebook: Codebook
+
+
+Action = Send | Note | MakeEstimator

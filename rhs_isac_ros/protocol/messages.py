@@ -173,6 +173,15 @@ class PositionEstimate(Message):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class NoFix(Message):
+    """The received signals tell no position."""
+
+    user: int = number(1, _LAST_USER)
+    codebook_id: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Beam(Message):
     """The beam of the transmission phase."""
 

@@ -112,6 +112,8 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'positioner': (
         SCENARIO,
         Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS)),
+        Parameter('table_folder', '',
+                  "Where tables are kept between runs; empty: the user's folder for caches."),
     ),
     'transmission': (
         SCENARIO,

@@ -168,6 +168,21 @@ class RoleNode(Node):
         self._outlets[type(message)].publish(convert.to_ros(message, stamp))
         return True
 
+    def perform(self, action: Action) -> None:
+        """Do what only this node can do for its role.
+
+        Parameters
+        ----------
+        action
+            Neither a message to send nor a note.
+
+        Raises
+        ------
+        TypeError
+            If the node knows no such action.
+        """
+        raise TypeError(f'{type(action).__name__} is no action of {self.get_name()}')
+
     def _receiver(self, kind: type[m.Message]) -> Callable[[Any], None]:
         def receive(ros_message: Any) -> None:
             try:
@@ -189,6 +204,8 @@ class RoleNode(Node):
                     self.get_logger().warning(text)
                 case Note(text):
                     self.get_logger().info(text)
+                case _:
+                    self.perform(action)
 
     def _complain(self, what: str, error: m.MessageError) -> None:
         """Log an error, once for each field: a babbling sender must not fill the disk."""

@@ -15,6 +15,7 @@ NAMES: Mapping[type[m.Message], str] = {
     m.FeedSignals: 'feed_signals',
     m.ReceivedSignals: 'received_signals',
     m.PositionEstimate: 'position_estimate',
+    m.NoFix: 'no_fix',
     m.Beam: 'beam',
     m.Data: 'data',
     m.Capacity: 'capacity',

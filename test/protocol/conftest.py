@@ -23,15 +23,23 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.bs import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.events import CodebookOffered, Note, PeersChanged, Send, Tick
-from rhs_isac_ros.protocol.positioner import Positioner
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    MakeEstimator,
+    Note,
+    PeersChanged,
+    Send,
+    Tick,
+)
+from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.roster import Roster
 from rhs_isac_ros.protocol.transmission import Transmission
 
 # What the nodes subscribe to.
 SUBSCRIPTIONS = {
-    'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.Beam, m.Data),
+    'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.NoFix, m.Beam,
+           m.Data),
     'user': (m.Beacon, m.Grant, m.PilotRequest, m.Data),
     'rhs_controller': (m.RhsCommand, m.Beam),
     'channel': (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
@@ -102,14 +110,15 @@ class Network:
     """The roles, coupled by a bus.
 
     `users` maps numbers to positions or mobilities; `make` makes the positioner's estimator of a
-    codebook; `ordered` keeps the order of what one role sends to another under one name.
+    codebook, which takes `make_s`; `ordered` keeps the order of what one role sends to another
+    under one name.
     """
 
     def __init__(
             self, scenario: Scenario, codebook, users, *, policy: str = 'round_robin',
             seed: int = 0, step_timeout_s: float = 1.0, ack_timeout_s: float = 0.1,
             rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
-            absent: Iterable[str] = ()) -> None:
+            make_s: float = 0.0, absent: Iterable[str] = ()) -> None:
         self.scenario, self.seed = scenario, seed
         self.transport, self.ordered = transport, ordered
         self.now_s = 0.0
@@ -127,6 +136,7 @@ class Network:
         self._policy, self._step_timeout_s = policy, step_timeout_s
         self._ack_timeout_s, self._rest_s = ack_timeout_s, rest_s
         self._make = make or (lambda codebook: Centre(scenario))
+        self._make_s = make_s
         self._awake = False
         for user, place in users.items():
             self.add_user(user, place)
@@ -174,8 +184,19 @@ class Network:
         for action in self._roles[name].handle(event, self.now_s):
             if isinstance(action, Send):
                 self.publish(action.message, name)
+            elif isinstance(action, MakeEstimator):
+                self._make_estimator(name, action.codebook)
             else:
                 self.notes.append(Said(self.now_s, name, action))
+
+    def _make_estimator(self, name: str, codebook) -> None:
+        """At once, or as something that arrives when it is done."""
+        event = make_estimator_for(codebook, self._make, lambda: self.now_s)
+        if not self._make_s:
+            self.tell(name, event)
+            return
+        heapq.heappush(self._queue, (self.now_s + self._make_s, next(self._serial), name,
+                                     self._roles[name], event))
 
     def publish(self, message: m.Message, sender: str = 'stranger') -> None:
         m.check(message, self.scenario.sizes)
@@ -310,7 +331,7 @@ class Network:
             case 'channel':
                 return Channel(scenario, self.seed)
             case 'positioner':
-                return Positioner(scenario, self._make, lambda: self.now_s)
+                return Positioner(scenario, lambda: self.now_s)
             case 'transmission':
                 return Transmission(scenario)
         raise ValueError(name)

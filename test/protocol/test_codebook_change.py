@@ -138,3 +138,32 @@ def test_a_codebook_offered_twice_while_beaconing_costs_nothing(network, codeboo
     assert net.outcomes()[1:] == [(2, 1, 'served'), (3, 1, 'served')]
     net.verify()
 
+
+
+def test_no_cycle_is_lost_while_an_estimator_is_made(network, codebooks):
+    """The signals of the new codebook wait for it, within the patience of the base station."""
+    net = network(make_s=0.8, step_timeout_s=1.0)
+    net.run_cycles(2)
+    net.run_to(State.SOUNDING)
+    net.offer(codebooks[1])
+    net.run_cycles(3)
+    assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
+    assert [ids(net, cycle_id) for cycle_id in (3, 4, 5)] == [
+        {codebooks[0].id}, {codebooks[1].id}, {codebooks[1].id}]
+    assert not net['positioner'].counters
+    net.verify()
+
+
+def test_an_estimator_that_takes_long_costs_the_cycles_of_its_codebook_only(network, codebooks):
+    net = network(make_s=2.5, step_timeout_s=1.0)
+    net.run(limit_s=5.0)
+    before = len(net.outcomes())
+    net.run_to(State.SOUNDING)
+    net.offer(codebooks[1])
+    net.run(limit_s=6.0)
+    outcomes = [outcome for _, _, outcome in net.outcomes()[before:]]
+    lost = outcomes.count('positioner_silent')
+    assert 1 <= lost <= 3
+    assert outcomes == ['served'] + ['positioner_silent'] * lost + ['served'] * (
+        len(outcomes) - lost - 1)
+    net.verify()

@@ -9,6 +9,7 @@ import pytest
 import rhs_isac_ros
 from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
 from rhs_isac_ros.model import Scenario, mobility
+from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.bs_table import State
 
@@ -78,8 +79,7 @@ def test_the_estimate_is_what_the_estimator_finds(network, scenario):
 
         def estimate(self, received):
             seen.append(received)
-            return type('Estimate', (), {
-                'mean': np.array([6.0, -2.0, 0.5]), 'covariance': np.diag([1.0, 2.0, 3.0])})
+            return Estimate(np.array([6.0, -2.0, 0.5]), np.diag([1.0, 2.0, 3.0]))
 
     seen = []
     net = network(make=lambda codebook: Corner())

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import mobility
+from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.bs_table import State
@@ -116,6 +117,8 @@ def test_one_lost_message_ends_one_cycle_at_most(
 
 def test_every_subscription_is_among_the_lost_messages(subscriptions):
     lost = {(kind, recipient.rstrip('1')) for kind, _, recipient, _, _ in LOST}
+    # That of a message which no good cycle has is lost in a test of its own.
+    lost.add((m.NoFix, 'bs'))
     assert lost == {(kind, role) for role, kinds in subscriptions.items() for kind in kinds}
 
 
@@ -549,3 +552,56 @@ def test_nothing_is_mixed_while_messages_are_lost_doubled_and_overtaken(network,
     net.run(limit_s=30.0)
     assert set(net.served()) == {1, 2, 3}
     net.verify()
+
+
+class Blind:
+    """An estimator that finds nobody in the cycles that it is told."""
+
+    name = 'blind'
+
+    def __init__(self, cycles):
+        self._cycles, self._cycle = cycles, 0
+
+    def estimate(self, received):
+        self._cycle += 1
+        if self._cycle in self._cycles:
+            return Estimate(np.full(3, np.nan), np.full((3, 3), np.nan), 'nothing fits')
+        return Estimate(np.array([10.0, 0.0, 0.0]), np.eye(3))
+
+
+def test_without_a_fix_the_cycle_ends_at_once_and_no_position_is_told(network):
+    net = network(make=lambda codebook: Blind({2}))
+    net.run_cycles(3)
+    assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'no_fix'), (3, 1, 'served')]
+    assert [e.cycle_id for e in net.sent(m.PositionEstimate)] == [1, 3]
+    assert not net.sent(m.Beam, cycle_id=2)
+    (told,) = net.sent(m.NoFix)
+    assert (told.cycle_id, told.user, told.reason) == (2, 1, 'nothing fits')
+    (signals_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ReceivedSignals)
+                    and s.message.cycle_id == 2]
+    (end_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ProtocolState)
+                and s.message.outcome == 'no_fix']
+    assert end_s - signals_s < 0.01
+    assert net.counters() == {
+        'bs': {'no_fix': 1}, 'positioner': {'no_fix': 1}, 'user1': {'abandoned': 1}}
+    net.verify()
+
+
+def test_a_lost_no_fix_costs_the_patience_of_one_step(network):
+    net = network(make=lambda codebook: Blind({2}), transport=LosesFirst(m.NoFix, {}))
+    net.run_cycles(3)
+    assert net.transport.lost is not None
+    assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'positioner_silent'), (3, 1, 'served')]
+    net.verify()
+
+
+@pytest.mark.parametrize('changes', [{'cycle_id': 1}, {'user': 2}, {'codebook_id': 'x'}], ids=str)
+def test_another_no_fix_does_not_end_the_cycle(network, codebooks, changes):
+    net = network()
+    net.run_cycles(1)
+    net.run_to(State.ESTIMATING)
+    net.publish(m.NoFix(**{'cycle_id': 2, 'user': 1, 'codebook_id': codebooks[0].id,
+                           'reason': ''} | changes))
+    net.run_cycles(1)
+    assert net.served() == [1, 1]
+    assert sum(net['bs'].counters.values()) == 1

@@ -10,11 +10,18 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.positioning import Estimate
+from rhs_isac_ros.positioning import Estimate, SignalError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.events import CodebookOffered, Note, Send
-from rhs_isac_ros.protocol.positioner import Positioner
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    EstimatorFailed,
+    EstimatorMade,
+    MakeEstimator,
+    Note,
+    Send,
+)
+from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
 from rhs_isac_ros.protocol.transmission import Transmission
 
 PLACE = np.array([8.0, -2.0, 0.5])
@@ -59,7 +66,7 @@ def downlink():
 
 def test_they_wait_for_messages_only(scenario):
     for role in (Channel(scenario, 0), Transmission(scenario, 0),
-                 Positioner(scenario, None, None)):
+                 Positioner(scenario, None)):
         assert role.next_deadline() is None
 
 
@@ -179,24 +186,38 @@ class Fixed:
 
 @pytest.fixture
 def positioner(scenario):
-    """A positioner and the codebooks that it made an estimator for; its watch ticks in seconds."""
-    made, watch = [], itertools.count(10.0)
+    """A positioner whose watch ticks in seconds."""
+    watch = itertools.count(10.0)
+    return Positioner(scenario, lambda: next(watch))
 
-    def make(codebook):
-        made.append(codebook.id)
-        return Fixed(codebook)
-    return Positioner(scenario, make, lambda: next(watch)), made
+
+@pytest.fixture
+def signals(codebooks, example):
+    """Function that makes received signals of a cycle with one of the codebooks."""
+    def make(cycle_id, number=0):
+        return example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
+                       codebook_id=codebooks[number].id)
+    return make
+
+
+def made(codebook, estimator=None):
+    return EstimatorMade(codebook, estimator or Fixed(codebook), 1.5)
+
+
+def wanted(actions):
+    """Ids of the codebooks that estimators are asked for."""
+    return [action.codebook.id for action in actions if isinstance(action, MakeEstimator)]
 
 
 def test_the_positioner_uses_the_estimator_of_the_signals_codebook(
-        positioner, scenario, codebooks, example):
-    role, made = positioner
+        positioner, scenario, codebooks, signals):
     for codebook in codebooks[:2]:
-        role.handle(CodebookOffered(codebook), 0.0)
-    assert made == [codebooks[0].id, codebooks[1].id]
-    for codebook in codebooks[:2] * 2:
-        received = example(m.ReceivedSignals, cycle_id=5, user=2, codebook_id=codebook.id)
-        ((estimate,),) = feed(role, [received])
+        assert wanted(positioner.handle(CodebookOffered(codebook), 0.0)) == [codebook.id]
+        assert positioner.handle(made(codebook), 0.0) == [
+            Note(f'fixed {codebook.id} is ready for codebook {codebook.id} after 1.5 s')]
+    for number in (0, 1, 0, 1):
+        codebook = codebooks[number]
+        ((estimate,),) = feed(positioner, [signals(5, number)])
         assert (estimate.cycle_id, estimate.user) == (5, 2)
         assert estimate.codebook_id == codebook.id
         assert estimate.estimator == f'fixed {codebook.id}'
@@ -204,25 +225,115 @@ def test_the_positioner_uses_the_estimator_of_the_signals_codebook(
         assert (estimate.covariance_m2 == 4 * np.eye(3)).all()
         assert estimate.crlb_m2 == pytest.approx(crlb(scenario, codebook, PLACE[None])[0])
         assert estimate.latency_s == 1.0
-    assert made == [codebooks[0].id, codebooks[1].id]
 
 
 def test_the_positioner_drops_signals_of_a_codebook_that_it_does_not_know(
-        positioner, codebooks, example):
-    role, _ = positioner
-    received = example(m.ReceivedSignals, codebook_id=codebooks[0].id)
-    assert feed(role, [received]) == [[]]
-    role.handle(CodebookOffered(codebooks[1]), 0.0)
-    assert feed(role, [received]) == [[]]
-    assert role.counters == {'wrong_codebook': 2}
+        positioner, codebooks, signals):
+    assert feed(positioner, [signals(1)]) == [[]]
+    feed(positioner, [CodebookOffered(codebooks[1]), made(codebooks[1])])
+    assert feed(positioner, [signals(1)]) == [[]]
+    assert positioner.counters == {'wrong_codebook': 2}
 
 
-def test_the_positioner_makes_one_estimator_for_a_codebook(positioner, codebooks):
-    role, made = positioner
-    notes = [role.handle(CodebookOffered(codebooks[0]), 0.0) for _ in range(3)]
-    assert made == [codebooks[0].id]
-    name = f'fixed {codebooks[0].id}'
-    assert notes == [[Note(f'{name} is ready for codebook {codebooks[0].id} after 1.0 s')], [], []]
+def test_the_positioner_wants_one_estimator_for_a_codebook(positioner, codebooks):
+    offers = [positioner.handle(CodebookOffered(codebooks[0]), 0.0) for _ in range(3)]
+    assert list(map(wanted, offers)) == [[codebooks[0].id], [], []]
+    positioner.handle(made(codebooks[0]), 0.0)
+    assert positioner.handle(CodebookOffered(codebooks[0]), 0.0) == []
+
+
+def test_the_positioner_goes_on_with_the_old_codebook_while_it_makes_the_new_one(
+        positioner, codebooks, signals):
+    feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0]),
+                      CodebookOffered(codebooks[1])])
+    (old,), nothing, (old_again,), (new,) = feed(
+        positioner, [signals(1), signals(2, 1), signals(3), made(codebooks[1])])
+    assert nothing == []
+    assert [e.cycle_id for e in (old, old_again, new)] == [1, 3, 2]
+    assert new.codebook_id == codebooks[1].id
+    assert positioner.counters == {}
+
+
+def test_of_signals_that_wait_the_newest_are_used(positioner, codebooks, signals):
+    *before, (estimate,), after = feed(
+        positioner, [CodebookOffered(codebooks[0]), signals(1), signals(2), made(codebooks[0]),
+                     CodebookOffered(codebooks[0])])
+    assert before == [[], [], []]
+    assert estimate.cycle_id == 2
+    assert after == []
+
+
+def test_one_estimator_is_made_at_a_time_and_the_newest_codebook_comes_next(
+        positioner, codebooks, signals):
+    first, second, third = codebooks
+    offers = [wanted(positioner.handle(CodebookOffered(c), 0.0)) for c in (first, second, third)]
+    assert offers == [[first.id], [], []]
+    positioner.handle(signals(7, 2), 0.0)
+    assert wanted(positioner.handle(made(first), 0.0)) == [third.id]
+    ((estimate,),) = feed(positioner, [made(third)])
+    assert (estimate.cycle_id, estimate.codebook_id) == (7, third.id)
+    assert feed(positioner, [signals(8, 1)]) == [[]]
+    assert positioner.counters == {'wrong_codebook': 1}
+
+
+def test_a_codebook_that_is_taken_back_is_not_made(positioner, codebooks):
+    first, second, _ = codebooks
+    feed(positioner, [CodebookOffered(c) for c in (first, second, first)])
+    assert wanted(positioner.handle(made(first), 0.0)) == []
+
+
+def test_an_estimator_that_cannot_be_made_leaves_the_old_one(positioner, codebooks, signals):
+    feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0]),
+                      CodebookOffered(codebooks[1]), signals(4, 1)])
+    assert positioner.handle(EstimatorFailed(codebooks[1], 'no model'), 0.0) == [
+        Note(f'no estimator for codebook {codebooks[1].id}: no model', warning=True)]
+    assert [len(sent) for sent in feed(positioner, [signals(5), signals(6, 1)])] == [1, 0]
+    assert positioner.counters == {'wrong_codebook': 2}
+    # It may be offered again.
+    assert wanted(positioner.handle(CodebookOffered(codebooks[1]), 0.0)) == [codebooks[1].id]
+
+
+class Lost(Fixed):
+    """An estimator without a fix: it says so, or finds the signals unusable."""
+
+    def __init__(self, codebook, error=False):
+        super().__init__(codebook)
+        self._error = error
+
+    def estimate(self, received):
+        if self._error:
+            raise SignalError('received: all wrong')
+        return Estimate(np.full(3, np.nan), np.full((3, 3), np.nan), 'received: all wrong')
+
+
+@pytest.mark.parametrize('error', [False, True])
+def test_without_a_fix_the_positioner_says_so_and_why(positioner, codebooks, signals, error):
+    lost = Lost(codebooks[0], error)
+    feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0], lost)])
+    send, note = positioner.handle(signals(9), 0.0)
+    assert isinstance(send.message, m.NoFix)
+    assert (send.message.cycle_id, send.message.user) == (9, 2)
+    assert send.message.codebook_id == codebooks[0].id
+    assert send.message.reason == 'received: all wrong'
+    assert note == Note('cycle 9: no fix: received: all wrong', warning=True)
+    assert positioner.counters == {'no_fix': 1}
+
+
+@pytest.mark.parametrize('error', [ValueError('bad model'), OSError('disk full'), MemoryError()])
+def test_what_goes_wrong_while_an_estimator_is_made_is_an_event(codebooks, error):
+    def make(codebook):
+        raise error
+    event = make_estimator_for(codebooks[0], make, lambda: 0.0)
+    assert isinstance(event, EstimatorFailed)
+    assert event.codebook is codebooks[0]
+    assert event.reason == (str(error) or 'MemoryError')
+
+
+def test_an_estimator_that_was_made_comes_with_its_time(codebooks):
+    watch = iter([3.0, 5.5])
+    event = make_estimator_for(codebooks[0], Fixed, lambda: next(watch))
+    assert (event.codebook, event.elapsed_s) == (codebooks[0], 2.5)
+    assert event.estimator.name == f'fixed {codebooks[0].id}'
 
 
 @pytest.fixture
@@ -367,7 +478,7 @@ def test_the_transmission_takes_its_band(scenario, codebooks, estimate):
 def test_no_sequence_of_messages_breaks_them(
         scenario, codebooks, subscriptions, example, name, seed):
     role = {'channel': lambda: Channel(scenario, 0),
-            'positioner': lambda: Positioner(scenario, Fixed, lambda: 0.0),
+            'positioner': lambda: Positioner(scenario, lambda: 0.0),
             'transmission': lambda: Transmission(scenario)}[name]()
     rng = np.random.default_rng(seed)
     kinds = subscriptions[name]
@@ -383,7 +494,9 @@ def test_no_sequence_of_messages_breaks_them(
         if 'position' in fields:
             given['position'] = scenario.sample_positions(1, rng)[0]
         if name != 'channel' and rng.random() < 0.05:
-            role.handle(CodebookOffered(codebooks[rng.integers(3)]), float(n))
+            offered = CodebookOffered(codebooks[rng.integers(3)])
+            for action in role.handle(offered, float(n)):
+                role.handle(EstimatorMade(action.codebook, Fixed(action.codebook), 0.0), float(n))
         for action in role.handle(example(kind, rng, **given), float(n)):
             assert isinstance(action, Send)
             m.check(action.message, scenario.sizes)

@@ -1,0 +1,113 @@
+"""The node of the positioner: estimators made in the background."""
+
+import threading
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import simulate_received
+from rhs_isac_ros.nodes import positioner
+from rhs_isac_ros.nodes.positioner import PositionerNode
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import CodebookOffered
+from rhs_isac_ros.ros import convert
+
+PLACE = np.array([10.0, 0.5, 0.2])
+
+
+@pytest.fixture
+def codebooks(small_files):
+    return [Codebook.load(small_files / f'{name}.yaml') for name in ('first', 'second')]
+
+
+@pytest.fixture
+def node(bench, small_files, tmp_path):
+    return bench.add(PositionerNode, parameter_overrides=[
+        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
+        Parameter('table_folder', value=str(tmp_path / 'tables'))])
+
+
+@pytest.fixture
+def send(bench, node, codebooks):
+    """Function that sends good signals of a cycle, and returns them."""
+    outlets = []
+
+    def send(cycle_id, number=0, factor=1.0):
+        outlets or outlets.append(bench.outlet(bench.add(Node, 'probe'), m.ReceivedSignals))
+        codebook = codebooks[number]
+        rng = np.random.default_rng(cycle_id)
+        signals = factor * simulate_received(node.scenario, codebook, PLACE[None], rng)[0]
+        message = m.ReceivedSignals(
+            cycle_id, 1, codebook.id, signals.reshape(codebook.digital.shape[:3]))
+        outlets[0].publish(convert.to_ros(message, node.get_clock().now().to_msg()))
+        return signals
+    return send
+
+
+def test_the_estimate_is_that_of_the_library(bench, node, send, codebooks, tmp_path):
+    estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+    node.tell(CodebookOffered(codebooks[0]))
+    signals = send(3)
+    (estimate,) = bench.until(lambda: estimates)
+    expected = make_estimator('bayes', node.scenario, codebooks[0]).estimate(signals)
+    np.testing.assert_array_equal(estimate.position, expected.mean)
+    np.testing.assert_array_equal(estimate.covariance_m2, expected.covariance)
+    assert len(list((tmp_path / 'tables').iterdir())) == 1
+
+
+def test_signals_are_answered_while_another_estimator_is_made(
+        bench, node, send, codebooks, monkeypatch):
+    free, begun = threading.Event(), threading.Event()
+
+    def slowly(name, scenario, codebook, **options):
+        if codebook.id == codebooks[1].id:
+            begun.set()
+            free.wait()
+        return make_estimator(name, scenario, codebook, **options)
+    monkeypatch.setattr(positioner, 'make_estimator', slowly)
+    estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+    node.tell(CodebookOffered(codebooks[0]))
+    send(1)
+    bench.until(lambda: len(estimates) == 1)
+    node.tell(CodebookOffered(codebooks[1]))
+    bench.until(begun.is_set)
+    send(2, 1)
+    send(3)
+    bench.until(lambda: len(estimates) == 2)
+    free.set()
+    bench.until(lambda: len(estimates) == 3)
+    assert [(e.cycle_id, e.codebook_id) for e in estimates] == [
+        (1, codebooks[0].id), (3, codebooks[0].id), (2, codebooks[1].id)]
+
+
+def test_a_node_that_ends_meanwhile_ends_well(bench, node, codebooks, monkeypatch):
+    begun, made = threading.Event(), []
+
+    def slowly(name, scenario, codebook, **options):
+        begun.set()
+        made.append(make_estimator(name, scenario, codebook, **options))
+        return made[0]
+    monkeypatch.setattr(positioner, 'make_estimator', slowly)
+    node.tell(CodebookOffered(codebooks[0]))
+    assert begun.wait(10)
+    bench.remove(node)
+    assert len(made) == 1
+    assert not [t for t in threading.enumerate() if t.name.startswith('positioner')]
+
+
+def test_without_a_fix_it_says_so(bench, node, send, codebooks):
+    ear = bench.add(Node, 'ear')
+    told, estimates = bench.hear(ear, m.NoFix), bench.hear(ear, m.PositionEstimate)
+    node.tell(CodebookOffered(codebooks[0]))
+    send(1, factor=0.0)
+    send(2, factor=1e3)
+    send(3)
+    bench.until(lambda: estimates and len(told) == 2)
+    assert [message.cycle_id for message in told] == [1, 2]
+    assert [message.cycle_id for message in estimates] == [3]
+    assert 'energy' in told[0].reason
+    assert 'misfit' in told[1].reason
