@@ -18,8 +18,8 @@ PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)
 # All that the pure layers may import besides the standard library and their own.
 LIBRARIES = {'numpy', 'scipy', 'yaml'}
 # What they may import inside functions that say so where it is missing: only pictures, the
-# genetic algorithm and experiments need these.
-OPTIONAL = {'distributed', 'joblib', 'matplotlib', 'pymoo', 'tqdm'}
+# genetic algorithm, the training of networks and experiments need these.
+OPTIONAL = {'distributed', 'joblib', 'matplotlib', 'pymoo', 'sklearn', 'tqdm'}
 ROOT = Path(rhs_isac_ros.__file__).parent
 MODULES = sorted(ROOT.rglob('*.py'))
 MOST_LINES = 299

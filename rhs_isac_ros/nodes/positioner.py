@@ -9,7 +9,13 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.positioning import Estimator, make_estimator
+from rhs_isac_ros.positioning import (
+    Estimator,
+    ModelError,
+    Network,
+    NeuralEstimator,
+    make_estimator,
+)
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
@@ -23,6 +29,7 @@ from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import Background
 from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -32,6 +39,8 @@ class PositionerNode(RoleNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', (m.PositionEstimate, m.NoFix), **node_options)
+        if self.values.estimator == NeuralEstimator.name:
+            self._check_model(self.values.model_file)
         self._background = Background(self)
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
@@ -39,11 +48,22 @@ class PositionerNode(RoleNode):
         self._codebook = CodebookSource(
             self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
 
+    @staticmethod
+    def _check_model(file: str) -> None:
+        """Refuse to start without a model; whether it fits a codebook shows later."""
+        try:
+            Network.load(file)
+        except ModelError as error:
+            raise ParameterError(f'model_file: {error}') from None
+
     def _make(self, codebook: Codebook) -> Estimator:
-        folder = self.values.table_folder
-        return make_estimator(
-            self.values.estimator, self.scenario, codebook,
-            table_folder=Path(folder) if folder else default_folder())
+        values = self.values
+        if values.estimator == NeuralEstimator.name:
+            options = {'model_file': values.model_file}
+        else:
+            folder = Path(values.table_folder) if values.table_folder else default_folder()
+            options = {'table_folder': folder}
+        return make_estimator(values.estimator, self.scenario, codebook, **options)
 
     def perform(self, action: Action) -> None:
         """Make an estimator, in the background.

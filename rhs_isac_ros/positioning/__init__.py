@@ -9,14 +9,18 @@ from rhs_isac_ros.positioning.bayes import BayesEstimator
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError
 from rhs_isac_ros.positioning.exhaustive import exhaustive_posterior
 from rhs_isac_ros.positioning.ml import MlEstimator
+from rhs_isac_ros.positioning.network import ModelError, Network
+from rhs_isac_ros.positioning.neural import NeuralEstimator
 from rhs_isac_ros.positioning.simulate import simulate_pairs
+from rhs_isac_ros.positioning.training import train
 
 ESTIMATORS: Mapping[str, type] = {
-    kind.name: kind for kind in (BayesEstimator, MlEstimator)}
+    kind.name: kind for kind in (BayesEstimator, MlEstimator, NeuralEstimator)}
 
 __all__ = [
-    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator', 'SignalError',
-    'exhaustive_posterior', 'make_estimator', 'simulate_pairs',
+    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator', 'ModelError',
+    'Network', 'NeuralEstimator', 'SignalError', 'exhaustive_posterior', 'make_estimator',
+    'simulate_pairs', 'train',
 ]
 
 
@@ -33,7 +37,8 @@ def make_estimator(
     codebook
         The codebook with which the signals are taken.
     **options
-        Options of that estimator.
+        Options of that estimator: ``table_folder`` of `bayes` and `ml`, where tables are kept;
+        ``model_file`` of `neural`, what `train` returns or its file.
 
     Returns
     -------
@@ -44,6 +49,8 @@ def make_estimator(
     ------
     ValueError
         If there is no estimator of that name.
+    ModelError
+        If a model cannot be read or is one of another codebook or scenario.
     CodebookError
         If the codebook does not fit the scenario.
     """

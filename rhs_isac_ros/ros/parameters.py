@@ -114,6 +114,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS)),
         Parameter('table_folder', '',
                   "Where tables are kept between runs; empty: the user's folder for caches."),
+        Parameter('model_file', '', 'Trained model; the estimator neural needs one.'),
     ),
     'transmission': (
         SCENARIO,

@@ -1,0 +1,99 @@
+"""Train the network of the estimator `neural` for a codebook and write it as a model file."""
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning.training import (
+    DEFAULT_EPOCHS,
+    DEFAULT_HIDDEN,
+    DEFAULT_PAIRS,
+    Epoch,
+    train,
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Parameters
+    ----------
+    arguments
+        Command line; by default the process's.
+
+    Returns
+    -------
+    int
+        Exit code: 0; 2 if an argument or a file is wrong; 130 after Ctrl-C, with nothing written.
+    """
+    parser = argparse.ArgumentParser(
+        prog='python -m rhs_isac_ros.positioning', description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    add = parser.add_argument
+    add('--codebook', type=Path, required=True, help='codebook file')
+    add('--scenario', type=Path,
+        help="YAML file of the scenario; the paper's Table I if none is given")
+    add('--pairs', type=int, default=DEFAULT_PAIRS,
+        help='simulated pairs for training, validation and test, 7 : 1.5 : 1.5')
+    add('--hidden', type=int, default=DEFAULT_HIDDEN, help='units of the hidden layer')
+    add('--epochs', type=int, default=DEFAULT_EPOCHS, help='passes through the pairs at most')
+    add('--seed', type=int, default=0, help='seeds pairs, first weights and order')
+    add('--output', type=Path, default=Path('model.npz'),
+        help='file to write; it is replaced at the end')
+    add('--quiet', action='store_true', help='show no progress')
+    try:
+        _run(parser.parse_args(arguments))
+    except KeyboardInterrupt:
+        return 130
+    # Those of scenario and codebook are among them.
+    except (ValueError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def _run(options: argparse.Namespace) -> None:
+    output = options.output
+    if not os.access(output.parent, os.W_OK):
+        raise OSError(f'{output}: expected a file in a directory that can be written')
+    scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+    codebook = Codebook.load(options.codebook)
+    with _bar(options) as show:
+        network = train(scenario, codebook, options.pairs, options.seed, options.hidden,
+                        options.epochs, show)
+    network.save(output)
+    about = network.about
+    print(f'{output}: codebook {codebook.id}, {about["epochs"]} epochs; mean squared error '
+          f'{about["validation_mse_m2"]:.3f} m^2 in validation, {about["test_mse_m2"]:.3f} m^2 '
+          'in the test')
+
+
+@contextlib.contextmanager
+def _bar(options: argparse.Namespace) -> Iterator[Callable[[Epoch], None] | None]:
+    """Function that shows progress: a bar, or lines where its library is missing."""
+    if options.quiet:
+        yield None
+        return
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        yield lambda epoch: print(_text(epoch), file=sys.stderr)
+        return
+    with tqdm(total=options.epochs, unit='epoch') as bar:
+        def show(epoch: Epoch) -> None:
+            bar.set_description(_text(epoch), refresh=False)
+            bar.update(epoch.number - bar.n)
+        yield show
+
+
+def _text(epoch: Epoch) -> str:
+    return f'epoch {epoch.number}: {epoch.validation_mse_m2:.3f} m^2'
+
+
+if __name__ == '__main__':
+    sys.exit(main())
