@@ -51,6 +51,9 @@ class PositionerNode(RoleNode):
     @staticmethod
     def _check_model(file: str) -> None:
         """Refuse to start without a model; whether it fits a codebook shows later."""
+        if not file:
+            raise ParameterError(
+                "model_file: '', expected a trained model for the estimator neural")
         try:
             Network.load(file)
         except ModelError as error:

@@ -1,6 +1,7 @@
 """The node of the positioner: estimators made in the background."""
 
 import threading
+import types
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.nodes import positioner
 from rhs_isac_ros.nodes.positioner import PositionerNode
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros import convert
@@ -25,10 +26,17 @@ def codebooks(small_files):
 
 
 @pytest.fixture
-def node(bench, small_files, tmp_path):
+def values():
+    """Parameters besides those of every test."""
+    return {}
+
+
+@pytest.fixture
+def node(bench, small_files, tmp_path, values):
+    values = {'scenario_file': str(small_files / 'scenario.yaml'),
+              'table_folder': str(tmp_path / 'tables'), **values}
     return bench.add(PositionerNode, parameter_overrides=[
-        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
-        Parameter('table_folder', value=str(tmp_path / 'tables'))])
+        Parameter(name, value=value) for name, value in values.items()])
 
 
 @pytest.fixture
@@ -111,3 +119,41 @@ def test_without_a_fix_it_says_so(bench, node, send, codebooks):
     assert [message.cycle_id for message in estimates] == [3]
     assert 'energy' in told[0].reason
     assert 'misfit' in told[1].reason
+
+
+class TestNeural:
+    """A node with a model of the first codebook."""
+
+    @pytest.fixture
+    def model(self, small, codebooks):
+        n_parts = 2 * codebooks[0].digital[..., 0].size
+        return Network(
+            np.zeros(n_parts), np.ones(n_parts), np.zeros((n_parts, 1)), np.ones(1),
+            np.array([[1.0, 0.5, 0.25]]), np.zeros(3), np.array([8.0, 0.0, 0.0]),
+            2 * np.eye(3), 1e4,
+            {'codebook': codebooks[0].id, 'scenario': small.scenario.changes()})
+
+    @pytest.fixture
+    def values(self, tmp_path, model):
+        model.save(tmp_path / 'model.npz')
+        return {'estimator': 'neural', 'model_file': str(tmp_path / 'model.npz')}
+
+    def test_it_estimates_with_its_model_and_refuses_another_codebook(
+            self, bench, node, send, codebooks, monkeypatch):
+        said = []
+        monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
+            info=said.append, warning=said.append))
+        estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+        node.tell(CodebookOffered(codebooks[0]))
+        send(1)
+        bench.until(lambda: len(estimates) == 1)
+        node.tell(CodebookOffered(codebooks[1]))
+        bench.until(lambda: len(said) == 2)
+        assert f'no estimator for codebook {codebooks[1].id}: ' in said[1]
+        assert f'model.npz: trained for codebook {codebooks[0].id}, expected' in said[1]
+        send(2, 1)
+        send(3)
+        bench.until(lambda: len(estimates) == 2)
+        assert [(e.cycle_id, e.estimator) for e in estimates] == [(1, 'neural'), (3, 'neural')]
+        np.testing.assert_array_equal(estimates[1].position, [9.0, 0.5, 0.25])
+        np.testing.assert_array_equal(estimates[1].covariance_m2, 2 * np.eye(3))
