@@ -60,11 +60,12 @@ def main() -> None:
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
         return
     positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
-    times_s, estimates = [], []
+    times_s, busy_s, estimates = [], [], []
     for signals in received:
-        begin = time.perf_counter()
+        begin, busy = time.perf_counter(), time.process_time()
         estimates.append(estimator.estimate(signals))
         times_s.append(time.perf_counter() - begin)
+        busy_s.append(time.process_time() - busy)
     print(f'estimator {options.estimator}, codebook {codebook.id}, {options.positions} positions, '
           f'seed {options.seed}')
     print_accuracy(estimates, positions)
@@ -73,7 +74,8 @@ def main() -> None:
         print_ratio(exhausted(scenario, codebook, received, options.reference), estimates,
                     positions)
     print(f'time of a fix        {1e3 * np.median(times_s):.1f} ms median, '
-          f'{1e3 * np.quantile(times_s, 0.99):.1f} ms 99th percentile')
+          f'{1e3 * np.quantile(times_s, 0.99):.1f} ms 99th percentile, '
+          f'{1e3 * np.median(busy_s):.1f} ms of a processor')
     print(f'time to get ready    {ready_s:.1f} s, tables built')
     print_loading(settings)
 
@@ -118,7 +120,7 @@ def exhausted(scenario: Scenario, codebook: Codebook, received: np.ndarray,
               log2_points: int) -> Estimate:
     """Weigh the posterior everywhere, with a progress bar."""
     with tqdm(total=1.0, bar_format='{percentage:3.0f} % |{bar}| {remaining} left',
-              leave=False) as bar:
+              leave=False, disable=None) as bar:
         return exhaustive_posterior(
             scenario, codebook, received, log2_points, lambda share: bar.update(share - bar.n))
 

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from rhs_isac_ros.model import Scenario, mean_received, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning.polar import to_polar
 from rhs_isac_ros.positioning.table import TemplateTable, separate
-from rhs_isac_ros.positioning.templates import DIRECTION_STEP, RANGE_CELL_M, polar_grid, tabulate
+from rhs_isac_ros.positioning.templates import RANGE_CELL_M, tabulate
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
@@ -38,26 +37,6 @@ def test_range_steps_resolve_the_shortest_wavelength(scenario, table):
     assert RANGE_CELL_M - (offsets[-1] - offsets[0]) <= quarter
     ranges = np.unique(table.points[:, 0])
     np.testing.assert_allclose(np.diff(ranges), RANGE_CELL_M)
-
-
-@pytest.mark.parametrize('region', [
-    {'roi_center_m': (5, 1, 0.5), 'roi_size_m': (4, 4, 2)},
-    {},
-    # Wide angles: a step of direction spans much depth there.
-    {'roi_center_m': (3, 0, 0), 'roi_size_m': (5, 14, 6)},
-    # So near that ranges reach almost zero.
-    {'roi_center_m': (1, 0, 0), 'roi_size_m': (1.9, 2, 2)},
-], ids=['small', 'Table I', 'wide', 'near'])
-def test_grid_covers_the_region(region):
-    """Every position has a grid point within half a step in range and direction."""
-    scenario = Scenario(n_subbands=1, n_frames=2, elements_per_side=2, **region)
-    points = polar_grid(scenario)
-    steps = np.array([RANGE_CELL_M, DIRECTION_STEP, DIRECTION_STEP])
-    wanted = to_polar(scenario.sample_positions(4000, np.random.default_rng(1))) / steps
-    distance, _ = cKDTree(points / steps).query(wanted, p=np.inf)
-    # At the rim of the half space and at the range 0 the grid is not regular.
-    assert distance.max() < 0.76
-    assert np.mean(distance < 0.5 + 1e-9) > 0.98
 
 
 def exact_log_likelihood(plain, model, received, points):
