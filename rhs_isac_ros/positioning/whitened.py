@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import factor, mean_derivative
+from rhs_isac_ros.bounds.fisher import factor
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, mean_received
 from rhs_isac_ros.model.geometry import element_positions
@@ -31,8 +31,8 @@ class WhitenedModel:
     def __init__(self, scenario: Scenario, codebook: Codebook) -> None:
         codebook.check(scenario)
         self.scenario, self.codebook = scenario, codebook
-        self._patterns, self._whiteners = factor(scenario, codebook)
-        self._moments = _moments(scenario, self._patterns)
+        patterns, self._whiteners = factor(scenario, codebook)
+        self._frames, self._moments = _weights(scenario, patterns)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -82,24 +82,28 @@ class WhitenedModel:
         tuple of numpy.ndarray
             Complex128 [N, N_B, N_SB F] and [N, 3, N_B, N_SB F] [1/m].
         """
-        n, n_rows = len(positions), self._whiteners.shape[1]
-        n_bands, n_subbands = self.scenario.n_bands, self.scenario.n_subbands
+        n, (n_bands, n_rows) = len(positions), self.shape
         mean = np.empty((n, n_bands, n_rows), complex)
         slopes = np.empty((n, 3, n_bands, n_rows), complex)
         for band, whitener in enumerate(self._whiteners):
             gain, rate = los_and_rate(self.scenario, positions, band)
-            mean[:, band] = mean_derivative(gain[:, None], self._patterns[band])[:, 0] @ whitener.T
-            # The sum over the elements of a T (p - p_m), with p drawn out.
-            sums = mean_derivative(rate[:, None], self._moments[band])
-            sums = np.moveaxis(sums.reshape(n, n_subbands, 4, -1), 2, 1).reshape(n, 4, n_rows)
-            by_position = positions[:, :, None] * sums[:, :1] - sums[:, 1:]
-            slopes[:, :, band] = by_position @ whitener.T
+            frames, moments = self._frames[band], self._moments[band]
+            sums = np.matmul(gain.transpose(1, 0, 2), frames).transpose(1, 0, 2)
+            mean[:, band] = sums.reshape(n, n_rows) @ whitener.T
+            # Eq. (14) with p - p_m drawn out: the sum over the elements of a T (p - p_m).
+            sums = np.matmul(rate.transpose(1, 0, 2), moments)
+            sums = sums.reshape(-1, n, 4, frames.shape[2]).transpose(2, 1, 0, 3)
+            sums = sums.reshape(4, n, n_rows)
+            by_position = positions.T[:, :, None] * sums[0] - sums[1:]
+            whitened = by_position.reshape(3 * n, n_rows) @ whitener.T
+            slopes[:, :, band] = whitened.reshape(3, n, n_rows).transpose(1, 0, 2)
         return mean, slopes
 
 
-def _moments(scenario: Scenario, patterns: np.ndarray) -> np.ndarray:
-    """Patterns alone and times each coordinate of the elements: [N_B, N_SB 4 F, N_E]."""
-    weights = np.vstack([np.ones(scenario.n_elements), element_positions(scenario).T])
-    frames = patterns.reshape(scenario.n_bands, scenario.n_subbands, 1, -1, scenario.n_elements)
-    weighted = frames * weights[:, None, :]
-    return weighted.reshape(scenario.n_bands, -1, scenario.n_elements)
+def _weights(scenario: Scenario, patterns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patterns, [N_B, N_SB, N_E, F]; the same and times element coordinates, [..., 4 F]."""
+    shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
+    frames = np.ascontiguousarray(np.swapaxes(patterns.reshape(shape), 2, 3))
+    coordinates = np.hstack([np.ones((scenario.n_elements, 1)), element_positions(scenario)])
+    moments = coordinates[:, :, None] * frames[..., None, :]
+    return frames, moments.reshape(*frames.shape[:3], -1)
