@@ -1,8 +1,9 @@
 """Training of the paper's network: 10^5 simulated pairs, split 7 : 1.5 : 1.5.
 
 What the paper leaves open is chosen here: 512 rectified hidden units, the squared error in metres
-as the loss, Adam with a step of 10^-3 and batches of 256 pairs, stopped when the validation error
-has not fallen for some epochs; the weights of the best epoch count.
+as the loss, and Adam with a step of 10^-3. When the validation error has not fallen for some
+epochs the batches grow, which calms the steps; after the largest ones training stops, and the
+weights of the best epoch count.
 """
 
 import copy
@@ -21,12 +22,12 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 DEFAULT_PAIRS = 100_000
 DEFAULT_HIDDEN = 512
-DEFAULT_EPOCHS = 100
-_BATCH = 256
+DEFAULT_EPOCHS = 150
+_BATCHES = (128, 1024, 8192)
 _STEP = 1e-3
-_PATIENCE = 8
-# Shares of the pairs for training and validation; the rest is the test.
-_TRAINING, _VALIDATION = 0.7, 0.15
+_PATIENCE = 4
+# Per cent of the pairs for training and validation; the rest is the test.
+_TRAINING, _VALIDATION = 70, 15
 
 
 class Epoch(NamedTuple):
@@ -90,9 +91,9 @@ def train(
         if value < least:
             raise ValueError(f'{name}: {value}, expected at least {least}')
     begin = time.monotonic()
-    regressor = _regressor(n_hidden, n_pairs, seed)
+    regressor = _regressor(n_hidden, seed)
     positions, received = simulate_pairs(scenario, codebook, n_pairs, seed)
-    first, second = int(_TRAINING * n_pairs), int((_TRAINING + _VALIDATION) * n_pairs)
+    first, second = n_pairs * _TRAINING // 100, n_pairs * (_TRAINING + _VALIDATION) // 100
     parts, center = real_parts(received), scenario.roi_bounds_m.mean(axis=0)
     mean, scale = parts[:first].mean(axis=0), parts[:first].std(axis=0)
     # One unit for all coordinates, so that the loss is the squared error.
@@ -103,32 +104,53 @@ def train(
     def residuals(subset: slice) -> np.ndarray:
         return (regressor.predict(inputs[subset]) - targets[subset]).astype(float) * unit
 
-    best, best_mse, best_epoch = None, np.inf, 0
-    for number in range(1, max_epochs + 1):
-        regressor.partial_fit(inputs[:first], targets[:first])
-        mse = float(np.mean(np.sum(residuals(slice(first, second))**2, axis=1)))
-        if mse < best_mse:
-            best, best_mse, best_epoch = copy.deepcopy(
-                (regressor.coefs_, regressor.intercepts_)), mse, number
+    def after_epoch(number: int, best: float) -> float:
+        mse = _mean_square(residuals(slice(first, second)))
         if progress:
-            progress(Epoch(number, mse, best_mse, time.monotonic() - begin))
-        if number - best_epoch >= _PATIENCE:
-            break
-    regressor.coefs_, regressor.intercepts_ = best
+            progress(Epoch(number, mse, min(mse, best), time.monotonic() - begin))
+        return mse
+
+    best_epoch, best_mse = _descend(
+        regressor, inputs[:first], targets[:first], max_epochs, after_epoch)
     errors, tests = residuals(slice(first, second)), residuals(slice(second, None))
     (w_in, w_out), (b_in, b_out) = (
-        [array.astype(float) for array in arrays] for arrays in best)
+        [array.astype(float) for array in arrays]
+        for arrays in (regressor.coefs_, regressor.intercepts_))
     return Network(
         input_mean=mean, input_scale=scale, w_in=w_in, b_in=b_in, w_out=w_out * unit,
         b_out=b_out * unit, center=center, covariance=errors.T @ errors / len(errors),
         loudest=_loudest(scenario, codebook, positions), about={
             'codebook': codebook.id, 'scenario': scenario.changes(), 'seed': seed,
             'pairs': n_pairs, 'epochs': best_epoch, 'version': __version__,
-            'validation_mse_m2': best_mse,
-            'test_mse_m2': float(np.mean(np.sum(tests**2, axis=1)))})
+            'validation_mse_m2': best_mse, 'test_mse_m2': _mean_square(tests)})
 
 
-def _regressor(n_hidden: int, n_pairs: int, seed: int) -> Any:
+def _descend(
+        regressor: Any, inputs: np.ndarray, targets: np.ndarray, max_epochs: int,
+        after_epoch: Callable[[int, float], float]) -> tuple[int, float]:
+    """Fit epoch after epoch and leave the best weights; returns their epoch and error.
+
+    `after_epoch` takes number and least error so far, and returns the epoch's.
+    """
+    best, best_mse, best_epoch, since = None, np.inf, 0, 0
+    sizes = [min(size, len(inputs)) for size in _BATCHES]
+    regressor.set_params(batch_size=sizes.pop(0))
+    for number in range(1, max_epochs + 1):
+        regressor.partial_fit(inputs, targets)
+        mse = after_epoch(number, best_mse)
+        if mse < best_mse:
+            best = copy.deepcopy((regressor.coefs_, regressor.intercepts_))
+            best_mse, best_epoch, since = mse, number, number
+        if number - since >= _PATIENCE:
+            if not sizes:
+                break
+            regressor.set_params(batch_size=sizes.pop(0))
+            since = number
+    regressor.coefs_, regressor.intercepts_ = best
+    return best_epoch, best_mse
+
+
+def _regressor(n_hidden: int, seed: int) -> Any:
     try:
         from sklearn.neural_network import MLPRegressor
     except ImportError:
@@ -137,8 +159,11 @@ def _regressor(n_hidden: int, n_pairs: int, seed: int) -> Any:
     state = int(streams.generator(seed, streams.TRAINING).integers(2**32))
     return MLPRegressor(
         hidden_layer_sizes=(n_hidden,), activation='relu', solver='adam', alpha=0.0,
-        learning_rate_init=_STEP, batch_size=min(_BATCH, int(_TRAINING * n_pairs)),
-        random_state=state)
+        learning_rate_init=_STEP, random_state=state)
+
+
+def _mean_square(errors: np.ndarray) -> float:
+    return float(np.mean(np.sum(errors**2, axis=1)))
 
 
 def _loudest(scenario: Scenario, codebook: Codebook, positions: np.ndarray) -> float:
