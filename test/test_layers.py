@@ -19,7 +19,8 @@ PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)
 LIBRARIES = {'numpy', 'scipy', 'yaml'}
 # What they may import inside functions that say so where it is missing: only pictures, the
 # genetic algorithm, the training of networks and experiments need these.
-OPTIONAL = {'distributed', 'joblib', 'matplotlib', 'pymoo', 'sklearn', 'tqdm'}
+OPTIONAL = {
+    'distributed', 'joblib', 'matplotlib', 'pymoo', 'sklearn', 'threadpoolctl', 'tqdm'}
 ROOT = Path(rhs_isac_ros.__file__).parent
 MODULES = sorted(ROOT.rglob('*.py'))
 MOST_LINES = 299

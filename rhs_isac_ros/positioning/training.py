@@ -91,7 +91,7 @@ def train(
         if value < least:
             raise ValueError(f'{name}: {value}, expected at least {least}')
     begin = time.monotonic()
-    regressor = _regressor(n_hidden, seed)
+    regressor, limit_threads = _regressor(n_hidden, seed)
     positions, received = simulate_pairs(scenario, codebook, n_pairs, seed)
     first, second = n_pairs * _TRAINING // 100, n_pairs * (_TRAINING + _VALIDATION) // 100
     parts, center = real_parts(received), scenario.roi_bounds_m.mean(axis=0)
@@ -110,8 +110,10 @@ def train(
             progress(Epoch(number, mse, min(mse, best), time.monotonic() - begin))
         return mse
 
-    best_epoch, best_mse = _descend(
-        regressor, inputs[:first], targets[:first], max_epochs, after_epoch)
+    # One thread: more of them round otherwise, and hinder each other on such small products.
+    with limit_threads(1):
+        best_epoch, best_mse = _descend(
+            regressor, inputs[:first], targets[:first], max_epochs, after_epoch)
     errors, tests = residuals(slice(first, second)), residuals(slice(second, None))
     (w_in, w_out), (b_in, b_out) = (
         [array.astype(float) for array in arrays]
@@ -150,16 +152,19 @@ def _descend(
     return best_epoch, best_mse
 
 
-def _regressor(n_hidden: int, seed: int) -> Any:
+def _regressor(n_hidden: int, seed: int) -> tuple[Any, Any]:
+    """Return the untrained network, and what limits the threads of its products."""
     try:
         from sklearn.neural_network import MLPRegressor
+        from threadpoolctl import threadpool_limits
     except ImportError:
         raise ValueError('training needs scikit-learn, which is not installed '
                          '(pip install scikit-learn)') from None
     state = int(streams.generator(seed, streams.TRAINING).integers(2**32))
-    return MLPRegressor(
+    regressor = MLPRegressor(
         hidden_layer_sizes=(n_hidden,), activation='relu', solver='adam', alpha=0.0,
         learning_rate_init=_STEP, random_state=state)
+    return regressor, threadpool_limits
 
 
 def _mean_square(errors: np.ndarray) -> float:
