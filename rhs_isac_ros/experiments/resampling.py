@@ -27,7 +27,7 @@ def reduction(
     Returns
     -------
     tuple of float
-        The reduction and the ends of its interval [%].
+        The reduction and the ends of its interval [%]; NaN or infinite where theirs is 0.
 
     Raises
     ------
@@ -41,6 +41,7 @@ def reduction(
     rng = np.random.default_rng(0)
     picks = rng.integers(len(ours), size=(_RESAMPLES, len(ours)))
     others = picks if paired else rng.integers(len(theirs), size=(_RESAMPLES, len(theirs)))
-    samples = 1 - statistic(ours[picks]) / statistic(theirs[others])
-    low, high = np.percentile(100 * samples, _INTERVAL)
-    return 100 * float(1 - statistic(ours) / statistic(theirs)), float(low), float(high)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        samples = 1 - statistic(ours[picks]) / statistic(theirs[others])
+        low, high = np.percentile(100 * samples, _INTERVAL)
+        return 100 * float(1 - statistic(ours) / statistic(theirs)), float(low), float(high)

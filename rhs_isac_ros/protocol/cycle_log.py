@@ -10,7 +10,8 @@ from rhs_isac_ros.protocol import messages as m
 # Cycles that may still lack a message; of older ones it does not come any more.
 _MOST_OPEN = 16
 # Messages that the log needs.
-RECEIVES = (m.Beacon, m.GroundTruth, m.PositionEstimate, m.Capacity, m.ProtocolState)
+RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity,
+            m.ProtocolState)
 
 
 @dataclasses.dataclass
@@ -29,7 +30,7 @@ class CycleRecord:
         When the end was seen [s]; NaN before.
     outcome
         ``served``, or why the cycle was given up; empty while it runs.
-    truth, estimate, capacity
+    truth, signals, estimate, capacity
         The messages of the cycle, None if not seen.
     """
 
@@ -40,13 +41,14 @@ class CycleRecord:
     ended_s: float = math.nan
     outcome: str = ''
     truth: m.GroundTruth | None = None
+    signals: m.ReceivedSignals | None = None
     estimate: m.PositionEstimate | None = None
     capacity: m.Capacity | None = None
 
     @property
     def complete(self) -> bool:
         """Whether the cycle was served and every message of it was seen."""
-        parts = (self.truth, self.estimate, self.capacity)
+        parts = (self.truth, self.signals, self.estimate, self.capacity)
         return self.outcome == 'served' and all(part is not None for part in parts)
 
     @property
@@ -106,6 +108,8 @@ class CycleLog:
         match message:
             case m.GroundTruth():
                 record.truth = message
+            case m.ReceivedSignals():
+                record.signals = message
             case m.PositionEstimate():
                 record.estimate = message
             case m.Capacity():

@@ -63,9 +63,12 @@ class Processes:
         **parameters
             ROS parameters.
         """
-        name = name or executable
         program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
-        command = [str(program), '--ros-args', '-r', f'__node:={name}']
+        command = [str(program), '--ros-args']
+        # Without a name, none is remapped: an executable may have many nodes.
+        if name:
+            command += ['-r', f'__node:={name}']
+        name = name or executable
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']

@@ -42,3 +42,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say():
 def test_samples_that_cannot_be_compared_are_an_error(ours, theirs, paired):
     with pytest.raises(ValueError, match='^ours, theirs: '):
         reduction(ours, theirs, mean, paired)
+
+
+def test_nothing_is_less_than_zero():
+    assert np.isnan(reduction([0.0, 0.0], [0.0, 0.0], mean)).all()

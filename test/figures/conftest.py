@@ -12,6 +12,9 @@ FOLDER = Path(__file__).parents[2] / 'scripts' / 'figures'
 @pytest.fixture(scope='session')
 def load_figure():
     """Function that imports a script by its name."""
+    # As Python does for a script that is started: its parts lie beside it.
+    sys.path.insert(0, str(FOLDER))
+
     def load(name):
         spec = importlib.util.spec_from_file_location(f'figures_{name}', FOLDER / f'{name}.py')
         module = importlib.util.module_from_spec(spec)

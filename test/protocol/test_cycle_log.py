@@ -82,7 +82,8 @@ def test_a_running_cycle_is_neither(network):
     assert log.complete == log.given_up == []
 
 
-@pytest.mark.parametrize('kind', [m.GroundTruth, m.PositionEstimate, m.Capacity])
+@pytest.mark.parametrize('kind', [
+    m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity])
 def test_a_served_cycle_that_lacks_a_message_waits_for_it(network, kind):
     net = network()
     net.run_cycles(1)
