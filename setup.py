@@ -37,6 +37,7 @@ setup(
     install_requires=['setuptools'],
     extras_require={
         'experiments': ['dask', 'distributed', 'joblib'],
+        'neural': ['scikit-learn'],
         'genetic': ['pymoo'],
         'test': ['pytest'],
     },

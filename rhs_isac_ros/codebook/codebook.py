@@ -4,8 +4,6 @@ import dataclasses
 import functools
 import hashlib
 import math
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 import yaml
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.shapes import check_shape
 
 # Node that owns the parameters of a codebook file, in any namespace.
@@ -200,16 +199,7 @@ class Codebook:
         values = {name.partition('.')[2]: value for name, value in self.to_parameters().items()}
         content = {PARAMETER_NODE: {'ros__parameters': {'codebook': values}}}
         text = yaml.safe_dump(content, sort_keys=False, width=95, default_flow_style=None)
-        path = Path(path)
-        descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-        try:
-            with os.fdopen(descriptor, 'w', encoding='utf-8') as stream:
-                stream.write(text)
-            os.chmod(aside, 0o644)
-            os.replace(aside, path)
-        except BaseException:
-            os.unlink(aside)
-            raise
+        write_whole(path, text)
 
     @classmethod
     def load(cls, path: str | Path) -> 'Codebook':

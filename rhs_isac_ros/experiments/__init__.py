@@ -4,10 +4,10 @@ from rhs_isac_ros.experiments.command import parse_options, positive, run_comman
 from rhs_isac_ros.experiments.jobs import Job, JobError
 from rhs_isac_ros.experiments.libraries import MissingLibraryError
 from rhs_isac_ros.experiments.report import markdown_table, mean_and_std, plus_minus
-from rhs_isac_ros.experiments.store import ResultStore, write_whole
+from rhs_isac_ros.experiments.store import ResultStore
 from rhs_isac_ros.experiments.trials import run_jobs
 
 __all__ = [
     'Job', 'JobError', 'MissingLibraryError', 'ResultStore', 'markdown_table', 'mean_and_std',
-    'parse_options', 'plus_minus', 'positive', 'run_command', 'run_jobs', 'write_whole',
+    'parse_options', 'plus_minus', 'positive', 'run_command', 'run_jobs',
 ]

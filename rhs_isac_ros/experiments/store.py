@@ -1,41 +1,13 @@
 """A folder with the result of each finished job."""
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.experiments.jobs import Job
-
-
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file aside and rename it: at no time is it there in part.
-
-    Parameters
-    ----------
-    path
-        The file.
-    content
-        All of it.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; an old file is kept.
-    """
-    data = content.encode() if isinstance(content, str) else content
-    descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-    try:
-        with os.fdopen(descriptor, 'wb') as stream:
-            stream.write(data)
-        os.chmod(aside, 0o644)
-        os.replace(aside, path)
-    except BaseException:
-        os.unlink(aside)
-        raise
+from rhs_isac_ros.model.files import write_whole
 
 
 class ResultStore:

@@ -2,13 +2,13 @@
 
 import dataclasses
 import json
-import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from rhs_isac_ros.model.files import write_whole
 
 _FORMAT = 1
 
@@ -98,18 +98,9 @@ class Network:
         OSError
             If the file cannot be written; the old one is kept.
         """
-        path = Path(path)
         arrays = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         arrays['about'] = json.dumps({'format': _FORMAT, **self.about})
-        descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-        try:
-            with os.fdopen(descriptor, 'wb') as stream:
-                np.savez(stream, **arrays)
-            os.chmod(aside, 0o644)
-            os.replace(aside, path)
-        except BaseException:
-            os.unlink(aside)
-            raise
+        write_whole(path, lambda stream: np.savez(stream, **arrays))
 
     @classmethod
     def load(cls, path: str | Path) -> 'Network':

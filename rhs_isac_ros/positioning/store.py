@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import hashlib
 import os
-import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros import __version__
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import templates
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
@@ -99,14 +99,7 @@ def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
     record['key'] = key.encode()
     record['digest'] = _digest(record)
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-    try:
-        with os.fdopen(descriptor, 'wb') as stream:
-            np.save(stream, record, allow_pickle=False)
-        os.replace(aside, path)
-    except BaseException:
-        os.unlink(aside)
-        raise
+    write_whole(path, lambda stream: np.save(stream, record, allow_pickle=False))
     _prune(path.parent)
 
 

@@ -41,10 +41,10 @@ from rhs_isac_ros.experiments import (
     positive,
     run_command,
     run_jobs,
-    write_whole,
 )
 from rhs_isac_ros.experiments.libraries import needed_for
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.files import write_whole
 
 BANDS = (1, 2, 4, 8)
 FRAMES_IN_ALL = 8

@@ -35,19 +35,19 @@ from rhs_isac_ros.experiments import (
     positive,
     run_command,
     run_jobs,
-    write_whole,
 )
 from rhs_isac_ros.experiments.libraries import needed_for
 from rhs_isac_ros.link import capacity, choose_beam
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import NeuralEstimator, make_estimator
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.training import train
 
 CONFIG = Path(__file__).parents[2] / 'config'
 TRIALS, QUICK_TRIALS = 50, 3
-PAIRS, QUICK_PAIRS = 100_000, 10_000
-POSITIONS, QUICK_POSITIONS = 1000, 200
+PAIRS, QUICK_PAIRS = 100_000, 20_000
+POSITIONS, QUICK_POSITIONS = 1000, 500
 # Positions of a job of (b), and of a call of an estimator.
 BLOCK = 50
 # The sequence of pairs that all are measured on; trainings draw others.

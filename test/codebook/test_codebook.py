@@ -245,20 +245,17 @@ def test_any_node_of_a_parameter_file_may_hold_the_codebook(small, tmp_path):
     assert Codebook.load(path).id == small.codebook.id
 
 
-@pytest.mark.parametrize('failing', ['replace', 'chmod', 'fdopen'])
-def test_a_failing_write_keeps_the_old_file_alone(small, tmp_path, monkeypatch, failing):
+def test_a_failing_write_keeps_the_old_file_alone(small, tmp_path, monkeypatch):
     path = tmp_path / 'codebook.yaml'
     small.codebook.save(path)
     before = path.read_bytes()
     other = Codebook(1 - small.codebook.analog, small.codebook.digital)
 
-    def fail(*args, **kwargs):
-        if failing == 'fdopen':
-            os.close(args[0])
+    def fail(*args):
         raise OSError('no space left')
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, failing, fail)
+        patch.setattr(os, 'replace', fail)
         with pytest.raises(OSError, match='no space left'):
             other.save(path)
     assert path.read_bytes() == before

@@ -16,9 +16,10 @@ from rclpy.signals import SignalHandlerOptions
 from tqdm import tqdm
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.experiments import JobError, markdown_table, write_whole
+from rhs_isac_ros.experiments import JobError, markdown_table
 from rhs_isac_ros.link import choose_beam, outcome
 from rhs_isac_ros.model import Scenario, simulate_received
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.nodes.demo import watch
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol.cycle_log import CycleRecord
