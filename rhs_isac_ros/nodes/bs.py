@@ -1,6 +1,7 @@
 """The executable ``bs``: the base station."""
 
 import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,8 @@ class BsNode(RoleNode):
         roster = Roster(
             values.policy, streams.generator(values.seed, streams.BASE_STATION))
         self.start(BaseStation(
-            self.scenario, roster, self._receive, timeouts_s, values.data_duration_s), RECEIVES)
+            self.scenario, roster, self._receive, timeouts_s, values.data_duration_s,
+            values.first_cycle or _number_from_the_clock()), RECEIVES)
         self._codebook = CodebookSource(
             self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
         self._peers = peers.PeerWatch(
@@ -46,6 +48,11 @@ class BsNode(RoleNode):
         if self.values.receiver_noise:
             rng = streams.generator(self.values.seed, streams.RECEIVER, user, cycle_id)
         return receive_feeds(self.scenario, codebook, feeds, rng)
+
+
+def _number_from_the_clock() -> int:
+    """Milliseconds since 1970: cycles take longer, so no later life repeats a number."""
+    return time.time_ns() // 1_000_000
 
 
 main = entry(lambda: [BsNode()])

@@ -100,7 +100,8 @@ def start_network(
     for user in range(1, users + 1):
         processes.start('user', f'user_{user}', user_id=user, seed=seed, mobility='random_walk',
                         speed_mps=scenario.max_user_speed_mps, **common)
-    processes.start('bs', seed=seed, rest_s=rest_s, **common)
+    # With numbers from 1, a seed gives the same cycles again.
+    processes.start('bs', seed=seed, rest_s=rest_s, first_cycle=1, **common)
 
 
 def watch(

@@ -21,7 +21,7 @@ class RhsControllerNode(RoleNode):
 
     def _on_codebook(self, codebook: Any) -> None:
         self.tell(CodebookOffered(codebook))
-        self.listen((m.RhsCommand, m.Beam))
+        self.listen((m.Grant, m.RhsCommand, m.Beam))
 
 
 main = entry(lambda: [RhsControllerNode()])

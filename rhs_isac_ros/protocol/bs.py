@@ -37,6 +37,9 @@ class BaseStation(Machine):
         Time-outs by state; at least RESTING, the pause between cycles.
     data_duration_s
         How long each direction transmits data [s].
+    first_cycle_id
+        Number of the first cycle. One that starts anew must repeat no number of its former life:
+        what is still on its way would be taken for its own.
     """
 
     TABLE = TABLE
@@ -44,7 +47,8 @@ class BaseStation(Machine):
     def __init__(
             self, scenario: Scenario, roster: Roster,
             receiver: Callable[[Codebook, np.ndarray, int, int], np.ndarray],
-            timeouts_s: Mapping[State, float], data_duration_s: float) -> None:
+            timeouts_s: Mapping[State, float], data_duration_s: float,
+            first_cycle_id: int = 1) -> None:
         super().__init__(State.WAITING, timeouts_s)
         self._scenario, self._roster, self._receiver = scenario, roster, receiver
         self._data_duration_s = data_duration_s
@@ -52,7 +56,7 @@ class BaseStation(Machine):
         self._offered: Codebook | None = None
         self._missing: tuple[str, ...] | None = None
         self._complaint = ''
-        self._cycle_id = 0
+        self._cycle_id = first_cycle_id - 1
         self._attempt = 0
         self._user = 0
         self._band = 0

@@ -16,6 +16,8 @@ from rhs_isac_ros.protocol.role import PlainRole
 
 # Pilots and data that wait for what they need; more belong to no cycle that can be complete.
 _MOST_PENDING = 256
+# Cycles whose true position is known again when it comes late or doubled.
+_MOST_BEGUN = 8
 
 
 class _Cycle:
@@ -52,6 +54,7 @@ class Channel(PlainRole):
         super().__init__()
         self._scenario, self._seed = scenario, seed
         self._cycle: _Cycle | None = None
+        self._begun: collections.deque[tuple] = collections.deque(maxlen=_MOST_BEGUN)
         # What the surface reports and which beam it holds, of any cycle that may be coming.
         self._reports: dict[tuple[int, m.Mode, int], np.ndarray] = {}
         self._beams: dict[tuple[int, int], m.Beam] = {}
@@ -87,12 +90,12 @@ class Channel(PlainRole):
         return self._answer_pending()
 
     def _begin(self, truth: m.GroundTruth) -> None:
-        old = self._cycle.truth if self._cycle else None
         # The same cycle at another place is one of a base station that has started anew.
-        if old and (old.cycle_id, old.user) == (truth.cycle_id, truth.user) and np.array_equal(
-                old.position, truth.position):
+        key = truth.cycle_id, truth.user, *truth.position.tolist()
+        if key in self._begun:
             self.counters['duplicate'] += 1
             return
+        self._begun.append(key)
         self._cycle = _Cycle(self._scenario, truth, self._seed)
         for event in [e for e in self._pending if e.cycle_id != truth.cycle_id]:
             self._pending.remove(event)

@@ -1,5 +1,6 @@
 """The controller of the surface: applies configurations and reports them."""
 
+import collections
 import enum
 from collections.abc import Mapping
 
@@ -22,22 +23,33 @@ class Input(enum.Enum):
     """Names of what can happen to the controller."""
 
     CODEBOOK = 'codebook'
+    GRANT = 'grant'
     COMMAND = 'command'
+    STALE_COMMAND = 'stale_command'
+    DUPLICATE = 'duplicate'
     BEAM = 'beam'
     WRONG_CODEBOOK = 'wrong_codebook'
     WRONG_CYCLE = 'wrong_cycle'
+    WRONG_USER = 'wrong_user'
 
 
 S, I = State, Input  # noqa: E741
 
 TABLE: Mapping[tuple[State | None, Input], Step] = {
     (ANY, I.CODEBOOK): Step(SAME, ('keep',)),
+    (ANY, I.GRANT): Step(SAME, ('note_grant',)),
     (ANY, I.COMMAND): Step(S.POSITIONING, ('apply_band',)),
     (S.POSITIONING, I.BEAM): Step(S.TRANSMITTING, ('apply_beam',)),
     (S.TRANSMITTING, I.BEAM): Step(SAME, ('apply_beam',), counts='duplicate'),
+    # Who asks again may not have heard the answer.
+    (ANY, I.DUPLICATE): Step(SAME, ('apply_band',), counts='duplicate'),
+    (ANY, I.STALE_COMMAND): Step(SAME, counts='stale_command'),
     (ANY, I.WRONG_CODEBOOK): Step(SAME, ('complain',), counts='wrong_codebook'),
     (ANY, I.WRONG_CYCLE): Step(SAME, counts='wrong_cycle'),
+    (ANY, I.WRONG_USER): Step(SAME, counts='wrong_user'),
 }
+# Grants and commands that are known again when they come late or doubled.
+_MOST_KNOWN = 8
 
 
 class RhsController(Machine):
@@ -52,27 +64,54 @@ class RhsController(Machine):
         super().__init__(State.IDLE, {})
         self._codebooks: Shelf[Codebook] = Shelf()
         self._cycle_id = 0
+        self._granted: collections.deque[m.Grant] = collections.deque(maxlen=_MOST_KNOWN)
+        # Cycle, band and codebook of what was applied, the present one last.
+        self._applied: collections.deque[tuple[int, int, str]] = collections.deque(
+            maxlen=_MOST_KNOWN)
         self._complaint = ''
 
     def _classify(self, event: Event) -> Input:
         match event:
             case CodebookOffered():
                 return Input.CODEBOOK
+            case m.Grant():
+                return Input.GRANT
             case m.RhsCommand():
-                known = event.codebook_id in self._codebooks
-                return Input.COMMAND if known else Input.WRONG_CODEBOOK
+                return self._classify_command(event)
             case m.Beam():
                 if event.cycle_id != self._cycle_id:
                     return Input.WRONG_CYCLE
+                if self._users(event.cycle_id) - {event.user}:
+                    return Input.WRONG_USER
                 same = event.codebook_id == self._codebooks.in_use
                 return Input.BEAM if same else Input.WRONG_CODEBOOK
         raise TypeError(f'{type(event).__name__} is no event of a controller of the surface')
+
+    def _classify_command(self, command: m.RhsCommand) -> Input:
+        if command.codebook_id not in self._codebooks:
+            return Input.WRONG_CODEBOOK
+        key = command.cycle_id, command.band, command.codebook_id
+        if key not in self._applied:
+            return Input.COMMAND
+        present = self.state is State.POSITIONING and key == self._applied[-1]
+        return Input.DUPLICATE if present else Input.STALE_COMMAND
+
+    def _users(self, cycle_id: int) -> set[int]:
+        """Whom a cycle was granted to, as far as the grant was heard."""
+        newest = [grant.user for grant in self._granted if grant.cycle_id == cycle_id]
+        return set(newest[-1:])
+
+    def _note_grant(self, event: m.Grant, now_s: float) -> None:
+        self._granted.append(event)
 
     def _keep(self, event: CodebookOffered, now_s: float) -> None:
         self._codebooks.put(event.codebook.id, event.codebook)
 
     def _apply_band(self, event: m.RhsCommand, now_s: float) -> list[Action]:
         self._cycle_id = event.cycle_id
+        key = event.cycle_id, event.band, event.codebook_id
+        if key not in self._applied:
+            self._applied.append(key)
         analog = self._codebooks.take(event.codebook_id).analog[event.band]
         return [Send(m.RhsConfiguration(
             event.cycle_id, m.Mode.POSITIONING, event.band, event.codebook_id, analog))]

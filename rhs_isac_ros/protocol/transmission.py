@@ -1,6 +1,7 @@
 """The transmission: steers a beam to the estimated position and reports what it carries."""
 
 import math
+from typing import Any
 
 from rhs_isac_ros.link import Beam, Outcome, RunningQuartiles, capacity, choose_beam, outcome
 from rhs_isac_ros.model import Scenario
@@ -11,6 +12,8 @@ from rhs_isac_ros.protocol.shelf import Shelf
 
 # Figures of a report that statistics are kept of; `CapacityStatistics` has the same names.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
+# Cycles whose reports may still come.
+_MOST_OPEN = 8
 
 
 class Transmission(PlainRole):
@@ -32,11 +35,11 @@ class Transmission(PlainRole):
         self._scenario = scenario
         self._bands = range(scenario.n_bands) if band is None else (band,)
         self._codebooks: Shelf[None] = Shelf()
-        self._beam: m.Beam | None = None
-        self._at_estimate_bps = math.nan
-        self._truth: m.GroundTruth | None = None
-        # The true position whose report is in the statistics already.
-        self._counted: m.GroundTruth | None = None
+        # By cycle: the beam with the capacity at the estimate, the true position, and whether
+        # its report is in the statistics already.
+        self._beams: dict[int, tuple[m.Beam, float]] = {}
+        self._truths: dict[int, m.GroundTruth] = {}
+        self._counted: dict[int, bool] = {}
         self._quartiles = RunningQuartiles(len(_FIGURES))
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
@@ -58,7 +61,7 @@ class Transmission(PlainRole):
             case CodebookOffered(codebook):
                 self._codebooks.put(codebook.id, None)
             case m.GroundTruth() if event.cycle_id:
-                self._truth = event
+                _put(self._truths, event.cycle_id, event)
             case m.PositionEstimate() if event.codebook_id not in self._codebooks:
                 self.counters['wrong_codebook'] += 1
             case m.PositionEstimate():
@@ -72,33 +75,45 @@ class Transmission(PlainRole):
         choice = choose_beam(
             self._scenario, estimate.position, estimate.covariance_m2, self._bands)
         beam = choice.beam
-        self._beam = m.Beam(
+        sent = m.Beam(
             estimate.cycle_id, estimate.user, estimate.codebook_id, beam.band, beam.analog,
             beam.digital, choice.expected_bps)
-        self._at_estimate_bps = float(
-            capacity(self._scenario, beam, estimate.position[None])[0])
-        return [Send(self._beam)]
+        at_estimate_bps = float(capacity(self._scenario, beam, estimate.position[None])[0])
+        _put(self._beams, estimate.cycle_id, (sent, at_estimate_bps))
+        return [Send(sent)]
 
     def _report(self, applied: m.RhsConfiguration) -> list[Action]:
-        beam, truth = self._beam, self._truth
-        if beam is None or applied.cycle_id != beam.cycle_id:
-            self.counters['wrong_cycle'] += 1
-            return []
+        beam, at_estimate_bps = self._beams.get(applied.cycle_id, (None, math.nan))
+        truth = self._truths.get(applied.cycle_id)
+        for wrong, found in (('wrong_cycle', beam is None),
+                             ('wrong_codebook', beam and applied.codebook_id != beam.codebook_id),
+                             ('wrong_band', beam and applied.band != beam.band)):
+            if found:
+                self.counters[wrong] += 1
+                return []
         result = Outcome(math.nan, math.nan)
-        if truth and (truth.cycle_id, truth.user) == (beam.cycle_id, beam.user):
+        if truth and truth.user == beam.user:
             used = Beam(applied.analog[0], beam.digital, beam.band)
             result = outcome(self._scenario, used, truth.position, self._bands)
         report = m.Capacity(
             beam.cycle_id, beam.user, beam.codebook_id, beam.band, beam.expected_bps,
             result.actual_bps, result.perfect_bps, result.loss_bps, result.loss_percent,
-            self._at_estimate_bps)
+            at_estimate_bps)
         return [Send(report), *self._summarise(report)]
 
     def _summarise(self, report: m.Capacity) -> list[Action]:
-        """Bring the statistics up to date, once for each true position."""
-        if not math.isfinite(report.loss_percent) or self._truth is self._counted:
+        """Bring the statistics up to date, once for each cycle."""
+        if not math.isfinite(report.loss_percent) or report.cycle_id in self._counted:
             return []
-        self._counted = self._truth
+        _put(self._counted, report.cycle_id, True)
         self._quartiles.add([getattr(report, name) for name in _FIGURES])
         figures = dict(zip(_FIGURES, self._quartiles.quartiles(), strict=True))
         return [Send(m.CapacityStatistics(report.cycle_id, len(self._quartiles), **figures))]
+
+
+def _put(items: dict, cycle_id: int, item: Any) -> None:
+    """Keep something of a cycle, and forget the oldest."""
+    items.pop(cycle_id, None)
+    items[cycle_id] = item
+    if len(items) > _MOST_OPEN:
+        del items[next(iter(items))]

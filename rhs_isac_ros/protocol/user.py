@@ -26,6 +26,7 @@ class Input(enum.Enum):
     BEACON = 'beacon'
     STALE_BEACON = 'stale_beacon'
     GRANT = 'grant'
+    LATE_GRANT = 'late_grant'
     OTHER_GRANT = 'other_grant'
     OTHER_USER = 'other_user'
     PILOT_REQUEST = 'pilot_request'
@@ -58,6 +59,7 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (S.GRANTED, I.BEACON): Step(S.ACKNOWLEDGED, ('acknowledge',), counts='abandoned'),
     (S.GRANTED, I.TIMEOUT): Step(S.LISTENING, counts='bs_silent'),
     (ANY, I.STALE_BEACON): Step(SAME, counts='stale_beacon'),
+    (ANY, I.LATE_GRANT): Step(SAME, counts='late_grant'),
     (ANY, I.OTHER_GRANT): Step(SAME),
     (ANY, I.OTHER_USER): Step(SAME),
     (ANY, I.OTHER_DATA): Step(SAME),
@@ -65,6 +67,8 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
 }
 
 
+# Cycles whose beacons are known again; of older ones none can still be on its way.
+_MOST_HEARD = 8
 # Steps of a cycle that the base station may wait for while its user hears nothing: the last
 # band's signals, the position, the beam, and the data.
 _SILENT_STEPS = 4
@@ -107,6 +111,9 @@ class User(Machine):
         self.user = user
         self._mobility = mobility
         self._cycle_id = 0
+        # The highest attempt heard by cycle, and the cycle for which it stood still last.
+        self._heard: dict[int, int] = {}
+        self._stood: int | None = None
 
     def whereabouts(self, now_s: float, cycle_id: int = 0) -> m.GroundTruth:
         """Return where the user is.
@@ -132,8 +139,7 @@ class User(Machine):
             case PeersChanged(missing):
                 return Input.CUT_OFF if missing else Input.CONNECTED
             case m.Beacon():
-                stale = self.state is State.GRANTED and event.cycle_id == self._cycle_id
-                return Input.STALE_BEACON if stale else Input.BEACON
+                return Input.STALE_BEACON if self._is_stale(event) else Input.BEACON
             case m.Data(stage=m.Stage.OFFERED) | m.Data(direction=m.Direction.UPLINK):
                 return Input.OTHER_DATA
         if event.user != self.user:
@@ -141,9 +147,21 @@ class User(Machine):
             return Input.OTHER_GRANT if ours else Input.OTHER_USER
         if event.cycle_id != self._cycle_id:
             return Input.WRONG_CYCLE
+        if isinstance(event, m.Grant) and self._is_done:
+            return Input.LATE_GRANT
         names = {m.Grant: Input.GRANT, m.PilotRequest: Input.PILOT_REQUEST,
                  m.Data: Input.DOWNLINK}
         return names[type(event)]
+
+    def _is_stale(self, beacon: m.Beacon) -> bool:
+        """Tell whether a beacon says nothing new: a late one, or the double of another."""
+        granted = self.state is State.GRANTED and beacon.cycle_id == self._cycle_id
+        return granted or beacon.attempt <= self._heard.get(beacon.cycle_id, -1)
+
+    @property
+    def _is_done(self) -> bool:
+        """Whether its cycle was granted before, and is over."""
+        return self._stood == self._cycle_id and self.state is not State.GRANTED
 
     def _say_found(self, event: PeersChanged, now_s: float) -> list[Action]:
         return [Note('listening for beacons')]
@@ -153,9 +171,15 @@ class User(Machine):
 
     def _acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
         self._cycle_id = event.cycle_id
+        self._heard.pop(event.cycle_id, None)
+        self._heard[event.cycle_id] = event.attempt
+        if len(self._heard) > _MOST_HEARD:
+            del self._heard[next(iter(self._heard))]
+        self._stood = None
         return [Send(m.Ack(event.cycle_id, self.user))]
 
     def _stand(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
+        self._stood = event.cycle_id
         return [Send(self.whereabouts(now_s, event.cycle_id))]
 
     def _send_pilots(self, event: m.PilotRequest, now_s: float) -> list[Action]:

@@ -92,6 +92,9 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0),
         Parameter('data_duration_s', 1e-3, 'Time that each direction transmits data.', 's',
                   1e-6, 10.0),
+        Parameter('first_cycle', 0,
+                  'Number of the first cycle; 0: from the clock, so that none is repeated after '
+                  'a restart.', low=0, high=2**53),
     ),
     'user': (
         SCENARIO, SEED,

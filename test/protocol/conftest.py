@@ -41,7 +41,7 @@ SUBSCRIPTIONS = {
     'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.NoFix, m.Beam,
            m.Data),
     'user': (m.Beacon, m.Grant, m.PilotRequest, m.Data),
-    'rhs_controller': (m.RhsCommand, m.Beam),
+    'rhs_controller': (m.Grant, m.RhsCommand, m.Beam),
     'channel': (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
     'positioner': (m.ReceivedSignals,),
     'transmission': (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth),
@@ -118,10 +118,11 @@ class Network:
             self, scenario: Scenario, codebook, users, *, policy: str = 'round_robin',
             seed: int = 0, step_timeout_s: float = 1.0, ack_timeout_s: float = 0.1,
             rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
-            make_s: float = 0.0, absent: Iterable[str] = ()) -> None:
+            make_s: float = 0.0, absent: Iterable[str] = (),
+            begin_s: float = 0.0) -> None:
         self.scenario, self.seed = scenario, seed
         self.transport, self.ordered = transport, ordered
-        self.now_s = 0.0
+        self.now_s = begin_s
         self.log: list[Sent] = []
         self.notes: list[Said] = []
         self._ends: list[tuple[int, int, str]] = []
@@ -137,6 +138,7 @@ class Network:
         self._ack_timeout_s, self._rest_s = ack_timeout_s, rest_s
         self._make = make or (lambda codebook: Centre(scenario))
         self._make_s = make_s
+        self._lives = 0
         self._awake = False
         for user, place in users.items():
             self.add_user(user, place)
@@ -148,6 +150,9 @@ class Network:
 
     def __getitem__(self, name: str):
         return self._roles[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._roles
 
     def add_user(self, user: int, place) -> None:
         moves = hasattr(place, 'state')
@@ -321,7 +326,11 @@ class Network:
                 timeouts_s = bs_table.timeouts(self._ack_timeout_s, step_s, self._rest_s)
                 roster = Roster(
                     self._policy, streams.generator(self.seed, streams.BASE_STATION))
-                return BaseStation(scenario, roster, self._receive, timeouts_s, DATA_DURATION_S)
+                # No number comes twice, as with the clock of the node.
+                first = 1_000_000 * self._lives + 1
+                self._lives += 1
+                return BaseStation(
+                    scenario, roster, self._receive, timeouts_s, DATA_DURATION_S, first)
             case 'user':
                 return user_role.User(
                     int(name.removeprefix('user')), self._mobilities[name],

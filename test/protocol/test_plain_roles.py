@@ -1,5 +1,6 @@
 """The roles that are no state machines: channel, positioner and transmission."""
 
+import dataclasses
 import itertools
 import math
 
@@ -57,6 +58,12 @@ def beam(scenario):
 @pytest.fixture
 def applied(beam):
     return m.RhsConfiguration(3, m.Mode.TRANSMISSION, 0, 'x', beam.analog[None])
+
+
+def configured(beam):
+    """What the surface reports once it has applied a beam."""
+    return m.RhsConfiguration(
+        beam.cycle_id, m.Mode.TRANSMISSION, beam.band, beam.codebook_id, beam.analog[None])
 
 
 @pytest.fixture
@@ -354,7 +361,7 @@ def test_the_transmission_reports_what_the_applied_beam_carries(
     ((beam,),) = feed(transmission, [estimate])
     assert (beam.cycle_id, beam.user, beam.codebook_id) == (3, 1, estimate.codebook_id)
     weaker = m.RhsConfiguration(
-        3, m.Mode.TRANSMISSION, 0, beam.codebook_id, beam.analog[None] / 2)
+        3, m.Mode.TRANSMISSION, beam.band, beam.codebook_id, beam.analog[None] / 2)
     (_, (report, _)) = feed(transmission, [truth, weaker])
     used = Beam(beam.analog / 2, beam.digital)
     assert report.actual_bps == pytest.approx(capacity(scenario, used, PLACE[None])[0])
@@ -365,13 +372,13 @@ def test_the_transmission_reports_what_the_applied_beam_carries(
 def test_no_beam_is_better_than_the_perfect_one(transmission, scenario, codebooks, example):
     """Steering finds one of many maxima, but never one that is much below another."""
     rng = np.random.default_rng(0)
-    for place in scenario.sample_positions(20, rng):
+    for cycle_id, place in enumerate(scenario.sample_positions(20, rng), 1):
         near = place + rng.normal(scale=0.2, size=3)
-        estimate = example(m.PositionEstimate, cycle_id=3, user=1, position=near,
+        estimate = example(m.PositionEstimate, cycle_id=cycle_id, user=1, position=near,
                            codebook_id=codebooks[0].id)
         ((beam,),) = feed(transmission, [estimate])
-        truth = m.GroundTruth(3, 1, place, np.zeros(3))
-        applied = m.RhsConfiguration(3, m.Mode.TRANSMISSION, 0, 'x', beam.analog[None])
+        truth = m.GroundTruth(cycle_id, 1, place, np.zeros(3))
+        applied = configured(beam)
         (_, (report, _)) = feed(transmission, [truth, applied])
         assert -0.05 <= report.loss_percent < 100
 
@@ -381,7 +388,7 @@ def test_the_truth_of_another_cycle_or_user_is_not_used(
         transmission, example, estimate, other):
     truth = example(m.GroundTruth, **{'cycle_id': 3, 'user': 1} | other)
     ((beam,), _) = feed(transmission, [estimate, truth])
-    applied = m.RhsConfiguration(3, m.Mode.TRANSMISSION, 0, 'x', beam.analog[None])
+    applied = configured(beam)
     ((report,),) = feed(transmission, [applied])
     assert math.isnan(report.actual_bps)
     assert math.isnan(report.perfect_bps)
@@ -391,6 +398,27 @@ def test_the_truth_of_another_cycle_or_user_is_not_used(
 def test_a_report_without_a_beam_is_counted(transmission, applied):
     assert feed(transmission, [applied]) == [[]]
     assert transmission.counters == {'wrong_cycle': 1}
+
+
+@pytest.mark.parametrize(('changes', 'reason'), [
+    ({'codebook_id': 'x'}, 'wrong_codebook'), ({'band': 1}, 'wrong_band'),
+    ({'cycle_id': 4}, 'wrong_cycle')])
+def test_a_report_of_another_beam_is_counted(transmission, estimate, changes, reason):
+    ((beam,),) = feed(transmission, [estimate])
+    other = {'band': 1 - beam.band} if 'band' in changes else changes
+    assert feed(transmission, [dataclasses.replace(configured(beam), **other)]) == [[]]
+    assert transmission.counters == {reason: 1}
+
+
+def test_what_comes_late_from_an_older_cycle_does_not_hide_the_present_one(
+        transmission, estimate, truth):
+    later = dataclasses.replace(estimate, cycle_id=4)
+    place = dataclasses.replace(truth, cycle_id=4)
+    ((beam,), *_) = feed(transmission, [later, place, estimate, truth])
+    ((report, _),) = feed(transmission, [configured(beam)])
+    assert report.cycle_id == 4
+    assert math.isfinite(report.actual_bps)
+    assert transmission.counters == {}
 
 
 def reported(transmission, scenario, example, codebook, places, cycle_id=1):
@@ -423,7 +451,8 @@ def test_a_report_that_is_repeated_counts_once(transmission, scenario, example, 
     (place,) = scenario.sample_positions(1, np.random.default_rng(5))
     ((report, statistics),) = reported(transmission, scenario, example, codebooks[0], [place])
     assert statistics.n_reports == 1
-    applied = m.RhsConfiguration(1, m.Mode.TRANSMISSION, report.band, 'x', np.ones((1, 16)))
+    applied = m.RhsConfiguration(
+        1, m.Mode.TRANSMISSION, report.band, report.codebook_id, np.ones((1, 16)))
     ((again,),) = feed(transmission, [applied])
     assert isinstance(again, m.Capacity)
     ((_, statistics),) = reported(
@@ -433,7 +462,7 @@ def test_a_report_that_is_repeated_counts_once(transmission, scenario, example, 
 
 def test_without_a_true_position_there_are_no_statistics(transmission, estimate):
     ((beam,),) = feed(transmission, [estimate])
-    applied = m.RhsConfiguration(3, m.Mode.TRANSMISSION, beam.band, 'x', beam.analog[None])
+    applied = configured(beam)
     ((report,),) = feed(transmission, [applied])
     assert isinstance(report, m.Capacity)
 
@@ -456,8 +485,7 @@ def test_the_perfect_position_has_the_choice_of_the_same_bands(
     for band in (None, 0, 1):
         role = Transmission(scenario, band)
         (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
-        applied = m.RhsConfiguration(
-            3, m.Mode.TRANSMISSION, beam.band, 'x', beam.analog[None])
+        applied = configured(beam)
         (_, (report, _)) = feed(role, [truth, applied])
         bands = range(2) if band is None else [band]
         assert report.perfect_bps == pytest.approx(max(
