@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import NamedTuple
 
+import hypothesis
 import numpy as np
 import pytest
 
@@ -10,6 +11,23 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 
 HERE = Path(__file__).resolve().parent
+
+# The same examples in every run, or many more and others each time.
+hypothesis.settings.register_profile(
+    'quick', max_examples=150, derandomize=True, database=None, deadline=None)
+hypothesis.settings.register_profile(
+    'thorough', max_examples=5000, database=None, deadline=None, print_blob=True,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow])
+
+
+def pytest_addoption(parser):
+    parser.addoption('--thorough', action='store_true',
+                     help='thousands of examples for each property instead of some')
+
+
+def pytest_configure(config):
+    thorough = config.getoption('thorough')
+    hypothesis.settings.load_profile('thorough' if thorough else 'quick')
 
 
 class Case(NamedTuple):

@@ -1,0 +1,184 @@
+"""Whatever is lost, doubled, late, dead or started anew: the promises of the protocol hold."""
+
+import itertools
+import types
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import example as explicit
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rhs_isac_ros.link import Beam, Outcome
+from rhs_isac_ros.model import mobility
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol import transmission
+from rhs_isac_ros.protocol.bs_table import State
+
+STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
+# Faults end after so long; then everyone has to be served within the other.
+TROUBLE_S, PATIENCE_S = 1.0, 3.0
+ROLES = ('bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'user1', 'user2')
+LOST = [(kind, recipient) for recipient, kinds in {
+    'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.Beam, m.Data),
+    'user': (m.Beacon, m.Grant, m.PilotRequest, m.Data),
+    'rhs_controller': (m.Grant, m.RhsCommand, m.Beam),
+    'channel': (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
+    'positioner': (m.ReceivedSignals,),
+    'transmission': (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth),
+}.items() for kind in kinds]
+
+
+class Fault(NamedTuple):
+    """The nth message of a kind to a recipient arrives after each of these delays."""
+
+    kind: type[m.Message]
+    recipient: str
+    nth: int
+    delays_s: tuple[float, ...]
+
+
+class Crash(NamedTuple):
+    """A role dies, with or without its peers' notice, and comes back."""
+
+    at_s: float
+    role: str
+    down_s: float
+    noticed: bool
+
+
+class Offer(NamedTuple):
+    """A codebook is offered to all that are there."""
+
+    at_s: float
+    number: int
+
+
+class Faulty:
+    """A transport with a list of faults; all else is on time."""
+
+    def __init__(self, faults):
+        self._faults = {(fault.kind, fault.recipient, fault.nth): fault.delays_s
+                        for fault in faults}
+        self._seen = {}
+
+    def __call__(self, message, recipient):
+        key = type(message), recipient.rstrip('0123456789')
+        nth = self._seen[key] = self._seen.get(key, -1) + 1
+        return [(delay_s, message) for delay_s in self._faults.get((*key, nth), (1e-3,))]
+
+
+TIMES_S = st.sampled_from([n * TROUBLE_S / 30 for n in range(30)]) | st.floats(
+    0, TROUBLE_S, allow_subnormal=False)
+DELAYS_S = st.sampled_from([1e-3, 2.5e-3, 0.03, 0.08, 0.25, 0.45])
+FAULTS = st.lists(st.builds(
+    lambda pair, nth, delays_s: Fault(*pair, nth, tuple(delays_s)),
+    st.sampled_from(LOST), st.integers(0, 12), st.lists(DELAYS_S, max_size=2)), max_size=8)
+CRASHES = st.lists(st.builds(
+    Crash, TIMES_S, st.sampled_from(ROLES), st.sampled_from([0.0, 0.01, 0.1, 0.4]),
+    st.booleans()), max_size=4)
+OFFERS = st.lists(st.builds(Offer, TIMES_S, st.integers(0, 2)), max_size=2)
+NOISE = st.fixed_dictionaries({
+    'seed': st.integers(0, 2**32 - 1), 'loss': st.sampled_from([0.0, 0.02, 0.1]),
+    'doubles': st.sampled_from([0.0, 0.1, 0.5]),
+    'jitter_s': st.sampled_from([0.0, 0.01, 0.1, 0.5])})
+
+
+@pytest.fixture(scope='module', autouse=True)
+def plain_beams():
+    """Beams that tell where they point, without the search for the best of them."""
+    def choose(scenario, position, covariance_m2, bands):
+        angles = np.arange(scenario.n_elements) * np.abs(position).sum()
+        digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
+        return types.SimpleNamespace(
+            beam=Beam(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(transmission, 'choose_beam', choose)
+        patch.setattr(transmission, 'outcome', lambda *_: Outcome(1e6, 1.1e6))
+        yield
+
+
+@pytest.fixture(scope='module')
+def make_network(network_class, scenario, codebooks):
+    """Function that makes a network of two users that move fast."""
+    def make(transport, ordered):
+        users = {user: mobility.RandomWalk(scenario, 50.0, np.random.default_rng(user))
+                 for user in (1, 2)}
+        return network_class(
+            scenario, codebooks[0], users, transport=transport, ordered=ordered,
+            step_timeout_s=STEP_S, ack_timeout_s=ACK_S, rest_s=REST_S)
+    return make
+
+
+@pytest.fixture(scope='module')
+def survive(codebooks):
+    """Function that lets a network live through crashes and offers, and heals it."""
+    def run(net, crashes, offers):
+        happens = [(crash.at_s, lambda crash=crash: stop(net, crash)) for crash in crashes]
+        happens += [(crash.at_s + crash.down_s, lambda crash=crash: start(net, crash.role))
+                    for crash in crashes]
+        happens += [(offer.at_s, lambda offer=offer: net.offer(codebooks[offer.number]))
+                    for offer in offers]
+        for at_s, act in sorted(happens, key=lambda pair: pair[0]):
+            net.run(limit_s=at_s - net.now_s)
+            act()
+        net.run(limit_s=max(TROUBLE_S - net.now_s, 0.0))
+        net.transport = lambda message, recipient: [(1e-3, message)]
+        check_end(net)
+        net.verify()
+        check_results(net)
+    return run
+
+
+def stop(net, crash):
+    if crash.role in net:
+        net.remove(crash.role, crash.noticed)
+
+
+def start(net, role):
+    if role not in net:
+        net.add(role)
+
+
+def check_end(net):
+    """The base station beacons again, serves everyone, and rests between cycles."""
+    net.run_to(State.BEACONING, limit_s=PATIENCE_S)
+    before = len(net.served())
+    net.run(lambda: {1, 2} <= set(net.served()[before:]), PATIENCE_S)
+    net.run_to(State.BEACONING, limit_s=PATIENCE_S)
+
+
+def check_results(net):
+    """A cycle has one user, one position and one codebook, and its results are of these."""
+    cycles = {}
+    for _, _, message in net.log:
+        if message.cycle_id and isinstance(message, (
+                m.Grant, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Beam,
+                m.Capacity)):
+            cycles.setdefault(message.cycle_id, []).append(message)
+    for messages in cycles.values():
+        assert len({message.user for message in messages}) == 1
+        ids = {message.codebook_id for message in messages if hasattr(message, 'codebook_id')}
+        assert len(ids) <= 1
+        places = {tuple(message.position) for message in messages
+                  if isinstance(message, m.GroundTruth)}
+        assert len(places) <= 1
+        beams = [message for message in messages if isinstance(message, m.Beam)]
+        for beam, report in itertools.product(
+                beams, [message for message in messages if isinstance(message, m.Capacity)]):
+            assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
+
+
+@given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, ordered=st.booleans())
+@explicit(faults=[], crashes=[], offers=[], ordered=True)
+def test_single_faults_and_crashes_break_no_promise(
+        make_network, survive, faults, crashes, offers, ordered):
+    survive(make_network(Faulty(faults), ordered), crashes, offers)
+
+
+@given(noise=NOISE, crashes=CRASHES, offers=OFFERS, ordered=st.booleans())
+def test_storms_and_crashes_break_no_promise(
+        make_network, survive, noisy, noise, crashes, offers, ordered):
+    survive(make_network(noisy(**noise), ordered), crashes, offers)
