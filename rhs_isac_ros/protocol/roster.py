@@ -27,7 +27,8 @@ class Roster:
         if policy not in POLICIES:
             raise ValueError(f'policy: {policy!r}, expected one of {list(POLICIES)}')
         self._policy, self._rng = policy, rng
-        self._served: dict[int, int] = {}
+        # The turn in which a user was served last, 1, or after which it came, 0.
+        self._served: dict[int, tuple[int, int]] = {}
         self._missed: dict[int, int] = {}
         self._turn = 0
         self.answered: list[int] = []
@@ -44,8 +45,9 @@ class Roster:
         user
             The user.
         """
-        # A newcomer stands where the one stands that waits longest.
-        self._served.setdefault(user, min(self._served.values(), default=0))
+        # A newcomer stands behind all that wait, and before who was served just now: who comes
+        # and goes takes nobody's turn.
+        self._served.setdefault(user, (self._turn, 0))
         self._missed[user] = 0
 
     def answer(self, user: int) -> None:
@@ -106,5 +108,5 @@ class Roster:
         else:
             chosen = min(self.answered, key=lambda user: (self._served[user], user))
         self._turn += 1
-        self._served[chosen] = self._turn
+        self._served[chosen] = self._turn, 1
         return chosen

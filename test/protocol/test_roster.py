@@ -37,11 +37,11 @@ def test_round_robin_serves_who_was_served_longest_ago(roster):
     assert [cycle(r, 1, 2, 3) for _ in range(4)] == [1, 3, 2, 1]
 
 
-def test_round_robin_puts_a_new_user_beside_the_one_that_waits_longest(roster):
+def test_round_robin_puts_a_new_user_behind_those_that_wait(roster):
     r = roster()
     assert [cycle(r, 2, 3) for _ in range(5)] == [2, 3, 2, 3, 2]
-    # User 3 waits longest; among equals the lower number comes first.
-    assert [cycle(r, 1, 2, 3, 9) for _ in range(8)] == [1, 3, 9, 2, 1, 3, 9, 2]
+    # User 3 waits, user 2 was served just now; of newcomers the lower number comes first.
+    assert [cycle(r, 1, 2, 3, 9) for _ in range(8)] == [3, 1, 9, 2, 3, 1, 9, 2]
 
 
 def test_who_comes_and_goes_is_not_served_more_often_than_the_others(roster):
@@ -54,6 +54,20 @@ def test_who_comes_and_goes_is_not_served_more_often_than_the_others(roster):
     counts = [served.count(user) for user in (1, 2, 3)]
     assert max(counts) <= 21
     assert min(counts) >= 9
+
+
+@pytest.mark.parametrize('order', [(1, 2, 3), (3, 2, 1)])
+def test_nobody_waits_longer_than_a_round_for_one_that_is_gone_in_each_of_its_cycles(
+        roster, order):
+    r = roster()
+    served = []
+    for _ in range(30):
+        served.append(cycle(r, *order))
+        if served[-1] == 1:
+            r.forget(1)
+    for user in (2, 3):
+        turns = [n for n, other in enumerate(served) if other == user]
+        assert max(np.diff([-1, *turns])) <= 3
 
 
 def test_first_serves_who_answers_first(roster):
