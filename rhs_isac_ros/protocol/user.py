@@ -2,6 +2,7 @@
 
 import enum
 from collections.abc import Mapping
+from typing import Any
 
 from rhs_isac_ros.model.mobility import Mobility
 from rhs_isac_ros.protocol import messages as m
@@ -67,8 +68,8 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
 }
 
 
-# Cycles whose beacons are known again; of older ones none can still be on its way.
-_MOST_HEARD = 8
+# Cycles that are known again; of older ones no message can still be on its way.
+_MOST_KNOWN = 8
 # Steps of a cycle that the base station may wait for while its user hears nothing: the last
 # band's signals, the position, the beam, and the data.
 _SILENT_STEPS = 4
@@ -111,9 +112,9 @@ class User(Machine):
         self.user = user
         self._mobility = mobility
         self._cycle_id = 0
-        # The highest attempt heard by cycle, and the cycle for which it stood still last.
+        # By cycle: the highest attempt heard, and where it stood, which holds for all of it.
         self._heard: dict[int, int] = {}
-        self._stood: int | None = None
+        self._truths: dict[int, m.GroundTruth] = {}
 
     def whereabouts(self, now_s: float, cycle_id: int = 0) -> m.GroundTruth:
         """Return where the user is.
@@ -161,7 +162,7 @@ class User(Machine):
     @property
     def _is_done(self) -> bool:
         """Whether its cycle was granted before, and is over."""
-        return self._stood == self._cycle_id and self.state is not State.GRANTED
+        return self._cycle_id in self._truths and self.state is not State.GRANTED
 
     def _say_found(self, event: PeersChanged, now_s: float) -> list[Action]:
         return [Note('listening for beacons')]
@@ -171,16 +172,13 @@ class User(Machine):
 
     def _acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
         self._cycle_id = event.cycle_id
-        self._heard.pop(event.cycle_id, None)
-        self._heard[event.cycle_id] = event.attempt
-        if len(self._heard) > _MOST_HEARD:
-            del self._heard[next(iter(self._heard))]
-        self._stood = None
+        _keep(self._heard, event.cycle_id, event.attempt)
         return [Send(m.Ack(event.cycle_id, self.user))]
 
     def _stand(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
-        self._stood = event.cycle_id
-        return [Send(self.whereabouts(now_s, event.cycle_id))]
+        truth = self._truths.get(event.cycle_id) or self.whereabouts(now_s, event.cycle_id)
+        _keep(self._truths, event.cycle_id, truth)
+        return [Send(truth)]
 
     def _send_pilots(self, event: m.PilotRequest, now_s: float) -> list[Action]:
         return [Send(m.Pilot(event.cycle_id, self.user, event.band, frame, 1.0, 0.0))
@@ -189,3 +187,11 @@ class User(Machine):
     def _send_uplink(self, event: m.Data, now_s: float) -> list[Action]:
         return [Send(m.Data(event.cycle_id, self.user, m.Direction.UPLINK, m.Stage.OFFERED,
                             event.duration_s, event.bits))]
+
+
+def _keep(items: dict, cycle_id: int, item: Any) -> None:
+    """Remember something of a cycle, and forget the oldest."""
+    items.pop(cycle_id, None)
+    items[cycle_id] = item
+    if len(items) > _MOST_KNOWN:
+        del items[next(iter(items))]

@@ -179,6 +179,10 @@ def test_single_faults_and_crashes_break_no_promise(
 
 
 @given(noise=NOISE, crashes=CRASHES, offers=OFFERS, ordered=st.booleans())
+# A late beacon and a late grant of a cycle that is over.
+@explicit(noise={'seed': 1038635, 'loss': 0.02, 'doubles': 0.5, 'jitter_s': 0.5},
+          crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
+          offers=[], ordered=False)
 def test_storms_and_crashes_break_no_promise(
         make_network, survive, noisy, noise, crashes, offers, ordered):
     survive(make_network(noisy(**noise), ordered), crashes, offers)

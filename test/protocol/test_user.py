@@ -37,6 +37,18 @@ def test_a_beacon_is_answered(user):
     assert user.next_deadline() == 12.0
 
 
+def test_a_late_beacon_and_grant_of_a_cycle_do_not_move_the_user_within_it(user):
+    (truth,) = grant(user)
+    user.handle(m.Data(7, 4, DOWN, DELIVERED, 0.25, 123.0), 11.0)
+    assert answers(user, m.Grant(7, 4), 11.5) == []
+    assert user.counters == {'late_grant': 1}
+    assert answers(user, m.Beacon(7, 0), 11.5) == []
+    assert user.counters == {'late_grant': 1, 'stale_beacon': 1}
+    user.handle(m.Beacon(7, 1), 12.0)
+    again, *_ = answers(user, m.PilotRequest(7, 4, 0, 2), 12.5)
+    assert again is truth
+
+
 @pytest.mark.parametrize('cycle_id', [7, 8])
 def test_every_further_beacon_is_answered_and_starts_the_time_out_afresh(user, cycle_id):
     user.handle(m.Beacon(7, 0), 10.0)
