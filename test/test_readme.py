@@ -23,7 +23,7 @@ def test_table_of_topics_names_every_topic():
     types = dict(rows)
     for kind, name in topics.NAMES.items():
         assert types[name] == kind.__name__
-    assert {topics.POSITION, topics.CODEBOOK} <= types.keys()
+    assert {topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS} <= types.keys()
 
 
 def test_example_of_the_library_runs(monkeypatch, capsys):

@@ -17,7 +17,9 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options
 from rhs_isac_ros.codebook.command import run as run_command
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.protocol.health import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
+from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import run
@@ -50,7 +52,9 @@ class OptimizerNode(Node):
         for name, value in defaults.to_parameters().items():
             self.declare_parameter(
                 name, value, ParameterDescriptor(description=DESCRIPTIONS[name]))
+        self._codebook_id, self._refused = '', 0
         self._publish(self._assemble({}))
+        self._diagnostics = Diagnostics(self, self._report)
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._on_set)
 
@@ -64,6 +68,7 @@ class OptimizerNode(Node):
         try:
             self._assemble({p.name: p.value for p in changes if p.name in DESCRIPTIONS})
         except CodebookError as error:
+            self._refused += 1
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -71,7 +76,12 @@ class OptimizerNode(Node):
         if any(p.name in DESCRIPTIONS for p in changes):
             self._publish(self._assemble({}))
 
+    def _report(self) -> Report:
+        values = {'codebook_id': self._codebook_id, 'dropped.wrong_codebook': str(self._refused)}
+        return Report(False, 'no fault', values)
+
     def _publish(self, codebook: Codebook) -> None:
+        self._codebook_id = codebook.id
         stamp = self.get_clock().now().to_msg()
         self._publisher.publish(convert.codebook_to_ros(codebook, stamp))
         self.get_logger().info(

@@ -11,7 +11,9 @@ from rclpy.publisher import Publisher
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Note, Send, Tick
+from rhs_isac_ros.protocol.health import Health, Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
+from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.timers import steady_timer
 
 
@@ -73,6 +75,7 @@ class RoleNode(Node):
         self._outlets: dict[type[m.Message], Publisher] = {}
         self.advertise(sends)
         self._complaints: set[str] = set()
+        self._health = Health()
         # One timer for all deadlines. It is set anew only when it rings too early or too late.
         self._timer = steady_timer(self, 3600.0, self._ring)
         self._timer.cancel()
@@ -89,7 +92,19 @@ class RoleNode(Node):
             Messages that it wants from now on.
         """
         self._role = role
+        self._diagnostics = Diagnostics(self, self.report)
         self.listen(receives)
+
+    def report(self) -> Report:
+        """Tell how the role fares, for the diagnostics.
+
+        Returns
+        -------
+        Report
+            The report; what is new is what came after the last one.
+        """
+        state = getattr(self._role, 'state', None)
+        return self._health.report(state.value if state else '', self._role.counters)
 
     def advertise(self, sends: Iterable[type[m.Message]]) -> None:
         """Create publishers; the graph then shows that the role is there.
@@ -140,9 +155,9 @@ class RoleNode(Node):
             The event.
         """
         now_s = self.now_s()
-        self._do(self._role.handle(event, now_s))
+        self._hand(event, now_s)
         while (deadline_s := self._role.next_deadline()) is not None and deadline_s <= now_s:
-            self._do(self._role.handle(Tick(), now_s))
+            self._hand(Tick(), now_s)
         if deadline_s is not None and (self._rings_s is None or deadline_s < self._rings_s):
             self._set_timer(deadline_s - now_s, deadline_s)
 
@@ -194,6 +209,12 @@ class RoleNode(Node):
                 return
             self.tell(message)
         return receive
+
+    def _hand(self, event: Event, now_s: float) -> None:
+        begin_s = time.perf_counter()
+        actions = self._role.handle(event, now_s)
+        self._health.note(event, actions, now_s, time.perf_counter() - begin_s)
+        self._do(actions)
 
     def _do(self, actions: list[Action]) -> None:
         for action in actions:

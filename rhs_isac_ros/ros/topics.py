@@ -26,6 +26,7 @@ NAMES: Mapping[type[m.Message], str] = {
 # What is not a message of the protocol.
 POSITION = 'position'
 CODEBOOK = 'codebook'
+DIAGNOSTICS = 'diagnostics'
 
 # The node that holds the codebook as its parameters.
 OPTIMIZER_NODE = 'optimizer'

@@ -7,7 +7,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 
-ALL = [*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK]
+ALL = [*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS]
 
 
 def test_every_message_has_a_topic_of_its_own():

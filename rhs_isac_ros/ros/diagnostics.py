@@ -1,0 +1,61 @@
+"""What every node tells of itself, once a second, as `diagnostic_msgs/DiagnosticArray`."""
+
+from collections.abc import Callable
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from std_msgs.msg import Header
+
+from rhs_isac_ros.protocol.health import Report
+from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros.timers import steady_timer
+
+_PERIOD_S = 1.0
+
+
+def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
+    """Convert a report to ROS.
+
+    Parameters
+    ----------
+    report
+        The report.
+    name
+        Full name of the node.
+    stamp
+        Time for the header.
+
+    Returns
+    -------
+    diagnostic_msgs.msg.DiagnosticArray
+        One status, OK or WARN, with all values.
+    """
+    level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
+    values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
+    status = DiagnosticStatus(
+        level=level, name=name.lstrip('/'), message=report.summary, values=values)
+    return DiagnosticArray(header=Header(stamp=stamp), status=[status])
+
+
+class Diagnostics:
+    """Publishes what a node tells of itself.
+
+    Parameters
+    ----------
+    node
+        The node.
+    report
+        Tells how it fares.
+    """
+
+    def __init__(self, node: Node, report: Callable[[], Report]) -> None:
+        self._node, self._report = node, report
+        self._publisher = node.create_publisher(
+            DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE)
+        steady_timer(node, _PERIOD_S, self._publish)
+
+    def _publish(self) -> None:
+        stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(
+            to_ros(self._report(), self._node.get_fully_qualified_name(), stamp))
