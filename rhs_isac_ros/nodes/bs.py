@@ -13,9 +13,11 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.bs import BaseStation
 from rhs_isac_ros.protocol.bs_table import timeouts
 from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged
+from rhs_isac_ros.protocol.gate import Gate, users_of
 from rhs_isac_ros.protocol.roster import Roster
 from rhs_isac_ros.ros import peers
 from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -36,11 +38,18 @@ class BsNode(RoleNode):
             values.policy, streams.generator(values.seed, streams.BASE_STATION))
         self.start(BaseStation(
             self.scenario, roster, self._receive, timeouts_s, values.data_duration_s,
-            values.first_cycle or _number_from_the_clock()), RECEIVES)
+            values.first_cycle or _number_from_the_clock(), self._gate()), RECEIVES)
         self._codebook = CodebookSource(
             self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
         self._peers = peers.PeerWatch(
             self, peers.OF_BASE_STATION, lambda missing: self.tell(PeersChanged(missing)))
+
+    def _gate(self) -> Gate:
+        try:
+            allowed = users_of(self.values.allowed_users)
+        except ValueError as error:
+            raise ParameterError(f'allowed_users: {error}') from None
+        return Gate(allowed, self.values.ack_rate_hz)
 
     def _receive(
             self, codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int) -> np.ndarray:

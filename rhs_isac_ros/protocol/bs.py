@@ -17,6 +17,7 @@ from rhs_isac_ros.protocol.events import (
     Send,
     Tick,
 )
+from rhs_isac_ros.protocol.gate import Gate
 from rhs_isac_ros.protocol.machine import Machine
 from rhs_isac_ros.protocol.roster import Roster
 
@@ -40,6 +41,8 @@ class BaseStation(Machine):
     first_cycle_id
         Number of the first cycle. One that starts anew must repeat no number of its former life:
         what is still on its way would be taken for its own.
+    gate
+        Whose acks it takes; by default all.
     """
 
     TABLE = TABLE
@@ -48,10 +51,12 @@ class BaseStation(Machine):
             self, scenario: Scenario, roster: Roster,
             receiver: Callable[[Codebook, np.ndarray, int, int], np.ndarray],
             timeouts_s: Mapping[State, float], data_duration_s: float,
-            first_cycle_id: int = 1) -> None:
+            first_cycle_id: int = 1, gate: Gate | None = None) -> None:
         super().__init__(State.WAITING, timeouts_s)
         self._scenario, self._roster, self._receiver = scenario, roster, receiver
         self._data_duration_s = data_duration_s
+        self._gate = gate or Gate()
+        self._refusal = ''
         self._codebook: Codebook | None = None
         self._offered: Codebook | None = None
         self._missing: tuple[str, ...] | None = None
@@ -63,6 +68,25 @@ class BaseStation(Machine):
         self._frames: dict[tuple[int, int], np.ndarray] = {}
         self._beam: m.Beam | None = None
         self._applied = False
+
+    def handle(self, event: Event, now_s: float) -> list[Action]:
+        """Take an event; an ack goes through the gate first.
+
+        Parameters
+        ----------
+        event
+            A message, or something local.
+        now_s
+            The time, on any clock that only goes forward [s].
+
+        Returns
+        -------
+        list of Action
+            What to do, in this order.
+        """
+        if isinstance(event, m.Ack):
+            self._refusal = self._gate.refusal(event.user, now_s)
+        return super().handle(event, now_s)
 
     def _classify(self, event: Event) -> Input:
         match event:
@@ -109,6 +133,8 @@ class BaseStation(Machine):
         return Input.TIMEOUT
 
     def _classify_ack(self, ack: m.Ack) -> Input:
+        if self._refusal:
+            return Input(self._refusal)
         if ack.cycle_id != self._cycle_id:
             return Input.WRONG_CYCLE
         if ack.user in self._roster.answered:

@@ -47,6 +47,8 @@ class Input(enum.Enum):
     WRONG_USER = 'wrong_user'
     WRONG_BAND = 'wrong_band'
     WRONG_CODEBOOK = 'wrong_codebook'
+    NOT_ALLOWED = 'not_allowed'
+    TOO_OFTEN = 'too_often'
 
 
 def timeouts(ack_s: float, step_s: float, rest_s: float) -> dict[State, float]:
@@ -116,4 +118,7 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (ANY, I.WRONG_USER): Step(SAME, counts='wrong_user'),
     (ANY, I.WRONG_BAND): Step(SAME, counts='wrong_band'),
     (ANY, I.WRONG_CODEBOOK): Step(SAME, counts='wrong_codebook'),
+    # Acks that the gate refuses.
+    (ANY, I.NOT_ALLOWED): Step(SAME, counts='not_allowed'),
+    (ANY, I.TOO_OFTEN): Step(SAME, counts='too_often'),
 }

@@ -92,6 +92,10 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0),
         Parameter('data_duration_s', 1e-3, 'Time that each direction transmits data.', 's',
                   1e-6, 10.0),
+        Parameter('allowed_users', '',
+                  'Users whose acks it takes, such as 1, 4, 10-20; empty: all.'),
+        Parameter('ack_rate_hz', 200.0, 'Acks that it takes of each user in a second.', 'Hz',
+                  1.0, 1e6),
         Parameter('first_cycle', 0,
                   'Number of the first cycle; 0: from the clock, so that none is repeated after '
                   'a restart.', low=0, high=2**53),

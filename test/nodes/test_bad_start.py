@@ -35,6 +35,7 @@ CASES = {
                            ['codebook.id', "'deadbeefdeadbeef'"]),
     'users': ('network', {'users': 0}, ['users', '0', '1 to 1000']),
     'network': ('network', {'policy': 'best'}, ['policy', "'best'"]),
+    'allowed users': ('bs', {'allowed_users': '7, 5-3'}, ['allowed_users', "'5-3'", '10-20']),
     'no parameter file': ('bs', ['--params-file', '/no/parameters.yaml'],
                           ['/no/parameters.yaml']),
 }

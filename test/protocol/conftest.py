@@ -119,10 +119,11 @@ class Network:
             seed: int = 0, step_timeout_s: float = 1.0, ack_timeout_s: float = 0.1,
             rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
             make_s: float = 0.0, absent: Iterable[str] = (),
-            begin_s: float = 0.0) -> None:
+            begin_s: float = 0.0, gate=None) -> None:
         self.scenario, self.seed = scenario, seed
         self.transport, self.ordered = transport, ordered
         self.now_s = begin_s
+        self._gate = gate
         self.log: list[Sent] = []
         self.notes: list[Said] = []
         self._ends: list[tuple[int, int, str]] = []
@@ -330,7 +331,8 @@ class Network:
                 first = 1_000_000 * self._lives + 1
                 self._lives += 1
                 return BaseStation(
-                    scenario, roster, self._receive, timeouts_s, DATA_DURATION_S, first)
+                    scenario, roster, self._receive, timeouts_s, DATA_DURATION_S, first,
+                    self._gate)
             case 'user':
                 return user_role.User(
                     int(name.removeprefix('user')), self._mobilities[name],
