@@ -247,6 +247,10 @@ def test_cycles_go_on_after_nodes_die_and_are_restarted(network, module_processe
     before = len(watch.heard[m.Beacon])
     watch.until(lambda: len(watch.heard[m.Beacon]) > before, 'beacons', running.values())
     watch.until_served(3, user=1, processes=running.values())
+    # No life of the base station repeats a number.
+    numbers = [beacon.cycle_id for beacon in watch.heard[m.Beacon]]
+    assert numbers == sorted(numbers)
+    assert len({grant.cycle_id for grant in watch.heard[m.Grant]}) == len(watch.heard[m.Grant])
 
 
 def not_finite(message):
