@@ -66,6 +66,24 @@ class Message:
         return {}
 
 
+def same(one: Message, other: Message) -> bool:
+    """Tell whether two messages say the same, as the double of a message does.
+
+    Parameters
+    ----------
+    one, other
+        Messages.
+
+    Returns
+    -------
+    bool
+        True if they are of one kind and all their fields are equal; NaN equals nothing.
+    """
+    return type(one) is type(other) and all(
+        np.array_equal(getattr(one, field.name), getattr(other, field.name))
+        for field in dataclasses.fields(one))
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Beacon(Message):
     """The base station invites users to a cycle."""

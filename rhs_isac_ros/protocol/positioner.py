@@ -46,6 +46,8 @@ class Positioner(PlainRole):
         self._making: Codebook | None = None
         self._next: Codebook | None = None
         self._waiting: m.ReceivedSignals | None = None
+        # The signals that were answered last, and the answer.
+        self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
         """Take a codebook, an estimator for one, or received signals.
@@ -96,8 +98,12 @@ class Positioner(PlainRole):
         return actions + (self._receive(waiting) if waiting else [])
 
     def _receive(self, received: m.ReceivedSignals) -> list[Action]:
+        if self._answered and m.same(self._answered[0], received):
+            self.counters['duplicate'] += 1
+            return self._answered[1]
         if received.codebook_id in self._estimators:
-            return self._locate(received)
+            self._answered = received, self._locate(received)
+            return self._answered[1]
         coming = {codebook.id for codebook in (self._making, self._next) if codebook}
         if received.codebook_id in coming:
             self._waiting = received

@@ -35,8 +35,9 @@ class Transmission(PlainRole):
         self._scenario = scenario
         self._bands = range(scenario.n_bands) if band is None else (band,)
         self._codebooks: Shelf[None] = Shelf()
-        # By cycle: the beam with the capacity at the estimate, the true position, and whether
-        # its report is in the statistics already.
+        # By cycle: the estimate, the beam with the capacity at the estimate, the true position,
+        # and whether its report is in the statistics already.
+        self._estimates: dict[int, m.PositionEstimate] = {}
         self._beams: dict[int, tuple[m.Beam, float]] = {}
         self._truths: dict[int, m.GroundTruth] = {}
         self._counted: dict[int, bool] = {}
@@ -71,6 +72,10 @@ class Transmission(PlainRole):
         return []
 
     def _steer(self, estimate: m.PositionEstimate) -> list[Action]:
+        known = self._estimates.get(estimate.cycle_id)
+        if known and m.same(known, estimate):
+            self.counters['duplicate'] += 1
+            return [Send(self._beams[estimate.cycle_id][0])]
         self._codebooks.take(estimate.codebook_id)
         choice = choose_beam(
             self._scenario, estimate.position, estimate.covariance_m2, self._bands)
@@ -79,6 +84,7 @@ class Transmission(PlainRole):
             estimate.cycle_id, estimate.user, estimate.codebook_id, beam.band, beam.analog,
             beam.digital, choice.expected_bps)
         at_estimate_bps = float(capacity(self._scenario, beam, estimate.position[None])[0])
+        _put(self._estimates, estimate.cycle_id, estimate)
         _put(self._beams, estimate.cycle_id, (sent, at_estimate_bps))
         return [Send(sent)]
 

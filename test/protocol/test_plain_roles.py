@@ -234,6 +234,15 @@ def test_the_positioner_uses_the_estimator_of_the_signals_codebook(
         assert estimate.latency_s == 1.0
 
 
+def test_signals_that_come_twice_are_answered_twice_and_estimated_once(
+        positioner, codebooks, signals):
+    feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0])])
+    (first,), (again,), (other,) = feed(positioner, [signals(5), signals(5), signals(6)])
+    assert again is first
+    assert other.cycle_id == 6
+    assert positioner.counters == {'duplicate': 1}
+
+
 def test_the_positioner_drops_signals_of_a_codebook_that_it_does_not_know(
         positioner, codebooks, signals):
     assert feed(positioner, [signals(1)]) == [[]]
@@ -393,6 +402,15 @@ def test_the_truth_of_another_cycle_or_user_is_not_used(
     assert math.isnan(report.actual_bps)
     assert math.isnan(report.perfect_bps)
     assert report.expected_bps == beam.expected_bps
+
+
+def test_an_estimate_that_comes_twice_is_steered_to_once(
+        transmission, estimate, truth, monkeypatch):
+    ((beam,),) = feed(transmission, [estimate])
+    monkeypatch.setattr('rhs_isac_ros.protocol.transmission.choose_beam', None)
+    ((again,),) = feed(transmission, [dataclasses.replace(estimate)])
+    assert again is beam
+    assert transmission.counters == {'duplicate': 1}
 
 
 def test_a_report_without_a_beam_is_counted(transmission, applied):
