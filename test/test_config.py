@@ -1,0 +1,59 @@
+"""The scenarios and codebooks that the package ships."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+
+CONFIG = Path(__file__).parents[1] / 'config'
+SCENARIOS = ('table1', 'quick', 'wideband')
+CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
+FIELDS = {field.name: field.metadata['unit'] for field in dataclasses.fields(Scenario)}
+
+
+def test_every_file_is_a_scenario_or_a_codebook():
+    assert {path.stem for path in CONFIG.glob('*.yaml')} == {*SCENARIOS, *CODEBOOKS}
+
+
+def test_table1_is_the_default_and_leaves_nothing_out():
+    assert Scenario.from_yaml(CONFIG / 'table1.yaml') == Scenario()
+    content = yaml.safe_load((CONFIG / 'table1.yaml').read_text(encoding='utf-8'))
+    assert list(content) == list(FIELDS)
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_every_line_tells_its_unit(name):
+    text = (CONFIG / f'{name}.yaml').read_text(encoding='utf-8')
+    lines = re.findall(r'^(\w+): (.*?) +# (.*)$', text, re.MULTILINE)
+    assert [field for field, _, _ in lines] == list(yaml.safe_load(text))
+    for field, _, comment in lines:
+        assert re.findall(r'\[([^],]+)\]', comment) == [FIELDS[field]] * bool(FIELDS[field])
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_numbers_are_numbers_to_yaml_too(name):
+    content = yaml.safe_load((CONFIG / f'{name}.yaml').read_text(encoding='utf-8'))
+    for value in content.values():
+        for number in value if isinstance(value, list) else [value]:
+            assert isinstance(number, int | float | None)
+
+
+def test_quick_is_smaller_and_wideband_has_four_bands():
+    quick, wideband = (Scenario.from_yaml(CONFIG / f'{name}.yaml')
+                       for name in ('quick', 'wideband'))
+    assert all(quick.sizes[symbol] < size for symbol, size in Scenario().sizes.items()
+               if symbol != 'N_B')
+    assert wideband.n_bands == 4
+    assert wideband.changes().keys() == {'center_frequencies_hz'}
+
+
+@pytest.mark.parametrize('name', sorted(CODEBOOKS))
+def test_codebooks_fit_their_scenarios(name):
+    scenario = name.removeprefix('codebook').removeprefix('_')
+    file = CONFIG / f'{scenario if scenario in SCENARIOS else "table1"}.yaml'
+    Codebook.load(CONFIG / f'{name}.yaml').check(Scenario.from_yaml(file))
