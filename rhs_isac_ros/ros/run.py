@@ -66,6 +66,10 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None) -
         if executor is not None:
             executor.shutdown()
         rclpy.try_shutdown()
+        # Python gives a handler back when it ends: one more signal, as with Ctrl-C on a launch,
+        # would then kill what ends well.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
     return 0
 
 

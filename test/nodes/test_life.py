@@ -54,3 +54,11 @@ def test_a_signal_ends_each_process_well(life, crashed, executable):
     assert code == 0, log
     assert not crashed(log), log
     assert '[ERROR]' not in log, log
+
+
+def test_signals_up_to_the_very_end_do_no_harm(processes, make_watch):
+    process = processes.start('rhs_controller', namespace='/impatient')
+    make_watch('/impatient').answering('rhs_controller')
+    while process.running:
+        process.signal(signal.SIGINT)
+    assert process.wait() == 0, process.log
