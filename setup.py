@@ -31,6 +31,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/launch', sorted(glob('launch/*.launch.*'))),
     ],
     python_requires='>=3.10',
     # What it runs on is in package.xml: rosdep or requirements.txt install it.

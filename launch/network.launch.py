@@ -1,0 +1,85 @@
+"""The whole network, every node a process: ``ros2 launch rhs_isac_ros network.launch.py``.
+
+``--show-args`` lists the arguments. ``network.launch.xml`` starts the same in one process.
+"""
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+from launch import LaunchContext, LaunchDescription
+
+PACKAGE = 'rhs_isac_ros'
+# A launch that gets SIGTERM leaves its processes to themselves: so the kernel ends them with it.
+END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
+ARGUMENTS = {
+    'users': ('2', 'Number of users.'),
+    'config': ('', "Scenario file; empty: the paper's Table I."),
+    'codebook': ('', 'Codebook file, of the sizes of the scenario; empty: that of the package.'),
+    'seed': ('0', 'Seed of all random numbers.'),
+    'estimator': ('bayes', 'Estimator of the position.'),
+    'namespace': ('', 'Namespace of all nodes and topics: one for each of many networks.'),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe the launch: its arguments, and the nodes that depend on them.
+
+    Returns
+    -------
+    launch.LaunchDescription
+        The description.
+    """
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=default, description=text)
+          for name, (default, text) in ARGUMENTS.items()),
+        OpaqueFunction(function=start_nodes),
+    ])
+
+
+def start_nodes(context: LaunchContext) -> list[Node]:
+    """Make the nodes, once the number of users is known.
+
+    Parameters
+    ----------
+    context
+        Holds the values of the arguments.
+
+    Returns
+    -------
+    list of launch_ros.actions.Node
+        The nodes.
+
+    Raises
+    ------
+    ValueError
+        If the number of users is no positive integer.
+    """
+    text = LaunchConfiguration('users').perform(context)
+    if not text.isdecimal() or not int(text):
+        raise ValueError(f'users: {text!r}, expected a positive integer')
+    seed = {'seed': _typed('seed', int)}
+    return [
+        _node('rhs_controller'),
+        _node('positioner', estimator=_typed('estimator', str)),
+        _node('transmission'),
+        _node('optimizer', codebook_file=_typed('codebook', str)),
+        _node('channel', **seed),
+        *(_node('user', f'user_{number}', user_id=number, **seed)
+          for number in range(1, int(text) + 1)),
+        _node('bs', **seed),
+    ]
+
+
+def _typed(argument: str, kind: type) -> ParameterValue:
+    """Return an argument as a parameter; without a type, YAML would guess one."""
+    return ParameterValue(LaunchConfiguration(argument), value_type=kind)
+
+
+def _node(executable: str, name: str = '', **parameters: ParameterValue | int) -> Node:
+    name = name or executable
+    return Node(
+        package=PACKAGE, executable=executable, name=name, exec_name=name, output='screen',
+        namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
+        parameters=[{'scenario_file': _typed('config', str), **parameters}])

@@ -1,0 +1,131 @@
+"""The launch files: what they declare, and whether they serve all users and end cleanly."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FILES = ('network.launch.py', 'network.launch.xml')
+PATIENCE_S = 60.0
+# `ros2 launch` in short.
+LAUNCH = '''
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+
+arguments = [tuple(argument.split(':=')) for argument in sys.argv[2:]]
+service = LaunchService()
+service.include_launch_description(LaunchDescription([
+    IncludeLaunchDescription(AnyLaunchDescriptionSource(sys.argv[1]),
+                             launch_arguments=arguments)]))
+sys.exit(service.run())
+'''
+# Its parser, and that of type supports, is older than this Python.
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+needs_launch = pytest.mark.skipif(
+    not all(map(find_spec, ('launch', 'launch_ros', 'launch_xml'))),
+    reason='there is no launch_ros here: it comes with a full ROS 2, not as a wheel')
+
+
+def arguments_of_xml():
+    root = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
+    return {arg.get('name'): (arg.get('default'), arg.get('description'))
+            for arg in root.iter('arg')}
+
+
+def test_they_are_installed_and_declared():
+    packages = pytest.importorskip('ament_index_python.packages')
+    share = Path(packages.get_package_share_directory('rhs_isac_ros'))
+    assert {path.name for path in (share / 'launch').iterdir()} >= set(FILES)
+    depends = {element.text for element in
+               ElementTree.parse(ROOT / 'package.xml').getroot().iter('exec_depend')}
+    assert {'launch', 'launch_ros', 'launch_xml'} <= depends
+
+
+def test_parameters_of_the_xml_variant_are_declared():
+    parameters = pytest.importorskip('rhs_isac_ros.ros.parameters')
+    declared = {parameter.name for own in parameters.NODES.values() for parameter in own}
+    root = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
+    values = {param.get('name'): param.get('value') for param in root.iter('param')}
+    assert values.keys() <= declared
+    assert {f'$(var {name})' for name in arguments_of_xml()} == {
+        *values.values(), *(node.get('namespace') for node in root.iter('node'))}
+
+
+@needs_launch
+def test_both_take_the_same_arguments():
+    from launch.launch_description_sources import (
+        get_launch_description_from_python_launch_file as load,
+    )
+    description = load(str(ROOT / 'launch' / 'network.launch.py'))
+    assert arguments_of_xml() == {
+        argument.name: (argument.default_value[0].text, argument.description)
+        if argument.default_value else ('', argument.description)
+        for argument in description.get_launch_arguments()}
+
+
+def is_there(group):
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.fixture
+def observer(monkeypatch):
+    """A node that watches the cycles of the namespace /launched, and how to spin it."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from rhs_isac_ros.ros.observer import CycleObserver
+    context = Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node, executor = CycleObserver(context=context, namespace='/launched'), (
+        SingleThreadedExecutor(context=context))
+    executor.add_node(node)
+    yield node, executor
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+@needs_launch
+@pytest.mark.parametrize('file, number', zip(FILES, (signal.SIGINT, signal.SIGTERM), strict=True))
+def test_all_users_are_served_and_nothing_is_left_behind(file, number, observer, tmp_path):
+    node, executor = observer
+    with open(tmp_path / 'log', 'w+', encoding='utf-8') as log, subprocess.Popen(
+            [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, 'users:=3', 'seed:=4',
+             f'config:={ROOT}/config/quick.yaml', f'codebook:={ROOT}/config/codebook_quick.yaml',
+             'namespace:=launched'],
+            stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True,
+            env={**os.environ, 'ROS_LOG_DIR': str(tmp_path)}) as process:
+        try:
+            end_s = time.monotonic() + PATIENCE_S
+            while {record.user for record in node.log.complete} != {1, 2, 3}:
+                executor.spin_once(timeout_sec=0.1)
+                assert process.poll() is None and time.monotonic() < end_s, (
+                    tmp_path / 'log').read_text(encoding='utf-8')
+            process.send_signal(number)
+            assert process.wait(PATIENCE_S) in (0, 1, -number)
+            end_s = time.monotonic() + PATIENCE_S
+            while is_there(process.pid):
+                assert time.monotonic() < end_s, 'processes are left behind'
+        finally:
+            if is_there(process.pid):
+                os.killpg(process.pid, signal.SIGKILL)
+    text = (tmp_path / 'log').read_text(encoding='utf-8')
+    assert 'Traceback' not in text, text
+    assert 'process has died' not in text, text
