@@ -40,7 +40,8 @@ setup(
         'experiments': ['dask', 'distributed', 'joblib'],
         'neural': ['scikit-learn'],
         'genetic': ['pymoo'],
-        'test': ['pytest'],
+        'recording': ['mcap'],
+        'test': ['mcap-ros2-support', 'pytest'],
     },
     zip_safe=False,
     entry_points={

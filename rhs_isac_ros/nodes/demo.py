@@ -16,6 +16,7 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.nodes.demo_report import draw, summary, table
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.resources import default_codebook_file
 
 # Without a new cycle for this long, something is broken.
@@ -49,9 +50,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'error: {error}\nA codebook for a scenario is made by: python -m '
               'rhs_isac_ros.codebook --scenario FILE --output FILE', file=sys.stderr)
         return 2
+    try:
+        recorder = Recorder(options.record, scenario) if options.record else None
+    except RecordingError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
     os.environ.update(private_domain())
     rclpy.init(args=[])
-    observer = CycleObserver()
+    observer = CycleObserver(recorder)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         processes = Processes(Path(logs), {'ROS_LOG_DIR': logs})
         try:
@@ -64,6 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             observer.destroy_node()
             rclpy.try_shutdown()
+            if recorder is not None:
+                recorder.close()
     try:
         return _report(observer, scenario, options, problem)
     except KeyboardInterrupt:
@@ -149,6 +157,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--seed', type=_not_negative, default=0, help='seed of all random numbers')
     parser.add_argument('--config', type=Path, help="scenario file; the paper's Table I if none")
     parser.add_argument('--codebook', type=Path, help="codebook file; the package's if none")
+    parser.add_argument('--record', type=Path, metavar='FILE', help='recording to write (MCAP)')
     parser.add_argument('--picture', type=Path, default=Path('demo.png'), help='file to draw')
     return parser
 
@@ -185,6 +194,8 @@ def _report(
         print(summary(complete, given_up))
         draw(complete, scenario, options.picture)
         print(f'picture: {options.picture}')
+    if options.record:
+        print(f'recording: {options.record}')
     if problem:
         print(f'error: {problem}', file=sys.stderr)
     return 1 if problem or given_up else 0

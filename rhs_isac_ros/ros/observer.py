@@ -5,14 +5,21 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 
 from rhs_isac_ros.protocol import cycle_log
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.recording import Recorder
 
 
 class CycleObserver(Node):
     """Collects the cycles that it sees on the topics.
+
+    Parameters
+    ----------
+    recorder
+        Also takes down what is seen, and everything else; whoever made it closes it.
 
     Attributes
     ----------
@@ -20,14 +27,24 @@ class CycleObserver(Node):
         The cycles.
     """
 
-    def __init__(self, **node_options: Any) -> None:
+    def __init__(self, recorder: Recorder | None = None, **node_options: Any) -> None:
         super().__init__('cycle_observer', **node_options)
         self.log = cycle_log.CycleLog()
+        if recorder is not None:
+            # One subscription for both, so that a replay sees the same cycles in the same order.
+            kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
+            recorder.listen(self, lambda name, message: self._on_recorded(
+                kinds.get(name), message))
+            return
         for kind in cycle_log.RECEIVES:
             self.create_subscription(
                 convert.ros_type(kind), topics.NAMES[kind],
                 lambda message, kind=kind: self._on_message(kind, message), qos.EXCHANGE,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+
+    def _on_recorded(self, kind: type[m.Message] | None, message: bytes) -> None:
+        if kind is not None:
+            self._on_message(kind, deserialize_message(message, convert.ros_type(kind)))
 
     def _on_message(self, kind: type[m.Message], message: Any) -> None:
         self.log.add(convert.from_ros(kind, message), time.monotonic())

@@ -1,0 +1,194 @@
+"""``scripts/replay FILE``: what estimators make of the received signals of a recording."""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.positioning import ESTIMATORS, Estimator, ModelError, make_estimator
+from rhs_isac_ros.positioning.store import default_folder
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.cycle_log import RECEIVES, CycleLog, CycleRecord
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """What a recording holds of one network.
+
+    Attributes
+    ----------
+    scenario
+        Its scenario.
+    cycles
+        Its complete cycles.
+    codebooks
+        Its codebooks, by their ids.
+    """
+
+    scenario: Scenario
+    cycles: list[CycleRecord]
+    codebooks: dict[str, Codebook]
+
+
+def load(path: str | Path, namespace: str = '/', scenario: Scenario | None = None) -> Recording:
+    """Read the cycles of a recording.
+
+    Parameters
+    ----------
+    path
+        The file.
+    namespace
+        Namespace of the network.
+    scenario
+        Scenario in place of the recording's.
+
+    Returns
+    -------
+    Recording
+        What it holds.
+
+    Raises
+    ------
+    RecordingError
+        If the file is no recording, has no complete cycle in the namespace, or a message is
+        malformed.
+    ScenarioError, CodebookError
+        If the scenario or a codebook in it is wrong.
+    """
+    scenario = scenario or read_scenario(path) or Scenario()
+    root = f'/{namespace.strip("/")}/'.replace('//', '/')
+    kinds = {f'{root}{topics.NAMES[kind]}': kind for kind in RECEIVES}
+    log, codebooks = CycleLog(), {}
+    for topic, message, time_s in read(path):
+        try:
+            if topic in kinds:
+                plain = convert.from_ros(kinds[topic], message)
+                m.check(plain, scenario.sizes)
+                log.add(plain, time_s)
+            elif topic == f'{root}{topics.CODEBOOK}' and isinstance(message, ros.Codebook):
+                codebooks[message.codebook_id] = convert.codebook_from_ros(message)
+        except m.MessageError as error:
+            raise RecordingError(f'{path}: {topic}: {error}') from None
+    if not log.complete:
+        raise RecordingError(f'{path}: no complete cycle in the namespace {namespace}')
+    return Recording(scenario, log.complete, codebooks)
+
+
+def errors_m(cycles: Sequence[CycleRecord], estimators: Mapping[str, Estimator]) -> np.ndarray:
+    """Estimate every cycle's position anew and return the distances from the true ones.
+
+    Parameters
+    ----------
+    cycles
+        Complete cycles.
+    estimators
+        Estimators by the id of the codebook with which the signals were taken.
+
+    Returns
+    -------
+    numpy.ndarray
+        Errors, float64 [len(cycles)] [m]; NaN where the signals tell no position.
+    """
+    errors = []
+    for cycle in cycles:
+        signals = cycle.signals.signals
+        estimate = estimators[cycle.signals.codebook_id].estimate(
+            signals.reshape(len(signals), -1))
+        errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
+                      if estimate.fix else np.nan)
+    return np.array(errors)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the errors of the live network and of estimators that see its signals again.
+
+    Parameters
+    ----------
+    arguments
+        Command line; by default the process's.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or 2 if an argument or a file is wrong.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        scenario = Scenario.from_yaml(options.config) if options.config else None
+        recording = load(options.file, options.namespace, scenario)
+        codebooks = _codebooks(recording, options.codebook)
+        live = np.array([cycle.error_m for cycle in recording.cycles])
+        names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
+        print(f'{len(live)} cycles\n{"":12s} median error  root mean square  no fix')
+        print(_row(f'live {", ".join(names)}', live))
+        for name in options.estimator or ['bayes']:
+            made = {key: make_estimator(
+                name, recording.scenario, codebook, **_files(name, options))
+                for key, codebook in codebooks.items()}
+            print(_row(name, errors_m(recording.cycles, made)))
+    except (RecordingError, ScenarioError, CodebookError, ModelError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def _row(name: str, errors: np.ndarray) -> str:
+    fixes = errors[~np.isnan(errors)]
+    median, rms = ((np.median(fixes), np.sqrt(np.mean(fixes**2))) if len(fixes)
+                   else (np.nan, np.nan))
+    return f'{name:12s} {median:10.6f} m {rms:15.6f} m {len(errors) - len(fixes):7d}'
+
+
+def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
+    """Return the codebook for the signals of every cycle, checked."""
+    used = sorted({cycle.signals.codebook_id for cycle in recording.cycles})
+    if file:
+        given = Codebook.load(file)
+        for key in used:
+            if key != given.id:
+                print(f'signals taken with codebook {key} are read as if with {given.id}',
+                      file=sys.stderr)
+        chosen = dict.fromkeys(used, given)
+    else:
+        missing = [key for key in used if key not in recording.codebooks]
+        if missing:
+            raise RecordingError(f'codebook {missing[0]}: not in the recording, expected its '
+                                 'file: --codebook FILE')
+        chosen = {key: recording.codebooks[key] for key in used}
+    for codebook in chosen.values():
+        codebook.check(recording.scenario)
+    return chosen
+
+
+def _files(name: str, options: argparse.Namespace) -> dict[str, object]:
+    if name == 'neural':
+        return {'model_file': options.model or ''}
+    return {'table_folder': default_folder()}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='replay', description='Feed the received signals of a recording to estimators, and '
+        'compare their errors with those of the live network.')
+    parser.add_argument('file', type=Path, help='recording')
+    parser.add_argument('--estimator', action='append', choices=tuple(ESTIMATORS),
+                        help='may be given more than once (default: bayes)')
+    parser.add_argument('--codebook', type=Path, metavar='FILE',
+                        help="codebook to assume; the recording's if none")
+    parser.add_argument('--config', type=Path, metavar='FILE',
+                        help="scenario file; the recording's if none")
+    parser.add_argument('--model', type=Path, metavar='FILE', help='model of the estimator neural')
+    parser.add_argument('--namespace', default='/', help='network of the recording (default: /)')
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

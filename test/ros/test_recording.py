@@ -1,0 +1,157 @@
+"""Recordings: written from a node, read back here and by an independent decoder."""
+
+import array
+import sys
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.ros import qos
+from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros.recording import (
+    Recorder,
+    RecordingError,
+    outlets,
+    read,
+    read_scenario,
+    schema,
+    type_name,
+)
+
+pytest.importorskip('mcap', reason='there is no mcap here')
+
+
+def received(cycle_id):
+    return ros.ReceivedSignals(
+        cycle_id=cycle_id, user=2, codebook_id='cb1', signals=ros.ComplexArray(
+            shape=array.array('I', [1, 1, 3]), re=array.array('d', [1.0, -2.5, cycle_id]),
+            im=array.array('d', [0.25, 0.0, 1e-30])))
+
+
+@pytest.fixture
+def recording(bench, probe, tmp_path):
+    """A file of three messages of two kinds, and the messages."""
+    recorder = Recorder(tmp_path / 'run.mcap', Scenario(n_frames=2))
+    recorder.listen(probe)
+    sent = [received(1), ros.PositionEstimate(cycle_id=1, covariance_m2=np.arange(9.0)),
+            received(2)]
+    publishers = {ros.ReceivedSignals: 'received_signals',
+                  ros.PositionEstimate: 'position_estimate'}
+    publishers = {kind: probe.create_publisher(kind, name, qos.EXCHANGE)
+                  for kind, name in publishers.items()}
+    for publisher in publishers.values():
+        bench.until(publisher.get_subscription_count, 'the recorder')
+    for number, message in enumerate(sent, 1):
+        publishers[type(message)].publish(message)
+        bench.until(lambda number=number: recorder.count >= number, 'the message')
+    path = tmp_path / 'run.mcap'
+    assert not path.exists()
+    recorder.close()
+    recorder.close()
+    assert [file.name for file in tmp_path.iterdir()] == ['run.mcap']
+    return path, sent
+
+
+def test_what_was_said_is_read_back(recording):
+    path, sent = recording
+    found = list(read(path))
+    assert [message for _, message, _ in found] == sent
+    assert [topic for topic, _, _ in found] == [
+        '/received_signals', '/position_estimate', '/received_signals']
+    times = [time_s for _, _, time_s in found]
+    assert times == sorted(times)
+    assert read_scenario(path) == Scenario(n_frames=2)
+
+
+def test_another_decoder_needs_only_the_file(recording):
+    """It knows the messages from the definitions in the file alone, as Foxglove does."""
+    mcap_ros2 = pytest.importorskip('mcap_ros2.decoder', reason='there is no mcap_ros2 here')
+    from mcap.reader import make_reader
+    path, sent = recording
+    with open(path, 'rb') as stream:
+        reader = make_reader(stream, decoder_factories=[mcap_ros2.DecoderFactory()])
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+        found = [message for *_, message in reader.iter_decoded_messages()]
+    assert {channel.topic for channel in summary.channels.values()} == {
+        f'/{name}' for name in outlets()}
+    assert [list(message.signals.re) for message in (found[0], found[2])] == [
+        list(message.signals.re) for message in (sent[0], sent[2])]
+    assert list(found[1].covariance_m2) == list(range(9))
+
+
+def test_every_definition_can_be_parsed():
+    pytest.importorskip('mcap_ros2', reason='there is no mcap_ros2 here')
+    from mcap_ros2._dynamic import generate_dynamic
+    for kind, _ in outlets().values():
+        assert type_name(kind) in generate_dynamic(type_name(kind), schema(kind))
+
+
+def test_a_definition_names_each_of_its_parts_once():
+    text = schema(PoseWithCovarianceStamped)
+    parts = [line for line in text.splitlines() if line.startswith('MSG: ')]
+    assert sorted(parts) == [
+        'MSG: builtin_interfaces/Time', 'MSG: geometry_msgs/Point', 'MSG: geometry_msgs/Pose',
+        'MSG: geometry_msgs/PoseWithCovariance', 'MSG: geometry_msgs/Quaternion',
+        'MSG: std_msgs/Header']
+
+
+def test_an_observer_sees_what_it_records(bench, probe, tmp_path):
+    recorder = Recorder(tmp_path / 'run.mcap', Scenario())
+    observer = bench.add(CycleObserver, recorder)
+    beacon = probe.create_publisher(ros.Beacon, 'beacon', qos.EXCHANGE)
+    state = probe.create_publisher(ros.ProtocolState, 'protocol_state', qos.EXCHANGE)
+    for publisher in (beacon, state):
+        bench.until(publisher.get_subscription_count, 'the recorder')
+    beacon.publish(ros.Beacon(cycle_id=7))
+    bench.until(lambda: recorder.count == 1)
+    state.publish(ros.ProtocolState(cycle_id=7, user=1, outcome='no_ack'))
+    bench.until(lambda: observer.log.given_up)
+    assert observer.log.given_up[0].cycle_id == 7
+    recorder.close()
+    assert [topic for topic, _, _ in read(tmp_path / 'run.mcap')] == ['/beacon', '/protocol_state']
+
+
+@pytest.mark.parametrize('content', [b'', b'no recording at all', None], ids=str)
+def test_what_is_no_recording_is_named(tmp_path, content):
+    path = tmp_path / 'bad.mcap'
+    if content is not None:
+        path.write_bytes(content)
+    for act in (lambda: list(read(path)), lambda: read_scenario(path)):
+        with pytest.raises(RecordingError, match=f'^{path}: '):
+            act()
+
+
+def test_half_a_recording_is_named(recording):
+    path, _ = recording
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(RecordingError, match=f'^{path}: no whole recording'):
+        list(read(path))
+
+
+def test_a_scenario_of_another_version_is_named(tmp_path):
+    class Other:
+        def changes(self):
+            return {'n_moons': 2}
+    recorder = Recorder(tmp_path / 'run.mcap', Other())
+    recorder.close()
+    with pytest.raises(RecordingError, match='its scenario is none: .*n_moons'):
+        read_scenario(tmp_path / 'run.mcap')
+
+
+def test_a_place_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RecordingError, match='none/run.mcap: cannot be written: No such file'):
+        Recorder(tmp_path / 'none' / 'run.mcap', Scenario())
+
+
+def test_without_the_library_the_error_says_so(tmp_path, monkeypatch):
+    for name in ('mcap.writer', 'mcap.reader'):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(RecordingError, match=r'^recording needs mcap.*pip install mcap'):
+        Recorder(tmp_path / 'run.mcap', Scenario())
+    with pytest.raises(RecordingError, match='^reading a recording needs mcap'):
+        list(read(tmp_path / 'run.mcap'))
+    assert not list(tmp_path.iterdir())
