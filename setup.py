@@ -15,6 +15,7 @@ NODES = (
     'rhs_controller',
     'transmission',
     'user',
+    'visualizer',
 )
 
 setup(

@@ -132,6 +132,10 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         SCENARIO,
         Parameter('codebook_file', '', 'Codebook to hold; empty: the one of the package.'),
     ),
+    'visualizer': (
+        SCENARIO,
+        Parameter('period_s', 0.2, 'How often it shows the scene.', 's', 0.01, 60.0),
+    ),
     'network': (
         Parameter('users', 2, 'Number of users.', low=1, high=1000),
     ),

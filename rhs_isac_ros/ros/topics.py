@@ -27,6 +27,7 @@ NAMES: Mapping[type[m.Message], str] = {
 POSITION = 'position'
 CODEBOOK = 'codebook'
 DIAGNOSTICS = 'diagnostics'
+MARKERS = 'markers'
 
 # The node that holds the codebook as its parameters.
 OPTIMIZER_NODE = 'optimizer'

@@ -1,0 +1,149 @@
+"""The scene of a network as markers for RViz: metres in the frame ``map``, x outward, z up."""
+
+import colorsys
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Quaternion, Vector3
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import element_interval_m, element_positions
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.topics import MAP_FRAME
+
+# Quantile of the squared distance that holds 95 % of a Gaussian in three dimensions.
+_CHI_SQUARE_95 = float(chdtri(3, 0.05))
+_USER_SIZE_M = 0.25
+# A body without extent is not drawn, and RViz complains about it [m].
+_THINNEST_M = 1e-3
+# Hues of users whose numbers follow on each other differ by the golden ratio.
+_HUE_STEP = 0.618034
+
+
+def board(scenario: Scenario, configuration: np.ndarray | None, stamp: Time) -> Marker:
+    """Return the surface, an element a square, from dark for 0 to bright for 1.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    configuration
+        What the surface applies, float64 [F, N_E] in [0, 1], of which the mean over the frames is
+        shown; None if that is not known.
+    stamp
+        Time of the marker.
+
+    Returns
+    -------
+    visualization_msgs.msg.Marker
+        A list of cubes.
+    """
+    places = element_positions(scenario)
+    shown = np.full(len(places), 0.5) if configuration is None else np.mean(configuration, axis=0)
+    side_m = 0.9 * element_interval_m(scenario)
+    marker = _marker('board', 0, Marker.CUBE_LIST, stamp)
+    marker.scale = Vector3(x=_THINNEST_M, y=side_m, z=side_m)
+    marker.points = [_point(place) for place in places]
+    marker.colors = [ColorRGBA(r=float(c), g=float(c), b=0.3 + 0.2 * float(c), a=1.0)
+                     for c in shown]
+    return marker
+
+
+def region(scenario: Scenario, stamp: Time) -> Marker:
+    """Return the region of interest.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    stamp
+        Time of the marker.
+
+    Returns
+    -------
+    visualization_msgs.msg.Marker
+        A cuboid that can be looked through.
+    """
+    marker = _marker('region', 0, Marker.CUBE, stamp)
+    marker.pose.position = _point(np.array(scenario.roi_center_m))
+    marker.scale = _vector(np.array(scenario.roi_size_m))
+    marker.color = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.15)
+    return marker
+
+
+def truth(message: m.GroundTruth, stamp: Time) -> Marker:
+    """Return where a user really is.
+
+    Parameters
+    ----------
+    message
+        The true position.
+    stamp
+        Time of the marker.
+
+    Returns
+    -------
+    visualization_msgs.msg.Marker
+        A small ball in the colour of the user.
+    """
+    marker = _marker('truth', message.user, Marker.SPHERE, stamp)
+    marker.pose.position = _point(message.position)
+    marker.scale = _vector(np.full(3, _USER_SIZE_M))
+    marker.color = _colour(message.user, 1.0)
+    return marker
+
+
+def estimate(message: m.PositionEstimate, stamp: Time) -> Marker:
+    """Return what is known of a user's position.
+
+    Parameters
+    ----------
+    message
+        The estimate.
+    stamp
+        Time of the marker.
+
+    Returns
+    -------
+    visualization_msgs.msg.Marker
+        The ellipsoid that holds 95 % of a Gaussian with the mean and covariance of the estimate,
+        in the colour of the user.
+    """
+    variances_m2, axes = np.linalg.eigh(message.covariance_m2)
+    # A rotation, not a reflection.
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    x, y, z, w = Rotation.from_matrix(axes).as_quat().tolist()
+    marker = _marker('estimate', message.user, Marker.SPHERE, stamp)
+    marker.pose.position = _point(message.position)
+    marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
+    diameters_m = 2 * np.sqrt(_CHI_SQUARE_95 * np.maximum(variances_m2, 0.0))
+    marker.scale = _vector(np.maximum(diameters_m, _THINNEST_M))
+    marker.color = _colour(message.user, 0.35)
+    return marker
+
+
+def _marker(namespace: str, number: int, kind: int, stamp: Time) -> Marker:
+    marker = Marker(header=Header(stamp=stamp, frame_id=MAP_FRAME), ns=namespace, type=kind,
+                    # Ids of markers have a sign, those of users have none.
+                    id=number & 0x7fffffff, action=Marker.ADD)
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _colour(user: int, opacity: float) -> ColorRGBA:
+    red, green, blue = colorsys.hsv_to_rgb(_HUE_STEP * user % 1.0, 0.8, 0.9)
+    return ColorRGBA(r=red, g=green, b=blue, a=opacity)
+
+
+def _point(values: np.ndarray) -> Point:
+    x, y, z = np.asarray(values).tolist()
+    return Point(x=x, y=y, z=z)
+
+
+def _vector(values: np.ndarray) -> Vector3:
+    x, y, z = np.asarray(values).tolist()
+    return Vector3(x=x, y=y, z=z)

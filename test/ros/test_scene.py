@@ -1,0 +1,85 @@
+"""Markers against plain geometry."""
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from visualization_msgs.msg import Marker
+
+from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import scene
+
+STAMP = Time(sec=3)
+# From a table of the chi-square distribution with three degrees of freedom.
+CHI_SQUARE_95 = 7.815
+
+
+def of(vector):
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def rotation(q):
+    """Matrix of a unit quaternion, written out."""
+    return np.array([
+        [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w), 2 * (q.x * q.z + q.y * q.w)],
+        [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2), 2 * (q.y * q.z - q.x * q.w)],
+        [2 * (q.x * q.z - q.y * q.w), 2 * (q.y * q.z + q.x * q.w), 1 - 2 * (q.x**2 + q.y**2)]])
+
+
+def an_estimate(covariance_m2, user=1):
+    return m.PositionEstimate(
+        5, user, 'cb', np.array([9.0, -1.0, 0.5]), covariance_m2, 0.1, 'bayes', 0.01)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_ellipsoid_is_that_of_the_covariance(seed):
+    root = np.random.default_rng(seed).normal(size=(3, 3))
+    marker = scene.estimate(an_estimate(root @ root.T), STAMP)
+    assert marker.type == Marker.SPHERE
+    assert of(marker.pose.position) == pytest.approx([9.0, -1.0, 0.5])
+    turn = rotation(marker.pose.orientation)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    radii = of(marker.scale) / 2
+    assert turn @ np.diag(radii**2) @ turn.T == pytest.approx(
+        CHI_SQUARE_95 * root @ root.T, rel=1e-3, abs=1e-3)
+
+
+def test_a_certain_position_is_drawn_all_the_same():
+    marker = scene.estimate(an_estimate(np.zeros((3, 3))), STAMP)
+    assert of(marker.scale).min() > 0
+
+
+def test_truth_and_estimate_of_a_user_share_a_hue_and_users_do_not():
+    markers = {}
+    for user in (1, 2, 2**32 - 1):
+        position = np.array([user % 7, 0.0, 0.0], float)
+        one = scene.truth(m.GroundTruth(0, user, position, np.zeros(3)), STAMP)
+        other = scene.estimate(an_estimate(np.eye(3), user), STAMP)
+        assert of(one.pose.position) == pytest.approx(position)
+        assert (one.ns, one.id) != (other.ns, other.id)
+        assert (one.color.r, one.color.g, one.color.b) == (
+            other.color.r, other.color.g, other.color.b)
+        assert one.color.a == 1 > other.color.a > 0
+        markers[one.color.r, one.color.g, one.color.b] = one
+    assert len(markers) == 3
+
+
+def test_the_board_shows_its_configuration(small):
+    configuration = np.linspace(0, 1, 2 * small.scenario.n_elements).reshape(2, -1)
+    marker = scene.board(small.scenario, configuration, STAMP)
+    assert np.array([of(point) for point in marker.points]) == pytest.approx(
+        element_positions(small.scenario))
+    assert [color.r for color in marker.colors] == pytest.approx(configuration.mean(axis=0))
+    places = np.unique(element_positions(small.scenario)[:, 1])
+    assert 0 < marker.scale.y == marker.scale.z < np.diff(places).min()
+    unknown = scene.board(small.scenario, None, STAMP)
+    assert len({color.r for color in unknown.colors}) == 1
+
+
+def test_the_region_is_where_the_scenario_says(small):
+    marker = scene.region(small.scenario, STAMP)
+    low, high = small.scenario.roi_bounds_m
+    assert of(marker.pose.position) - of(marker.scale) / 2 == pytest.approx(low)
+    assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
+    assert (marker.header.frame_id, marker.header.stamp) == ('map', STAMP)
+    assert marker.pose.orientation.w == 1
