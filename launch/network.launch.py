@@ -4,6 +4,7 @@
 """
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -19,6 +20,7 @@ ARGUMENTS = {
     'codebook': ('', 'Codebook file, of the sizes of the scenario; empty: that of the package.'),
     'seed': ('0', 'Seed of all random numbers.'),
     'estimator': ('bayes', 'Estimator of the position.'),
+    'visualizer': ('false', 'Whether to publish markers for RViz and Foxglove.'),
     'namespace': ('', 'Namespace of all nodes and topics: one for each of many networks.'),
 }
 
@@ -69,6 +71,7 @@ def start_nodes(context: LaunchContext) -> list[Node]:
         *(_node('user', f'user_{number}', user_id=number, **seed)
           for number in range(1, int(text) + 1)),
         _node('bs', **seed),
+        _node('visualizer', condition=IfCondition(LaunchConfiguration('visualizer'))),
     ]
 
 
@@ -77,9 +80,12 @@ def _typed(argument: str, kind: type) -> ParameterValue:
     return ParameterValue(LaunchConfiguration(argument), value_type=kind)
 
 
-def _node(executable: str, name: str = '', **parameters: ParameterValue | int) -> Node:
+def _node(
+        executable: str, name: str = '', condition: IfCondition | None = None,
+        **parameters: ParameterValue | int) -> Node:
     name = name or executable
     return Node(
         package=PACKAGE, executable=executable, name=name, exec_name=name, output='screen',
         namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
+        condition=condition,
         parameters=[{'scenario_file': _typed('config', str), **parameters}])

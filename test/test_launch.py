@@ -57,7 +57,8 @@ def test_parameters_of_the_xml_variant_are_declared():
     values = {param.get('name'): param.get('value') for param in root.iter('param')}
     assert values.keys() <= declared
     assert {f'$(var {name})' for name in arguments_of_xml()} == {
-        *values.values(), *(node.get('namespace') for node in root.iter('node'))}
+        *values.values(), '$(var visualizer)',
+        *(node.get('namespace') for node in root.iter('node'))}
 
 
 @needs_launch
@@ -109,12 +110,13 @@ def test_all_users_are_served_and_nothing_is_left_behind(file, number, observer,
     with open(tmp_path / 'log', 'w+', encoding='utf-8') as log, subprocess.Popen(
             [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, 'users:=3', 'seed:=4',
              f'config:={ROOT}/config/quick.yaml', f'codebook:={ROOT}/config/codebook_quick.yaml',
-             'namespace:=launched'],
+             'namespace:=launched', 'visualizer:=true'],
             stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, 'ROS_LOG_DIR': str(tmp_path)}) as process:
         try:
             end_s = time.monotonic() + PATIENCE_S
-            while {record.user for record in node.log.complete} != {1, 2, 3}:
+            while ({record.user for record in node.log.complete} != {1, 2, 3}
+                   or not node.count_publishers('/launched/markers')):
                 executor.spin_once(timeout_sec=0.1)
                 assert process.poll() is None and time.monotonic() < end_s, (
                     tmp_path / 'log').read_text(encoding='utf-8')
