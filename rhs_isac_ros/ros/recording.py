@@ -89,6 +89,16 @@ def schema(kind: type) -> str:
     return '\n'.join([own, *(f'{_RULE}\nMSG: {name}\n{text}' for name, text in texts.items())])
 
 
+def _offered(profile: QoSProfile) -> str:
+    """Write a quality of service as ``ros2 bag play`` reads it: else nothing would be latched."""
+    for_ever = {'sec': 9223372036, 'nsec': 854775807}
+    return yaml.safe_dump([{
+        'history': profile.history.short_key, 'depth': profile.depth,
+        'reliability': profile.reliability.short_key, 'durability': profile.durability.short_key,
+        'deadline': dict(for_ever), 'lifespan': dict(for_ever), 'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(for_ever), 'avoid_ros_namespace_conventions': False}])
+
+
 def _parts(text: str, package: str) -> Iterator[str]:
     """Yield the messages that a definition names."""
     for line in text.splitlines():
@@ -153,7 +163,7 @@ class Recorder:
                 topic=node.resolve_topic_name(name), message_encoding='cdr',
                 schema_id=self._writer.register_schema(
                     type_name(kind), 'ros2msg', schema(kind).encode()),
-                metadata={'offered_qos_profiles': ''})
+                metadata={'offered_qos_profiles': _offered(profile)})
             node.create_subscription(
                 kind, name, self._writes(channel, name, then), profile, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))

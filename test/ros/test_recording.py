@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 import rhs_isac_msgs.msg as ros
@@ -78,6 +79,11 @@ def test_another_decoder_needs_only_the_file(recording):
         found = [message for *_, message in reader.iter_decoded_messages()]
     assert {channel.topic for channel in summary.channels.values()} == {
         f'/{name}' for name in outlets()}
+    offered = {channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])
+               for channel in summary.channels.values()}
+    assert [offered[topic][0]['durability'] for topic in ('/codebook', '/pilot')] == [
+        'transient_local', 'volatile']
+    assert {profile['reliability'] for (profile,) in offered.values()} == {'reliable'}
     assert [list(message.signals.re) for message in (found[0], found[2])] == [
         list(message.signals.re) for message in (sent[0], sent[2])]
     assert list(found[1].covariance_m2) == list(range(9))
