@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 from ament_index_python.packages import get_package_share_directory
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -43,6 +44,7 @@ def outlets() -> dict[str, tuple[type, QoSProfile]]:
     found = {name: (convert.ros_type(kind), qos.of(kind)) for kind, name in topics.NAMES.items()}
     found[topics.POSITION] = PoseWithCovarianceStamped, qos.EXCHANGE
     found[topics.CODEBOOK] = ros.Codebook, qos.LATCHED
+    found[topics.DIAGNOSTICS] = DiagnosticArray, qos.EXCHANGE
     return found
 
 
