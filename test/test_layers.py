@@ -12,8 +12,8 @@ import rhs_isac_ros
 
 LAYERS = (
     'model', 'bounds', 'codebook', 'positioning', 'link', 'experiments', 'protocol', 'ros',
-    'nodes', 'cli')
-ROS_LAYERS = ('ros', 'nodes', 'cli')
+    'nodes')
+ROS_LAYERS = ('ros', 'nodes')
 PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)
 # All that the pure layers may import besides the standard library and their own.
 LIBRARIES = {'numpy', 'scipy', 'yaml'}

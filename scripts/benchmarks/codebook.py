@@ -18,6 +18,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
+from rhs_isac_ros.experiments.resampling import reduction
 from rhs_isac_ros.model import Scenario, simulate_received, streams
 from rhs_isac_ros.positioning import make_estimator
 
@@ -42,25 +43,29 @@ def main() -> None:
         'directional': directional_codebook(scenario),
         'random': random_codebook(scenario, streams.generator(options.seed, streams.START)),
         **{path.stem: Codebook.load(path) for path in options.codebook}}
-    errors = {name: squared_errors(scenario, codebook, options.positions, options.seed)
-              for name, codebook in codebooks.items()}
+    errors, in_range = {}, {}
+    for name, codebook in codebooks.items():
+        errors[name], in_range[name] = squared_errors(
+            scenario, codebook, options.positions, options.seed)
     print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
-    print('| codebook | mean squared error [m^2] | standard error | median | average CRLB [m^2] |')
-    print('|---|---|---|---|---|')
+    print('| codebook | mean squared error [m^2] | standard error | of it in range | median | '
+          'average CRLB [m^2] |\n|---|---|---|---|---|---|')
     figures = {}
     for name, codebook in codebooks.items():
         bound = crlb(scenario, codebook, places(scenario, options.positions, options.seed)).mean()
         figures[name] = {
             'id': codebook.id, 'mse_m2': errors[name].mean(),
             'standard_error_m2': errors[name].std() / np.sqrt(options.positions),
+            'in_range_m2': in_range[name].mean(),
             'median_m2': np.median(errors[name]), 'average_crlb_m2': bound}
-        print('| {} | {mse_m2:.3f} | {standard_error_m2:.3f} | {median_m2:.3f} | '
-              '{average_crlb_m2:.4f} |'.format(name, **figures[name]))
+        print('| {} | {mse_m2:.3f} | {standard_error_m2:.3f} | {in_range_m2:.3f} | '
+              '{median_m2:.3f} | {average_crlb_m2:.4f} |'.format(name, **figures[name]))
     print()
     for rival in ('crlb', 'directional', 'random'):
-        less, spread = reduction(errors['ambiguity'], errors[rival])
+        less, low, high = reduction(
+            errors['ambiguity'], errors[rival], lambda values: values.mean(axis=-1))
         figures[f'reduction_{rival}_percent'] = less
-        print(f'ambiguity is {less:.1f} % below {rival} (standard error {spread:.1f})')
+        print(f'ambiguity is {less:.1f} % below {rival} (95 % interval {low:.1f} to {high:.1f})')
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
 
@@ -70,23 +75,18 @@ def places(scenario: Scenario, n: int, seed: int) -> np.ndarray:
     return scenario.sample_positions(n, np.random.default_rng(seed))
 
 
-def squared_errors(scenario: Scenario, codebook: Codebook, n: int, seed: int) -> np.ndarray:
-    """Squared error of the posterior mean at every position [m^2]."""
+def squared_errors(
+        scenario: Scenario, codebook: Codebook, n: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Squared error of the posterior mean at every position, and its part in range [m^2]."""
     positions = places(scenario, n, seed)
     # The same draws of multipath and noise, whatever the codebook makes of them.
     received = simulate_received(scenario, codebook, positions, np.random.default_rng(seed + 1))
     estimator = make_estimator('bayes', scenario, codebook)
     means = np.concatenate([estimator.estimate(received[start:start + BATCH]).mean
                             for start in range(0, n, BATCH)])
-    return np.sum((means - positions)**2, axis=1)
-
-
-def reduction(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
-    """How far one mean lies below another, and its standard error by paired resampling [%]."""
-    rng = np.random.default_rng(0)
-    picks = rng.integers(len(ours), size=(2000, len(ours)))
-    samples = 1 - ours[picks].mean(axis=1) / theirs[picks].mean(axis=1)
-    return 100 * float(1 - ours.mean() / theirs.mean()), 100 * float(samples.std())
+    ranges = np.linalg.norm(means, axis=1) - np.linalg.norm(positions, axis=1)
+    return np.sum((means - positions)**2, axis=1), ranges**2
 
 
 if __name__ == '__main__':

@@ -11,14 +11,13 @@ import argparse
 import importlib.util
 import json
 import os
-import re
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from parts.optimizer_growth import GROWTH, POSITIONS, growth, side_by_side
 from peers.jax_crlb import JaxAverageCrlb
 from scipy.optimize import minimize
 
@@ -33,12 +32,7 @@ from rhs_isac_ros.model import Scenario, streams
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
 TARGET_M2 = 0.0415
-POSITIONS = 1200
 HELD_OUT = 2000
-# Sides of the surface, numbers of positions and of bands of part (c).
-GROWTH = {'N_sam': (100, 300, 1000, 3000, 10000), 'N_E': (100, 256, 484, 1024),
-          'N_B': (1, 2, 4, 8)}
-LARGE = {'N_sam': POSITIONS, 'N_E': 1024, 'N_B': 4}
 
 
 def main() -> None:
@@ -50,12 +44,8 @@ def main() -> None:
     parser.add_argument('--parts', default='abc', help='which parts to run')
     parser.add_argument('--json', type=Path, help='file for the figures')
     parser.add_argument('--picture', type=Path, help='file for a picture')
-    parser.add_argument('--growth', help=argparse.SUPPRESS)
     options = parser.parse_args()
     pin(options.threads)
-    if options.growth:
-        print(json.dumps(grow(json.loads(options.growth))))
-        return
     if not HAVE_JAX:
         print('JAX is not installed, so its figures are left out: '
               'python -m pip install --no-deps -r requirements-peers.txt\n', file=sys.stderr)
@@ -121,17 +111,6 @@ def products(problem: Problem, scenario: Scenario) -> Callable[[], list]:
         pairs.append((rows, rng.normal(size=(rows.shape[1], size)) + 0j,
                       rng.normal(size=(len(rows), size)) + 0j))
     return lambda: [(rows @ right, rows.T @ left) for rows, right, left in pairs]
-
-
-def side_by_side(contenders: dict[str, Callable], rounds: int = 25) -> dict[str, float]:
-    """Median times, taken in turn so that a disturbance meets everybody [s]."""
-    times: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(rounds):
-        for name, function in contenders.items():
-            begin = time.perf_counter()
-            function()
-            times[name].append(time.perf_counter() - begin)
-    return {name: float(np.median(values[3:])) for name, values in times.items()}
 
 
 def target(limit_s: float) -> dict:
@@ -256,60 +235,6 @@ def first_below(scenario: Scenario, trace: Trace, held_out: np.ndarray) -> tuple
         else:
             low = middle + 1
     return trace[high]
-
-
-def growth() -> dict:
-    """Part (c); every size in a process of its own, for its peak memory."""
-    print('(c) growth: set-up, one value and gradient, peak memory of the process\n')
-    print('| size | set-up [s] | evaluation [ms] | peak [MiB] | ranks |\n|---|---|---|---|---|')
-    base = {'N_sam': POSITIONS, 'N_E': 100, 'N_B': 2}
-    rows = {}
-    for symbol, values in GROWTH.items():
-        for value in values:
-            rows[f'{symbol} = {value}'] = measured(base | {symbol: value})
-    large = ', '.join(f'{symbol} = {value}' for symbol, value in LARGE.items())
-    rows[large] = measured(LARGE)
-    for name, row in rows.items():
-        print(f'| {name} | {row["setup_s"]:.2f} | {row["evaluation_ms"]:.1f} | '
-              f'{row["peak_mib"]:.0f} | {", ".join(map(str, row["ranks"]))} |')
-    def to_linear(symbol: str, a: int, b: int) -> float:
-        first, second = (rows[f'{symbol} = {n}']['evaluation_ms'] for n in (a, b))
-        return second / first * a / b
-
-    whole = {symbol: to_linear(symbol, values[0], values[-1])
-             for symbol, values in GROWTH.items()}
-    step = {symbol: max(to_linear(symbol, *pair) for pair in zip(values, values[1:], strict=False))
-            for symbol, values in GROWTH.items()}
-    print('\nrelative to linear growth, from end to end (and in the steepest step): '
-          + ', '.join(f'{s} {whole[s]:.2f} ({step[s]:.2f})' for s in GROWTH) + '\n')
-    return {'growth': rows, 'growth_to_linear': whole, 'growth_to_linear_steepest': step,
-            'large_peak_mib': rows[large]['peak_mib']}
-
-
-def measured(sizes: dict[str, int]) -> dict:
-    """Measure one size in a new process."""
-    done = subprocess.run(
-        [sys.executable, __file__, '--threads', str(threads()), '--growth', json.dumps(sizes)],
-        stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout)
-
-
-def grow(sizes: dict[str, int]) -> dict:
-    """Set-up time, time of an evaluation, and peak memory of this process."""
-    scenario = Scenario(
-        center_frequencies_hz=tuple(2e9 + 0.5e9 * (i + 1) for i in range(sizes['N_B'])),
-        elements_per_side=round(sizes['N_E']**0.5))
-    positions = monte_carlo(scenario, sizes['N_sam'], streams.generator(0, streams.SAMPLES))
-    codebook = random_codebook(scenario, streams.generator(0, streams.START))
-    begin = time.perf_counter()
-    average = AverageCrlb(scenario, positions, ROW_TOLERANCE)
-    setup_s = time.perf_counter() - begin
-    average(codebook)
-    seconds = side_by_side({'evaluation': lambda: average(codebook)}, 15)['evaluation']
-    # Not getrusage, which also counts the process that this one was forked from.
-    peak = re.search(r'VmHWM:\s*(\d+) kB', Path('/proc/self/status').read_text(encoding='ascii'))
-    return {'setup_s': setup_s, 'evaluation_ms': 1e3 * seconds, 'peak_mib': int(peak[1]) / 1024,
-            'ranks': average.rows.ranks}
 
 
 def draw(figures: dict, path: Path) -> None:

@@ -37,7 +37,7 @@ from rhs_isac_ros.experiments import (
     run_jobs,
 )
 from rhs_isac_ros.experiments.libraries import needed_for
-from rhs_isac_ros.link import capacity, choose_beam
+from rhs_isac_ros.link import Outcome, capacity, choose_beam
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import NeuralEstimator, make_estimator
@@ -92,8 +92,8 @@ def lose(first: int, estimates: Mapping[str, Mapping[str, Any]]) -> dict:
         for place, best_bps, mean, covariance in zip(
                 truth, perfect_bps, estimate['means'], estimate['covariances'], strict=True):
             beam = choose_beam(scenario, np.array(mean), np.array(covariance)).beam
-            loss_bps = best_bps - float(capacity(scenario, beam, place[None])[0])
-            losses[name].append([loss_bps, 100 * loss_bps / best_bps])
+            one = Outcome(float(capacity(scenario, beam, place[None])[0]), best_bps)
+            losses[name].append([one.loss_bps, one.loss_percent])
     return losses
 
 

@@ -1,6 +1,6 @@
 """``scripts/topic``: what of ``ros2 topic`` the wheels lack, with the same output.
 
-``python -m rhs_isac_ros.cli.topic --help`` lists the commands.
+``python -m rhs_isac_ros.nodes.cli.topic --help`` lists the commands.
 """
 
 import argparse
@@ -19,9 +19,9 @@ from rclpy.qos import (
 )
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
-from rhs_isac_ros.cli.message_text import Layout, as_csv, as_yaml
-from rhs_isac_ros.cli.rate import Rate
-from rhs_isac_ros.cli.session import Session, ToolError, run_tool, say
+from rhs_isac_ros.nodes.cli.message_text import Layout, as_csv, as_yaml
+from rhs_isac_ros.nodes.cli.rate import Rate
+from rhs_isac_ros.nodes.cli.session import Session, ToolError, run_tool, say
 from rhs_isac_ros.ros.timers import steady_timer
 
 _LONGEST = 128

@@ -13,16 +13,16 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from rhs_isac_ros.cli import record
-from rhs_isac_ros.cli.replay import errors_m, load, main
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.nodes.cli import record
+from rhs_isac_ros.nodes.cli.replay import errors_m, load, main
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import Recorder, read
 
 pytest.importorskip('mcap', reason='there is no mcap here')
-CONFIG = Path(__file__).parents[2] / 'config'
+CONFIG = Path(__file__).parents[3] / 'config'
 SCRIPTS = CONFIG.parent / 'scripts'
 CYCLES = 4
 

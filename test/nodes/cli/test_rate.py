@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from rhs_isac_ros.cli.rate import Rate
+from rhs_isac_ros.nodes.cli.rate import Rate
 
 
 def numbers(report):

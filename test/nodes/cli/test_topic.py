@@ -8,10 +8,10 @@ from pathlib import Path
 
 import yaml
 
-from rhs_isac_ros.cli.topic import main
+from rhs_isac_ros.nodes.cli.topic import main
 from rhs_isac_ros.ros import topics
 
-SCRIPT = Path(__file__).parents[2] / 'scripts' / 'topic'
+SCRIPT = Path(__file__).parents[3] / 'scripts' / 'topic'
 
 
 def test_list_names_every_topic(hear):

@@ -1,6 +1,6 @@
 """``scripts/param``: what of ``ros2 param`` the wheels lack, with the same output.
 
-``python -m rhs_isac_ros.cli.param --help`` lists the commands.
+``python -m rhs_isac_ros.nodes.cli.param --help`` lists the commands.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from rhs_isac_ros.cli.session import Session, ToolError, run_tool, say
+from rhs_isac_ros.nodes.cli.session import Session, ToolError, run_tool, say
 
 # How long a node's services, and their answers, may take [s].
 _PATIENCE_S = 5.0

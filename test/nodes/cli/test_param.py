@@ -2,7 +2,7 @@
 
 import yaml
 
-from rhs_isac_ros.cli.param import main
+from rhs_isac_ros.nodes.cli.param import main
 
 
 def test_get_tells_the_type(hear):

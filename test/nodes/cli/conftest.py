@@ -1,27 +1,15 @@
 """A network in another process, and the tools run in this one."""
 
 import contextlib
-import os
 import subprocess
-import warnings
 from pathlib import Path
 
 import pytest
-from rclpy.type_support import check_for_type_support
 
-import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.cli.session import Session
+from rhs_isac_ros.nodes.cli.session import Session
 from rhs_isac_ros.ros.processes import Processes
 
-# Before rclpy reads them; the processes inherit them.
-os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-# Type supports load a parser that is older than this Python.
-with warnings.catch_warnings():
-    warnings.simplefilter('ignore', DeprecationWarning)
-    check_for_type_support(ros.Beacon)
-
-CONFIG = Path(__file__).parents[2] / 'config'
+CONFIG = Path(__file__).parents[3] / 'config'
 PATIENCE_S = 60.0
 
 
@@ -51,7 +39,7 @@ def shared_session(network):
 def say(shared_session, capsys, monkeypatch):
     """Function that calls a tool's main function and returns what it says, and its exit code."""
     monkeypatch.setattr(
-        'rhs_isac_ros.cli.session.Session', lambda: contextlib.nullcontext(shared_session))
+        'rhs_isac_ros.nodes.cli.session.Session', lambda: contextlib.nullcontext(shared_session))
 
     def call(main, *arguments):
         code = main(arguments)
