@@ -33,12 +33,14 @@ class BsNode(RoleNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('bs', SENDS, **node_options)
         values = self.values
-        timeouts_s = timeouts(values.ack_timeout_s, values.step_timeout_s, values.rest_s)
+        timeouts_s = timeouts(
+            values.ack_timeout_s, values.step_timeout_s, values.rest_s, values.retries)
         roster = Roster(
             values.policy, streams.generator(values.seed, streams.BASE_STATION))
         self.start(BaseStation(
             self.scenario, roster, self._receive, timeouts_s, values.data_duration_s,
-            values.first_cycle or _number_from_the_clock(), self._gate()), RECEIVES)
+            values.first_cycle or _number_from_the_clock(), self._gate(), values.retries),
+            RECEIVES)
         self._codebook = CodebookSource(
             self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
         self._peers = peers.PeerWatch(

@@ -25,7 +25,9 @@ class UserNode(RoleNode):
     def __init__(self, name: str = '', **node_options: Any) -> None:
         super().__init__('user', SENDS, name, **node_options)
         values = self.values
-        self._user = User(values.user_id, self._mobility(), timeouts(values.step_timeout_s))
+        self._user = User(
+            values.user_id, self._mobility(),
+            timeouts(values.step_timeout_s, values.beacon_timeout_s))
         self.start(self._user, RECEIVES)
         self._peers = peers.PeerWatch(
             self, peers.OF_USER, lambda missing: self.tell(PeersChanged(missing)))

@@ -7,7 +7,8 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.bs_table import TABLE, Input, State
+from rhs_isac_ros.protocol.bs_table import STEPS, TABLE, Input, State
+from rhs_isac_ros.protocol.complaints import Complaints
 from rhs_isac_ros.protocol.events import (
     Action,
     CodebookOffered,
@@ -19,6 +20,7 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.gate import Gate
 from rhs_isac_ros.protocol.machine import Machine
+from rhs_isac_ros.protocol.phase_times import PhaseTimes
 from rhs_isac_ros.protocol.roster import Roster
 
 
@@ -43,29 +45,34 @@ class BaseStation(Machine):
         what is still on its way would be taken for its own.
     gate
         Whose acks it takes; by default all.
+    retries
+        How often a step of a cycle is asked for again, before the cycle is given up.
     """
 
     TABLE = TABLE
+    LACKING = frozenset({State.WAITING})
 
     def __init__(
             self, scenario: Scenario, roster: Roster,
             receiver: Callable[[Codebook, np.ndarray, int, int], np.ndarray],
             timeouts_s: Mapping[State, float], data_duration_s: float,
-            first_cycle_id: int = 1, gate: Gate | None = None) -> None:
+            first_cycle_id: int = 1, gate: Gate | None = None, retries: int = 0) -> None:
         super().__init__(State.WAITING, timeouts_s)
         self._scenario, self._roster, self._receiver = scenario, roster, receiver
         self._data_duration_s = data_duration_s
-        self._gate = gate or Gate()
+        self._gate, self._retries = gate or Gate(), retries
         self._refusal = ''
         self._codebook: Codebook | None = None
         self._offered: Codebook | None = None
         self._missing: tuple[str, ...] | None = None
         self._complaint = ''
+        self._complaints, self._times = Complaints(), PhaseTimes()
         self._cycle_id = first_cycle_id - 1
         self._attempt = 0
         self._user = 0
         self._band = 0
         self._frames: dict[tuple[int, int], np.ndarray] = {}
+        self._received: m.ReceivedSignals | None = None
         self._beam: m.Beam | None = None
         self._applied = False
 
@@ -130,7 +137,8 @@ class BaseStation(Machine):
             return Input.WINDOW_OVER
         if self.state is State.RESTING and (self._missing or not self._offered):
             return Input.NOT_READY
-        return Input.TIMEOUT
+        again = self.state in STEPS and self.repeats < self._retries
+        return Input.RETRY if again else Input.TIMEOUT
 
     def _classify_ack(self, ack: m.Ack) -> Input:
         if self._refusal:
@@ -139,6 +147,8 @@ class BaseStation(Machine):
             return Input.WRONG_CYCLE
         if ack.user in self._roster.answered:
             return Input.DUPLICATE
+        if self._roster.is_full_for(ack.user):
+            return Input.CROWDED
         if self.state is not State.BEACONING:
             return Input.LATE_ACK
         return Input.LAST_ACK if self._roster.complete_with(ack.user) else Input.ACK
@@ -189,12 +199,16 @@ class BaseStation(Machine):
         self._user, self._band = 0, 0
         self._frames, self._beam, self._applied = {}, None, False
         self._roster.open()
-        return [Send(m.Beacon(self._cycle_id, self._attempt))]
+        return self._beacon(now_s)
 
     def _beacon_again(self, event: Event, now_s: float) -> list[Action]:
         self._attempt += 1
         # Nothing of the cycle depends on the codebook before the grant.
         self._codebook = self._offered
+        return self._beacon(now_s)
+
+    def _beacon(self, now_s: float) -> list[Action]:
+        self._times.beacon(now_s)
         return [Send(m.Beacon(self._cycle_id, self._attempt))]
 
     def _note_ack(self, event: m.Ack, now_s: float) -> None:
@@ -209,10 +223,13 @@ class BaseStation(Machine):
         return [Send(m.Grant(self._cycle_id, self._user))]
 
     def _announce_positioning(self, event: Event, now_s: float) -> list[Action]:
-        return self._announce(m.Phase.POSITIONING)
+        return self._announce(m.Phase.POSITIONING, now_s)
 
     def _command_band(self, event: Event, now_s: float) -> list[Action]:
         self._band += 1
+        return self._command_again(event, now_s)
+
+    def _command_again(self, event: Event, now_s: float) -> list[Action]:
         return [Send(m.RhsCommand(self._cycle_id, self._band, self._codebook_id))]
 
     def _request_pilots(self, event: Event, now_s: float) -> list[Action]:
@@ -227,8 +244,12 @@ class BaseStation(Machine):
         feeds = np.stack([[self._frames[band, frame] for frame in range(sizes['F'])]
                           for band in range(sizes['N_B'])])
         signals = self._receiver(self._codebook, feeds, self._user, self._cycle_id)
-        return [Send(m.ReceivedSignals(self._cycle_id, self._user, self._codebook_id, signals)),
-                *self._announce(m.Phase.ESTIMATING)]
+        self._received = m.ReceivedSignals(
+            self._cycle_id, self._user, self._codebook_id, signals)
+        return [Send(self._received), *self._announce(m.Phase.ESTIMATING, now_s)]
+
+    def _deliver_again(self, event: Event, now_s: float) -> list[Action]:
+        return [Send(self._received)]
 
     def _keep_beam(self, event: m.Beam | m.RhsConfiguration, now_s: float) -> None:
         if isinstance(event, m.Beam):
@@ -238,21 +259,24 @@ class BaseStation(Machine):
         self._applied = True
 
     def _offer_data(self, event: Event, now_s: float) -> list[Action]:
+        return [*self._offer_again(event, now_s), *self._announce(m.Phase.TRANSMITTING, now_s)]
+
+    def _offer_again(self, event: Event, now_s: float) -> list[Action]:
         bits = self._beam.expected_bps * self._data_duration_s // 1
         return [Send(m.Data(self._cycle_id, self._user, m.Direction.DOWNLINK, m.Stage.OFFERED,
-                            self._data_duration_s, bits)),
-                *self._announce(m.Phase.TRANSMITTING)]
+                            self._data_duration_s, bits))]
 
     def _forget_user(self, event: Event, now_s: float) -> None:
         self._roster.forget(self._user)
 
     def _abandon(self, event: Event, now_s: float) -> list[Action]:
         reason = TABLE[self.state, self._classify(event)].counts
-        return [*self._announce(m.Phase.BEACONING, reason),
-                Note(f'cycle {self._cycle_id}: user {self._user} given up: {reason}', True)]
+        return [Send(self._times.end(reason, self._cycle_id, self._user, now_s)),
+                *self._complaints.given_up(self._cycle_id, self._user, reason)]
 
     def _finish(self, event: Event, now_s: float) -> list[Action]:
-        return self._announce(m.Phase.BEACONING, 'served')
+        return [Send(self._times.end('served', self._cycle_id, self._user, now_s)),
+                *self._complaints.served(self._cycle_id, self._user)]
 
-    def _announce(self, phase: m.Phase, outcome: str = '') -> list[Action]:
-        return [Send(m.ProtocolState(self._cycle_id, self._user, phase, outcome))]
+    def _announce(self, phase: m.Phase, now_s: float) -> list[Action]:
+        return [Send(self._times.begin(phase, self._cycle_id, self._user, now_s))]

@@ -26,6 +26,7 @@ class Input(enum.Enum):
     NOT_READY = 'not_ready'
     CODEBOOK = 'codebook'
     PEERS = 'peers'
+    RETRY = 'retry'
     TIMEOUT = 'timeout'
     WINDOW_OVER = 'window_over'
     ACK = 'ack'
@@ -49,9 +50,15 @@ class Input(enum.Enum):
     WRONG_CODEBOOK = 'wrong_codebook'
     NOT_ALLOWED = 'not_allowed'
     TOO_OFTEN = 'too_often'
+    CROWDED = 'crowded'
 
 
-def timeouts(ack_s: float, step_s: float, rest_s: float) -> dict[State, float]:
+# States that are part of a granted cycle: each waits for an answer, and may ask for it again.
+STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
+
+
+def timeouts(
+        ack_s: float, step_s: float, rest_s: float, retries: int = 0) -> dict[State, float]:
     """Return the time-outs of the base station.
 
     Parameters
@@ -62,15 +69,16 @@ def timeouts(ack_s: float, step_s: float, rest_s: float) -> dict[State, float]:
         How long to wait for the next message of a cycle [s].
     rest_s
         Pause between cycles [s].
+    retries
+        How often a step is asked for again within its time.
 
     Returns
     -------
     dict
         Time-outs by state [s].
     """
-    steps = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
-             State.TRANSMITTING)
-    return {State.RESTING: rest_s, State.BEACONING: ack_s, **dict.fromkeys(steps, step_s)}
+    return {State.RESTING: rest_s, State.BEACONING: ack_s,
+            **dict.fromkeys(STEPS, step_s / (retries + 1))}
 
 
 S, I = State, Input  # noqa: E741
@@ -93,13 +101,19 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (ANY, I.LATE_ACK): Step(SAME, ('welcome',), counts='late_ack'),
     # Positioning.
     (S.CONFIGURING, I.CONFIGURED): Step(S.SOUNDING, ('request_pilots',)),
+    (S.CONFIGURING, I.RETRY): Step(SAME, ('command_again',), counts='retry_rhs', rearm=True),
     (S.CONFIGURING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='rhs_silent'),
+    (S.SOUNDING, I.CONFIGURED): Step(SAME),
     (S.SOUNDING, I.FRAME): Step(SAME, ('keep_frame',)),
     (S.SOUNDING, I.LAST_FRAME_OF_BAND): Step(S.CONFIGURING, ('keep_frame', 'command_band')),
     (S.SOUNDING, I.LAST_FRAME): Step(S.ESTIMATING, ('keep_frame', 'deliver')),
+    # The surface too: the channel may not have heard what it reported.
+    (S.SOUNDING, I.RETRY): Step(
+        SAME, ('command_again', 'request_pilots'), counts='retry_band', rearm=True),
     (S.SOUNDING, I.TIMEOUT): Step(S.RESTING, ('forget_user', 'abandon'), counts='user_gone'),
     (S.ESTIMATING, I.ESTIMATE): Step(S.STEERING),
     (S.ESTIMATING, I.NO_FIX): Step(S.RESTING, ('abandon',), counts='no_fix'),
+    (S.ESTIMATING, I.RETRY): Step(SAME, ('deliver_again',), counts='retry_position', rearm=True),
     (S.ESTIMATING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='positioner_silent'),
     # Transmission. Beam and configuration come from two nodes, in either order.
     (S.ESTIMATING, I.BEAM): Step(S.STEERING, ('keep_beam',)),
@@ -108,8 +122,18 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (S.ESTIMATING, I.BEAM_APPLIED): Step(S.STEERING, ('keep_applied',)),
     (S.STEERING, I.BEAM_APPLIED): Step(SAME, ('keep_applied',)),
     (S.STEERING, I.BEAM_READY): Step(S.TRANSMITTING, ('keep_beam', 'offer_data')),
+    # From the start: who heard its part already answers the same again.
+    (S.STEERING, I.RETRY): Step(SAME, ('deliver_again',), counts='retry_beam', rearm=True),
     (S.STEERING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='transmission_silent'),
+    (S.RESTING, I.DELIVERED): Step(SAME, counts='duplicate'),
     (S.TRANSMITTING, I.DELIVERED): Step(S.RESTING, ('finish',)),
+    # The channel may not have heard the beam, or that the surface took it.
+    (S.TRANSMITTING, I.RETRY): Step(
+        SAME, ('deliver_again', 'offer_again'), counts='retry_data', rearm=True),
+    # What was asked for twice may be answered twice.
+    (S.TRANSMITTING, I.ESTIMATE): Step(SAME, counts='duplicate'),
+    (S.TRANSMITTING, I.BEAM): Step(SAME, counts='duplicate'),
+    (S.TRANSMITTING, I.BEAM_READY): Step(SAME, counts='duplicate'),
     (S.TRANSMITTING, I.TIMEOUT): Step(S.RESTING, ('abandon',), counts='data_lost'),
     (ANY, I.OTHER_DATA): Step(SAME),
     # What belongs to no step is dropped.
@@ -118,7 +142,8 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (ANY, I.WRONG_USER): Step(SAME, counts='wrong_user'),
     (ANY, I.WRONG_BAND): Step(SAME, counts='wrong_band'),
     (ANY, I.WRONG_CODEBOOK): Step(SAME, counts='wrong_codebook'),
-    # Acks that the gate refuses.
+    # Acks that the gate or the roster refuses.
     (ANY, I.NOT_ALLOWED): Step(SAME, counts='not_allowed'),
     (ANY, I.TOO_OFTEN): Step(SAME, counts='too_often'),
+    (ANY, I.CROWDED): Step(SAME, counts='crowded'),
 }

@@ -12,7 +12,9 @@ class MessageError(ValueError):
     """A message holds something that no valid message holds."""
 
 
-def array(dims: str, kind: type = float, low: float = -math.inf, high: float = math.inf) -> Any:
+def array(
+        dims: str, kind: type = float, low: float = -math.inf, high: float = math.inf,
+        may_lack: bool = False) -> Any:
     """Declare an array field.
 
     Parameters
@@ -23,6 +25,8 @@ def array(dims: str, kind: type = float, low: float = -math.inf, high: float = m
         ``float`` or ``complex``.
     low, high
         Range of the entries, for real arrays.
+    may_lack
+        Whether entries may be NaN, for `not known`.
 
     Returns
     -------
@@ -30,7 +34,8 @@ def array(dims: str, kind: type = float, low: float = -math.inf, high: float = m
         The field.
     """
     return dataclasses.field(
-        metadata={'dims': tuple(dims.split()), 'kind': kind, 'low': low, 'high': high})
+        metadata={'dims': tuple(dims.split()), 'kind': kind, 'low': low, 'high': high,
+                  'may_lack': may_lack})
 
 
 def index(symbol: str) -> Any:
@@ -134,7 +139,7 @@ def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[st
         wanted = ', '.join(d if d.isdigit() else f'{d} = {e}'
                            for d, e in zip(dims, expected, strict=True))
         return f'shape {list(value.shape)}, expected [{wanted}]'
-    if not np.isfinite(value).all():
+    if not (np.isfinite(value) | (meta['may_lack'] & np.isnan(value))).all():
         return 'not finite, expected finite numbers'
     if meta['low'] > -math.inf and value.size and (
             value.min() < meta['low'] or value.max() > meta['high']):

@@ -14,9 +14,13 @@ from rhs_isac_ros.protocol.machine import Step
 # Durations of which percentiles are told: the newest so many.
 _NEWEST = 512
 _PERCENTS = (50, 95, 99)
-# Of the counters of a role, what ends a cycle, as base station or user see it. A beacon that
-# nobody answers is no fault; all else is a message that was dropped.
+# Of the counters of a role: beacons without an ack, or none at all; steps that were asked for
+# again; and what ends a cycle, as base station or user see it. All else was dropped.
 UNANSWERED = bs_table.TABLE[bs_table.State.BEACONING, bs_table.Input.TIMEOUT].counts
+NO_BEACON = user.TABLE[user.State.LISTENING, user.Input.TIMEOUT].counts
+RETRIES = frozenset(
+    step.counts for table, name in ((bs_table.TABLE, 'retry'), (user.TABLE, 'same_request'))
+    for (_, event), step in table.items() if event.value == name)
 
 
 def _ends(table: Mapping[tuple, Step]) -> frozenset[str]:
@@ -25,7 +29,7 @@ def _ends(table: Mapping[tuple, Step]) -> frozenset[str]:
         event.value in ('timeout', 'no_fix') or step.counts == 'abandoned'))
 
 
-CYCLE_ENDS = (_ends(bs_table.TABLE) | _ends(user.TABLE)) - {UNANSWERED}
+CYCLE_ENDS = (_ends(bs_table.TABLE) | _ends(user.TABLE)) - {UNANSWERED, NO_BEACON}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +44,8 @@ class Report:
         The same in words.
     values
         Everything by name: ``phase``, ``codebook_id``, ``cycles.<outcome>``,
-        ``dropped.<reason>``, ``sent.<message>`` and percentiles such as ``handling_ms.p95``.
+        ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``, ``received.<message>``,
+        ``sent.<message>`` and percentiles such as ``handling_ms.p95``.
     """
 
     fault: bool
@@ -52,6 +57,7 @@ class Health:
     """Keeps the books of a role, from outside: it sees each event and what comes of it."""
 
     def __init__(self) -> None:
+        self._received: collections.Counter[str] = collections.Counter()
         self._sent: collections.Counter[str] = collections.Counter()
         self._served = 0
         self._codebook_id = ''
@@ -59,6 +65,16 @@ class Health:
         self._began_s: float | None = None
         self._durations_s: dict[str, collections.deque[float]] = {}
         self._faults = 0
+
+    def receive(self, kind: type[m.Message]) -> None:
+        """Count a message that has come, whatever becomes of it.
+
+        Parameters
+        ----------
+        kind
+            Its class.
+        """
+        self._received[kind.__name__] += 1
 
     def note(
             self, event: Event, actions: Sequence[Action], now_s: float,
@@ -101,7 +117,8 @@ class Health:
     def _add(self, name: str, duration_s: float) -> None:
         self._durations_s.setdefault(name, collections.deque(maxlen=_NEWEST)).append(duration_s)
 
-    def report(self, phase: str, counters: Mapping[str, int]) -> Report:
+    def report(
+            self, phase: str, counters: Mapping[str, int], lacking: bool = False) -> Report:
         """Tell how the role fares; what is new is what came after the last call.
 
         Parameters
@@ -110,6 +127,8 @@ class Health:
             The present state of the role; empty if it has none.
         counters
             What it has counted, by reason.
+        lacking
+            Whether it misses something in this state.
 
         Returns
         -------
@@ -125,8 +144,8 @@ class Health:
             values['cycles.served'] = str(self._served)
         for reason, n in sorted(counters.items()):
             values[f'{_section(reason)}.{reason}'] = str(n)
-        for name, n in sorted(self._sent.items()):
-            values[f'sent.{name}'] = str(n)
+        for section, books in (('received', self._received), ('sent', self._sent)):
+            values |= {f'{section}.{name}': str(n) for name, n in sorted(books.items())}
         for name, durations_s in self._durations_s.items():
             percentiles = 1e3 * np.percentile(durations_s, _PERCENTS)
             values |= {f'{name}.p{percent}': f'{value:.3f}'
@@ -135,13 +154,18 @@ class Health:
         new, self._faults = faults - self._faults, faults
         if self._missing:
             return Report(True, f'waiting for {", ".join(self._missing)}', values)
+        if lacking:
+            return Report(True, f'cannot work: {phase}', values)
         if new:
-            return Report(True, f'{new} cycles given up or messages dropped just now', values)
+            return Report(
+                True, f'{new} messages dropped, steps repeated or cycles given up', values)
         return Report(False, 'no fault', values)
 
 
 def _section(reason: str) -> str:
     """What a counter is about."""
-    if reason == UNANSWERED:
+    if reason in (UNANSWERED, NO_BEACON):
         return 'beacons'
+    if reason in RETRIES:
+        return 'retries'
     return 'cycles' if reason in CYCLE_ENDS else 'dropped'

@@ -54,14 +54,19 @@ class Machine:
     ----------
     state
         Present state.
+    repeats
+        How often the present state's time-out began afresh.
     counters
         What was dropped or went wrong, by reason.
     """
 
     TABLE: ClassVar[Mapping[tuple[enum.Enum | None, enum.Enum], Step]]
+    # States in which something that the role needs is missing.
+    LACKING: ClassVar[frozenset[enum.Enum]] = frozenset()
 
     def __init__(self, initial: enum.Enum, timeouts_s: Mapping[enum.Enum, float]) -> None:
         self.state = initial
+        self.repeats = 0
         self.counters: collections.Counter[str] = collections.Counter()
         self._timeouts_s = dict(timeouts_s)
         self._deadline_s: float | None = None
@@ -91,8 +96,10 @@ class Machine:
         actions: list[Action] = []
         for method in step.do:
             actions += getattr(self, f'_{method}')(event, now_s) or []
-        if step.to is not SAME and step.to is not self.state or step.rearm:
+        changes = step.to is not SAME and step.to is not self.state
+        if changes or step.rearm:
             self.state = step.to or self.state
+            self.repeats = 0 if changes else self.repeats + 1
             timeout = self._timeouts_s.get(self.state)
             self._deadline_s = None if timeout is None else now_s + timeout
         return actions

@@ -265,3 +265,5 @@ class ProtocolState(Message):
     user: int = number(0, _LAST_USER)
     phase: Phase
     outcome: str
+    began_s: np.ndarray = array('4', may_lack=True)
+    elapsed_s: float = number(0, 1e9)

@@ -5,6 +5,8 @@ import numpy as np
 POLICIES = ('round_robin', 'first', 'random')
 # A user that leaves so many beacons in a row without an answer is not waited for.
 _PATIENCE = 3
+# More that answer at once are refused: numbers cost nothing, memory does.
+_MOST_USERS = 1024
 
 
 class Roster:
@@ -36,6 +38,21 @@ class Roster:
     def open(self) -> None:
         """Begin a cycle: nobody has answered yet."""
         self.answered = []
+
+    def is_full_for(self, user: int) -> bool:
+        """Tell whether there is no place for a user.
+
+        Parameters
+        ----------
+        user
+            The user.
+
+        Returns
+        -------
+        bool
+            True if it is not known, and no other can be.
+        """
+        return user not in self._missed and len(self._missed) >= _MOST_USERS
 
     def welcome(self, user: int) -> None:
         """Know a user, without counting it as answering.

@@ -15,6 +15,7 @@ class State(enum.Enum):
 
     ALONE = 'alone'                # base station or channel is not there
     LISTENING = 'listening'        # for a beacon
+    UNCALLED = 'uncalled'          # the same, for too long
     ACKNOWLEDGED = 'acknowledged'  # waiting for the grant
     GRANTED = 'granted'            # being positioned and served
 
@@ -31,6 +32,7 @@ class Input(enum.Enum):
     OTHER_GRANT = 'other_grant'
     OTHER_USER = 'other_user'
     PILOT_REQUEST = 'pilot_request'
+    SAME_REQUEST = 'same_request'
     DOWNLINK = 'downlink'
     OTHER_DATA = 'other_data'
     WRONG_CYCLE = 'wrong_cycle'
@@ -48,6 +50,9 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     # The base station may take longer than this user waited.
     (S.LISTENING, I.GRANT): Step(S.GRANTED, ('stand',)),
     (S.LISTENING, I.BEACON): Step(S.ACKNOWLEDGED, ('acknowledge',)),
+    (S.LISTENING, I.TIMEOUT): Step(S.UNCALLED, ('say_uncalled',), counts='no_beacon'),
+    (S.UNCALLED, I.GRANT): Step(S.GRANTED, ('say_called', 'stand')),
+    (S.UNCALLED, I.BEACON): Step(S.ACKNOWLEDGED, ('say_called', 'acknowledge')),
     (S.ACKNOWLEDGED, I.BEACON): Step(SAME, ('acknowledge',), rearm=True),
     (S.ACKNOWLEDGED, I.GRANT): Step(S.GRANTED, ('stand',)),
     # A request that overtakes the grant says the same.
@@ -56,7 +61,11 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (S.ACKNOWLEDGED, I.TIMEOUT): Step(S.LISTENING, counts='not_granted'),
     (S.GRANTED, I.GRANT): Step(SAME),
     (S.GRANTED, I.PILOT_REQUEST): Step(SAME, ('send_pilots',), rearm=True),
+    # Something was lost: perhaps the pilots, perhaps where they come from.
+    (S.GRANTED, I.SAME_REQUEST): Step(
+        SAME, ('stand', 'send_pilots'), counts='asked_again', rearm=True),
     (S.GRANTED, I.DOWNLINK): Step(S.LISTENING, ('send_uplink',)),
+    (S.LISTENING, I.DOWNLINK): Step(SAME, ('send_uplink',), counts='asked_again'),
     (S.GRANTED, I.BEACON): Step(S.ACKNOWLEDGED, ('acknowledge',), counts='abandoned'),
     (S.GRANTED, I.TIMEOUT): Step(S.LISTENING, counts='bs_silent'),
     (ANY, I.STALE_BEACON): Step(SAME, counts='stale_beacon'),
@@ -75,20 +84,23 @@ _MOST_KNOWN = 8
 _SILENT_STEPS = 4
 
 
-def timeouts(step_s: float) -> dict[State, float]:
+def timeouts(step_s: float, beacon_s: float) -> dict[State, float]:
     """Return the time-outs of a user.
 
     Parameters
     ----------
     step_s
         How long the base station waits for each step [s].
+    beacon_s
+        How long is too long without a beacon [s].
 
     Returns
     -------
     dict
         Time-outs by state [s].
     """
-    return {State.ACKNOWLEDGED: step_s, State.GRANTED: _SILENT_STEPS * step_s}
+    return {State.LISTENING: beacon_s, State.ACKNOWLEDGED: step_s,
+            State.GRANTED: _SILENT_STEPS * step_s}
 
 
 class User(Machine):
@@ -105,6 +117,7 @@ class User(Machine):
     """
 
     TABLE = TABLE
+    LACKING = frozenset({State.ALONE, State.UNCALLED})
 
     def __init__(
             self, user: int, mobility: Mobility, timeouts_s: Mapping[State, float]) -> None:
@@ -112,6 +125,8 @@ class User(Machine):
         self.user = user
         self._mobility = mobility
         self._cycle_id = 0
+        # Cycle and band of the pilots that were sent last.
+        self._sounded = (0, 0)
         # By cycle: the highest attempt heard, and where it stood, which holds for all of it.
         self._heard: dict[int, int] = {}
         self._truths: dict[int, m.GroundTruth] = {}
@@ -150,6 +165,8 @@ class User(Machine):
             return Input.WRONG_CYCLE
         if isinstance(event, m.Grant) and self._is_done:
             return Input.LATE_GRANT
+        if isinstance(event, m.PilotRequest) and self._sounded == (event.cycle_id, event.band):
+            return Input.SAME_REQUEST
         names = {m.Grant: Input.GRANT, m.PilotRequest: Input.PILOT_REQUEST,
                  m.Data: Input.DOWNLINK}
         return names[type(event)]
@@ -170,6 +187,13 @@ class User(Machine):
     def _say_missing(self, event: PeersChanged, now_s: float) -> list[Action]:
         return [Note(f'waiting for {", ".join(event.missing)}', warning=True)]
 
+    def _say_uncalled(self, event: Tick, now_s: float) -> list[Action]:
+        wait_s = self._timeouts_s[State.LISTENING]
+        return [Note(f'no beacon for {wait_s:g} s', warning=True)]
+
+    def _say_called(self, event: m.Beacon | m.Grant, now_s: float) -> list[Action]:
+        return [Note('called again')]
+
     def _acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
         self._cycle_id = event.cycle_id
         _keep(self._heard, event.cycle_id, event.attempt)
@@ -181,6 +205,7 @@ class User(Machine):
         return [Send(truth)]
 
     def _send_pilots(self, event: m.PilotRequest, now_s: float) -> list[Action]:
+        self._sounded = event.cycle_id, event.band
         return [Send(m.Pilot(event.cycle_id, self.user, event.band, frame, 1.0, 0.0))
                 for frame in range(event.n_frames)]
 

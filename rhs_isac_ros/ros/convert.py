@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
+from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
@@ -87,6 +88,38 @@ def from_ros(kind: type[Message], message: Any) -> Message:
         except ValueError as error:
             raise MessageError(f'{kind.__name__}.{name}: {error}') from None
     return kind(**values)
+
+
+def from_bytes(kind: type[Message], serialized: bytes) -> Message:
+    """Convert a message from what a raw subscription gets.
+
+    rclpy drops what it cannot decode without a word; here it is an error like any other.
+
+    Parameters
+    ----------
+    kind
+        Class of the result.
+    serialized
+        A message of its `ros_type`, in CDR.
+
+    Returns
+    -------
+    Message
+        The message.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are no such message, or as with `from_ros`.
+    """
+    try:
+        message = deserialize_message(serialized, ros_type(kind))
+    # What rclpy raises is a RuntimeError without a public name; a string may be no UTF-8.
+    except (RuntimeError, ValueError) as error:
+        raise MessageError(
+            f'{kind.__name__}: {len(serialized)} bytes, expected one in CDR: '
+            f'{str(error).splitlines()[0]}') from None
+    return from_ros(kind, message)
 
 
 def codebook_to_ros(codebook: Codebook, stamp: Time) -> ros.Codebook:
@@ -205,6 +238,7 @@ _CODECS: dict[str, tuple[Callable, Callable]] = {
     'geometry_msgs/Point': (functools.partial(_encode_vector, Point), _decode_vector),
     'geometry_msgs/Vector3': (functools.partial(_encode_vector, Vector3), _decode_vector),
     'double[3]': (np.ascontiguousarray, np.asarray),
+    'double[4]': (np.ascontiguousarray, np.asarray),
     'double[9]': (np.ravel, lambda values: np.reshape(values, (3, 3))),
 }
 

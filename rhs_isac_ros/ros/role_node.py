@@ -104,7 +104,10 @@ class RoleNode(Node):
             The report; what is new is what came after the last one.
         """
         state = getattr(self._role, 'state', None)
-        return self._health.report(state.value if state else '', self._role.counters)
+        if state is None:
+            return self._health.report('', self._role.counters)
+        return self._health.report(
+            state.value, self._role.counters, state in self._role.LACKING)
 
     def advertise(self, sends: Iterable[type[m.Message]]) -> None:
         """Create publishers; the graph then shows that the role is there.
@@ -132,7 +135,7 @@ class RoleNode(Node):
                 self._listening.add(kind)
                 self.create_subscription(
                     convert.ros_type(kind), topics.NAMES[kind], self._receiver(kind),
-                    qos.of(kind), event_callbacks=SubscriptionEventCallbacks(
+                    qos.of(kind), raw=True, event_callbacks=SubscriptionEventCallbacks(
                         use_default_callbacks=False))
 
     @staticmethod
@@ -198,10 +201,11 @@ class RoleNode(Node):
         """
         raise TypeError(f'{type(action).__name__} is no action of {self.get_name()}')
 
-    def _receiver(self, kind: type[m.Message]) -> Callable[[Any], None]:
-        def receive(ros_message: Any) -> None:
+    def _receiver(self, kind: type[m.Message]) -> Callable[[bytes], None]:
+        def receive(serialized: bytes) -> None:
+            self._health.receive(kind)
             try:
-                message = convert.from_ros(kind, ros_message)
+                message = convert.from_bytes(kind, serialized)
                 m.check(message, self._sizes)
             except m.MessageError as error:
                 self._role.counters['malformed'] += 1

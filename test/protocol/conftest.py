@@ -119,11 +119,12 @@ class Network:
             seed: int = 0, step_timeout_s: float = 1.0, ack_timeout_s: float = 0.1,
             rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
             make_s: float = 0.0, absent: Iterable[str] = (),
-            begin_s: float = 0.0, gate=None) -> None:
+            begin_s: float = 0.0, gate=None, retries: int = 0,
+            beacon_timeout_s: float = 3.0) -> None:
         self.scenario, self.seed = scenario, seed
         self.transport, self.ordered = transport, ordered
         self.now_s = begin_s
-        self._gate = gate
+        self._gate, self._retries, self._beacon_timeout_s = gate, retries, beacon_timeout_s
         self.log: list[Sent] = []
         self.notes: list[Said] = []
         self._ends: list[tuple[int, int, str]] = []
@@ -324,7 +325,8 @@ class Network:
         scenario, step_s = self.scenario, self._step_timeout_s
         match self._kind(name):
             case 'bs':
-                timeouts_s = bs_table.timeouts(self._ack_timeout_s, step_s, self._rest_s)
+                timeouts_s = bs_table.timeouts(
+                    self._ack_timeout_s, step_s, self._rest_s, self._retries)
                 roster = Roster(
                     self._policy, streams.generator(self.seed, streams.BASE_STATION))
                 # No number comes twice, as with the clock of the node.
@@ -332,11 +334,11 @@ class Network:
                 self._lives += 1
                 return BaseStation(
                     scenario, roster, self._receive, timeouts_s, DATA_DURATION_S, first,
-                    self._gate)
+                    self._gate, self._retries)
             case 'user':
                 return user_role.User(
                     int(name.removeprefix('user')), self._mobilities[name],
-                    user_role.timeouts(step_s))
+                    user_role.timeouts(step_s, self._beacon_timeout_s))
             case 'rhs_controller':
                 return RhsController()
             case 'channel':

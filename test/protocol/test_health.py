@@ -10,7 +10,8 @@ from rhs_isac_ros.protocol.health import Health
 
 
 def state(outcome, cycle_id=1):
-    return Send(m.ProtocolState(cycle_id, 1, m.Phase.BEACONING, outcome))
+    return Send(m.ProtocolState(
+        cycle_id, 1, m.Phase.BEACONING, outcome, np.zeros(4), 0.5))
 
 
 def test_a_role_that_has_done_nothing_tells_its_phase_only():
@@ -21,10 +22,13 @@ def test_a_role_that_has_done_nothing_tells_its_phase_only():
 
 
 def test_counters_are_told_by_what_they_are_about():
-    counters = {'wrong_cycle': 3, 'rhs_silent': 2, 'unanswered': 7, 'not_granted': 1}
+    counters = {'wrong_cycle': 3, 'rhs_silent': 2, 'unanswered': 7, 'not_granted': 1,
+                'retry_band': 4, 'asked_again': 5, 'no_beacon': 6}
     values = Health().report('', counters).values
     assert values == {'dropped.wrong_cycle': '3', 'cycles.rhs_silent': '2',
-                      'beacons.unanswered': '7', 'cycles.not_granted': '1'}
+                      'beacons.unanswered': '7', 'cycles.not_granted': '1',
+                      'retries.retry_band': '4', 'retries.asked_again': '5',
+                      'beacons.no_beacon': '6'}
 
 
 def test_the_ends_of_cycles_are_those_of_the_tables():
@@ -67,7 +71,7 @@ def test_a_fault_is_told_once_and_a_missing_role_as_long_as_it_is_missing():
     counters = {'wrong_user': 2, 'unanswered': 5}
     first, second = (books.report('', counters) for _ in range(2))
     assert (first.fault, second.fault) == (True, False)
-    assert first.summary.startswith('2 cycles given up or messages dropped')
+    assert first.summary.startswith('2 messages dropped')
     books.note(PeersChanged(('channel', 'bs')), [], 0.0, 0.0)
     for _ in range(2):
         report = books.report('', counters)

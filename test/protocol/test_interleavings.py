@@ -78,6 +78,7 @@ FAULTS = st.lists(st.builds(
 CRASHES = st.lists(st.builds(
     Crash, TIMES_S, st.sampled_from(ROLES), st.sampled_from([0.0, 0.01, 0.1, 0.4]),
     st.booleans()), max_size=4)
+RETRIES = st.sampled_from([0, 3])
 OFFERS = st.lists(st.builds(Offer, TIMES_S, st.integers(0, 2)), max_size=2)
 NOISE = st.fixed_dictionaries({
     'seed': st.integers(0, 2**32 - 1), 'loss': st.sampled_from([0.0, 0.02, 0.1]),
@@ -103,12 +104,12 @@ def plain_beams():
 @pytest.fixture(scope='module')
 def make_network(network_class, scenario, codebooks):
     """Function that makes a network of two users that move fast."""
-    def make(transport, ordered):
+    def make(transport, ordered, retries):
         users = {user: mobility.RandomWalk(scenario, 50.0, np.random.default_rng(user))
                  for user in (1, 2)}
         return network_class(
             scenario, codebooks[0], users, transport=transport, ordered=ordered,
-            step_timeout_s=STEP_S, ack_timeout_s=ACK_S, rest_s=REST_S)
+            step_timeout_s=STEP_S, ack_timeout_s=ACK_S, rest_s=REST_S, retries=retries)
     return make
 
 
@@ -171,18 +172,18 @@ def check_results(net):
             assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
 
 
-@given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, ordered=st.booleans())
-@explicit(faults=[], crashes=[], offers=[], ordered=True)
+@given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, ordered=st.booleans(), retries=RETRIES)
+@explicit(faults=[], crashes=[], offers=[], ordered=True, retries=3)
 def test_single_faults_and_crashes_break_no_promise(
-        make_network, survive, faults, crashes, offers, ordered):
-    survive(make_network(Faulty(faults), ordered), crashes, offers)
+        make_network, survive, faults, crashes, offers, ordered, retries):
+    survive(make_network(Faulty(faults), ordered, retries), crashes, offers)
 
 
-@given(noise=NOISE, crashes=CRASHES, offers=OFFERS, ordered=st.booleans())
+@given(noise=NOISE, crashes=CRASHES, offers=OFFERS, ordered=st.booleans(), retries=RETRIES)
 # A late beacon and a late grant of a cycle that is over.
 @explicit(noise={'seed': 1038635, 'loss': 0.02, 'doubles': 0.5, 'jitter_s': 0.5},
           crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
-          offers=[], ordered=False)
+          offers=[], ordered=False, retries=0)
 def test_storms_and_crashes_break_no_promise(
-        make_network, survive, noisy, noise, crashes, offers, ordered):
-    survive(make_network(noisy(**noise), ordered), crashes, offers)
+        make_network, survive, noisy, noise, crashes, offers, ordered, retries):
+    survive(make_network(noisy(**noise), ordered, retries), crashes, offers)

@@ -191,3 +191,15 @@ def test_being_welcome_again_does_not_change_the_turn(roster):
     r.welcome(1)
     r.welcome(2)
     assert cycle(r, 2, 1) == 1
+
+
+def test_more_users_than_it_can_remember_are_refused(roster):
+    roster = roster()
+    roster.open()
+    for user in range(1, 1025):
+        assert not roster.is_full_for(user)
+        roster.answer(user)
+    assert roster.is_full_for(5000)
+    assert not roster.is_full_for(17)
+    roster.forget(17)
+    assert not roster.is_full_for(5000)

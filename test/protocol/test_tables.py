@@ -21,7 +21,7 @@ ROLES = {
         endless={bs_table.State.WAITING}),
     'user': types.SimpleNamespace(
         machine=user.User, states=user.State, inputs=user.Input, initial=user.State.ALONE,
-        home=user.State.LISTENING, endless={user.State.ALONE, user.State.LISTENING}),
+        home=user.State.UNCALLED, endless={user.State.ALONE, user.State.UNCALLED}),
     'rhs_controller': types.SimpleNamespace(
         machine=rhs_controller.RhsController, states=rhs_controller.State,
         inputs=rhs_controller.Input, initial=rhs_controller.State.IDLE,

@@ -147,9 +147,10 @@ def test_a_pilot_request_that_overtakes_the_grant_stands_for_it(user):
 
 def test_a_granted_user_outlasts_the_steps_that_it_hears_nothing_of():
     """Sounding of the last band, estimating and steering, each just within its time-out."""
-    waits = timeouts(0.5)
+    waits = timeouts(0.5, 7.0)
     assert waits[State.GRANTED] > 3 * 0.5
-    assert waits.keys() == {State.ACKNOWLEDGED, State.GRANTED}
+    assert waits.keys() == {State.LISTENING, State.ACKNOWLEDGED, State.GRANTED}
+    assert waits[State.LISTENING] == 7.0
 
 
 @pytest.mark.parametrize(('granted', 'deadline_s', 'reason'), [

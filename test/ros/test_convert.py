@@ -200,6 +200,16 @@ def test_an_unknown_constant_is_refused(kind, field, number):
         convert.from_ros(kind, message)
 
 
+@pytest.mark.parametrize('kind', KINDS, ids=lambda kind: kind.__name__)
+def test_bytes_are_the_message_or_an_error_that_names_it(kind):
+    message = random_message(kind, np.random.default_rng(3))
+    serialized = serialize_message(convert.to_ros(message, STAMP))
+    assert_same(message, convert.from_bytes(kind, serialized))
+    for broken in (b'', serialized[:4], serialized[:-1], b'\xff' * len(serialized)):
+        with pytest.raises(MessageError, match=f'{kind.__name__}'):
+            m.check(convert.from_bytes(kind, broken), SIZES)
+
+
 def test_codebook_travels_bit_for_bit(shipped):
     sent = convert.codebook_to_ros(shipped, STAMP)
     received = deserialize_message(serialize_message(sent), ros.Codebook)

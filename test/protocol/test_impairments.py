@@ -1,0 +1,89 @@
+"""An air that is not ideal: what it does to messages, and that the protocol bears it."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.events import Note, Send, Tick
+from rhs_isac_ros.protocol.impairments import Impaired, Impairments
+from rhs_isac_ros.protocol.role import PlainRole
+
+
+class Repeats(PlainRole):
+    """Sends on what it is told, with a note."""
+
+    def handle(self, event, now_s):
+        return [Send(event), Note('heard')]
+
+
+@pytest.fixture
+def impaired():
+    """Function of impairments: `Repeats` behind such an air."""
+    def make(seed=0, **impairments):
+        return Impaired(Repeats(), Impairments(**impairments), np.random.default_rng(seed))
+    return make
+
+
+def through(role, n):
+    """Cycle numbers in the order of their arrival, of n messages sent at time 0."""
+    arrived = [action for cycle in range(n) for action in role.handle(m.Beacon(cycle, 0), 0.0)]
+    while (due_s := role.next_deadline()) is not None:
+        arrived += role.handle(Tick(), due_s)
+    assert sum(isinstance(action, Note) for action in arrived) == n
+    return [action.message.cycle_id for action in arrived if isinstance(action, Send)]
+
+
+def test_an_ideal_air_changes_nothing(impaired):
+    role = impaired()
+    (sent, note) = sorted(role.handle(m.Beacon(5, 0), 1.0), key=lambda a: isinstance(a, Note))
+    assert (sent.message.cycle_id, note.text) == (5, 'heard')
+    assert role.next_deadline() is None
+    assert role.counters == {}
+
+
+def test_losses_and_doubles_are_as_probable_as_told_and_counted(impaired):
+    role = impaired(loss_probability=0.2, double_probability=0.1)
+    arrived = through(role, 5000)
+    lost = 5000 - len(set(arrived))
+    doubled = len(arrived) - len(set(arrived))
+    assert role.counters == {'emulated_loss': lost, 'emulated_double': doubled}
+    # Four standard deviations of the binomial.
+    assert abs(lost - 1000) < 4 * np.sqrt(5000 * 0.2 * 0.8)
+    assert abs(doubled - 400) < 4 * np.sqrt(4000 * 0.1 * 0.9)
+    assert len(arrived) <= 2 * len(set(arrived))
+
+
+def test_each_takes_its_time_and_they_overtake_each_other(impaired):
+    role = impaired(delay_s=0.5, jitter_s=0.2)
+    role.handle(m.Beacon(1, 0), 10.0)
+    due_s = role.next_deadline()
+    assert 10.5 <= due_s <= 10.7
+    assert role.handle(Tick(), due_s - 1e-6) == []
+    (sent,) = role.handle(Tick(), due_s)
+    assert sent.message.cycle_id == 1
+    arrived = through(role, 100)
+    assert sorted(arrived) == list(range(100))
+    assert arrived != sorted(arrived)
+
+
+def test_without_jitter_the_order_stays(impaired):
+    assert through(impaired(delay_s=0.5), 50) == list(range(50))
+
+
+def test_the_fate_of_a_message_does_not_depend_on_that_of_others(impaired):
+    some, more = (set(through(impaired(loss_probability=p), 1000)) for p in (0.3, 0.1))
+    assert some < more
+
+
+def test_nearly_all_cycles_are_served_through_a_bad_air(network):
+    net = network(2, rest_s=0.0, retries=3)
+    channel = Channel(net.scenario, net.seed)
+    air = Impairments(0.05, 0.05, 1e-3, 5e-3)
+    net._roles['channel'] = Impaired(channel, air, np.random.default_rng(1))
+    net.run_cycles(300, limit_s=600.0)
+    outcomes = [outcome for _, _, outcome in net.outcomes()]
+    assert outcomes.count('served') >= 0.99 * len(outcomes)
+    assert net['channel'].counters['emulated_loss'] > 50
+    assert net['bs'].counters['retry_band'] > 25
+    net.verify()
