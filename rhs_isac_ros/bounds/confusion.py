@@ -1,7 +1,6 @@
 """How often far positions are taken for one another, which no local bound tells."""
 
 import numpy as np
-from scipy.special import ndtr
 
 from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.model.los import checked_positions, los_gain
@@ -56,6 +55,8 @@ class PairConfusion(Average):
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cost times Q(sqrt(q / 2)), and minus its derivative by the form, which is 2 q."""
+        from scipy.special import ndtr
+
         root = np.sqrt(forms[:, 0, 0])
         costs = self._costs[block]
         # Two equal signals have no slope towards either side.

@@ -3,7 +3,6 @@
 import functools
 
 import numpy as np
-from scipy.special import j0
 
 from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
@@ -121,6 +120,9 @@ def time_correlation(
     center_hz = scenario.center_frequencies_hz[band]
     doppler_hz = scenario.max_user_speed_mps * center_hz / SPEED_OF_LIGHT_MPS
     lag_s = (np.asarray(first) - np.asarray(second)) * scenario.frame_duration_s
+    # Here, as in all that every node imports: SciPy takes longer to load than ROS.
+    from scipy.special import j0
+
     return j0(2 * np.pi * doppler_hz * lag_s)
 
 

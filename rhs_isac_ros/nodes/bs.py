@@ -16,7 +16,6 @@ from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged
 from rhs_isac_ros.protocol.gate import Gate, users_of
 from rhs_isac_ros.protocol.roster import Roster
 from rhs_isac_ros.ros import peers
-from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -41,8 +40,7 @@ class BsNode(RoleNode):
             self.scenario, roster, self._receive, timeouts_s, values.data_duration_s,
             values.first_cycle or _number_from_the_clock(), self._gate(), values.retries),
             RECEIVES)
-        self._codebook = CodebookSource(
-            self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
+        self.follow_codebook(lambda codebook: self.tell(CodebookOffered(codebook)))
         self._peers = peers.PeerWatch(
             self, peers.OF_BASE_STATION, lambda missing: self.tell(PeersChanged(missing)))
 

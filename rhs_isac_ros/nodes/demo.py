@@ -1,6 +1,7 @@
 """The executable ``demo``: the whole network as processes, watched for some cycles."""
 
 import argparse
+import dataclasses
 import os
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from rclpy.executors import ExternalShutdownException
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.nodes.demo_report import draw, summary, table
+from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
@@ -80,7 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def start_network(
         processes: Processes, users: int, seed: int, scenario_file: Path | None,
-        codebook_file: Path, scenario: Scenario, rest_s: float = 0.1) -> None:
+        codebook_file: Path, scenario: Scenario, rest_s: float = 0.1, first_cycle: int = 1,
+        impairments: Impairments | None = None) -> None:
     """Start every node as a process of its own.
 
     Parameters
@@ -99,17 +102,22 @@ def start_network(
         The scenario itself.
     rest_s
         Pause between cycles [s].
+    first_cycle
+        Number of the first cycle. With numbers from 1, a seed gives the same cycles again; 0, for
+        a base station that is started anew: numbers from the clock.
+    impairments
+        What the air does to signals and packets; by default nothing.
     """
     common = {'scenario_file': Path(scenario_file).resolve()} if scenario_file else {}
     for executable in ('rhs_controller', 'positioner', 'transmission'):
         processes.start(executable, **common)
     processes.start('optimizer', codebook_file=codebook_file, **common)
-    processes.start('channel', seed=seed, **common)
+    air = dataclasses.asdict(impairments or Impairments())
+    processes.start('channel', seed=seed, **air, **common)
     for user in range(1, users + 1):
         processes.start('user', f'user_{user}', user_id=user, seed=seed, mobility='random_walk',
                         speed_mps=scenario.max_user_speed_mps, **common)
-    # With numbers from 1, a seed gives the same cycles again.
-    processes.start('bs', seed=seed, rest_s=rest_s, first_cycle=1, **common)
+    processes.start('bs', seed=seed, rest_s=rest_s, first_cycle=first_cycle, **common)
 
 
 def watch(

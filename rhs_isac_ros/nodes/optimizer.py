@@ -47,7 +47,7 @@ class OptimizerNode(Node):
         values = parameters.declare(self, 'optimizer')
         self._scenario = (
             Scenario.from_yaml(values.scenario_file) if values.scenario_file else Scenario())
-        self._publisher = self.create_publisher(ros.Codebook, topics.CODEBOOK, qos.LATCHED)
+        self._publisher = self.create_publisher(ros.Codebook, topics.CODEBOOK, qos.HELD)
         defaults = Codebook.load(values.codebook_file or default_codebook_file())
         for name, value in defaults.to_parameters().items():
             self.declare_parameter(

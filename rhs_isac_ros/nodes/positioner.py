@@ -28,7 +28,6 @@ from rhs_isac_ros.protocol.events import (
 from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import Background
-from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -45,8 +44,7 @@ class PositionerNode(RoleNode):
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
         self.start(Positioner(self.scenario, time.perf_counter), ())
-        self._codebook = CodebookSource(
-            self, self.scenario, lambda codebook: self.tell(CodebookOffered(codebook)))
+        self.follow_codebook(lambda codebook: self.tell(CodebookOffered(codebook)))
 
     @staticmethod
     def _check_model(file: str) -> None:

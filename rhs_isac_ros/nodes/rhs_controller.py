@@ -6,7 +6,6 @@ from typing import Any
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.rhs_controller import RhsController
-from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -17,7 +16,7 @@ class RhsControllerNode(RoleNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('rhs_controller', (m.RhsConfiguration,), **node_options)
         self.start(RhsController(), ())
-        self._codebook = CodebookSource(self, self.scenario, self._on_codebook)
+        self.follow_codebook(self._on_codebook)
 
     def _on_codebook(self, codebook: Any) -> None:
         self.tell(CodebookOffered(codebook))

@@ -7,7 +7,6 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -25,7 +24,7 @@ class TransmissionNode(RoleNode):
             raise ParameterError(
                 f'band: {band}, expected 0 to {n_bands - 1} of the scenario, or -1')
         self.start(Transmission(self.scenario, None if band < 0 else band), ())
-        self._codebook = CodebookSource(self, self.scenario, self._on_codebook)
+        self.follow_codebook(self._on_codebook)
 
     def _on_codebook(self, codebook: Codebook) -> None:
         self.tell(CodebookOffered(codebook))

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from scipy.special import ndtri
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -11,9 +10,6 @@ from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
 from rhs_isac_ros.positioning.region import loss
 from rhs_isac_ros.positioning.search import SearchEstimator
-
-# Points that represent the Gaussian around a mode when it is cut to the region of interest.
-_SPREAD = 128
 
 
 class BayesEstimator(SearchEstimator):
@@ -44,11 +40,7 @@ class BayesEstimator(SearchEstimator):
             table_folder: Path | None = None) -> None:
         super().__init__(scenario, codebook, table_folder)
         self._prior = np.diag((self._bounds[1] - self._bounds[0])**2 / 12)
-        # Here: a slow import that only this estimator needs.
-        from scipy.stats import qmc
-
-        uniform = qmc.Sobol(3, seed=0).random(_SPREAD)
-        self._normal = ndtri(np.clip(uniform, 1e-6, 1 - 1e-6))
+        self._normal = self._table.normal
 
     def _moments(self, modes: Modes) -> tuple[np.ndarray, np.ndarray]:
         points, curvature, value, gap = modes

@@ -6,7 +6,6 @@ quantiles of `FALSE_ALARM` comes from no position of the region: from a user els
 codebook, a silent or a broken receiver. Then there is no fix.
 """
 
-from scipy.special import gammainccinv, gammaincinv
 
 # Share of good signals that each of the tests may refuse.
 FALSE_ALARM = 1e-9
@@ -30,6 +29,8 @@ class FitTest:
 
     def __init__(self, n_measurements: int) -> None:
         # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
+        from scipy.special import gammainccinv, gammaincinv
+
         self.least_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
         self.most_misfit = float(gammainccinv(n_measurements, FALSE_ALARM))
 

@@ -18,6 +18,8 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 # Tables that a folder keeps; of more, the oldest go.
 _MOST = 16
 _PREFIX = 'table-'
+# Of what a table holds; another one makes tables of before unknown.
+_FORMAT = 2
 
 
 def default_folder() -> Path:
@@ -81,7 +83,7 @@ def table_key(model: WhitenedModel) -> str:
     str
         32 hexadecimal digits.
     """
-    parts = (dataclasses.astuple(model.scenario), model.codebook.id, __version__,
+    parts = (dataclasses.astuple(model.scenario), model.codebook.id, __version__, _FORMAT,
              templates.RANGE_CELL_M, templates.DIRECTION_STEP)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 

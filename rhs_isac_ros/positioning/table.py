@@ -47,10 +47,12 @@ class TemplateTable:
         Grid (r [m], u, v), float64 [G, 3].
     range_offsets_m
         Fine ranges around a grid point's, float64 [D] [m].
+    normal
+        Points that represent a standard Gaussian, float64 [128, 3].
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
-        self.points = arrays['points']
+        self.points, self.normal = arrays['points'], arrays['normal']
         self._filters, self._slope_filters = arrays['filters'], arrays['slope_filters']
         self._energy, self._energy_slope = arrays['energy'], arrays['energy_slope']
         self._curvature = arrays['curvature'] + np.diag(LEAST_CURVATURE)

@@ -13,6 +13,8 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 RANGE_CELL_M = 0.5
 DIRECTION_STEP = 0.025
+# Points that represent a Gaussian where it is cut to the region of interest.
+_SPREAD = 128
 # Grid points that are computed at a time.
 _BLOCK = 256
 # Largest sine of the angle from the normal that the grid goes to.
@@ -34,7 +36,8 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
         conjugate templates without carrier, complex64 [N_B, G, N_SB F]; ``slope_filters``, the
         same of their derivatives by the point, complex64 [G, 3, N_B N_SB F]; ``energy`` of the
         templates, float32 [G]; ``energy_slope``, its derivative, float64 [G, 3]; ``curvature`` of
-        the log-likelihood, float64 [G, 3, 3].
+        the log-likelihood, float64 [G, 3, 3]; and, of no codebook, ``normal``, points that
+        represent a standard Gaussian, float64 [128, 3].
     """
     points = polar_grid(model.scenario)
     n, (n_bands, n_rows) = len(points), model.shape
@@ -45,6 +48,7 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
         'energy': np.empty(n, np.float32),
         'energy_slope': np.empty((n, 3)),
         'curvature': np.empty((n, 3, 3)),
+        'normal': _standard_normal(),
     }
     wavenumbers = carrier_wavenumbers(model.scenario)
     for start in range(0, n, _BLOCK):
@@ -61,6 +65,14 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
         table['energy_slope'][block] = 2 * np.matmul(slopes.conj(), flat[..., None])[..., 0].real
         table['curvature'][block] = information_of(slopes)
     return table
+
+
+def _standard_normal() -> np.ndarray:
+    # Here, and kept with the table: what it imports takes longer to load than the table.
+    from scipy.special import ndtri
+    from scipy.stats import qmc
+
+    return ndtri(np.clip(qmc.Sobol(3, seed=0).random(_SPREAD), 1e-6, 1 - 1e-6))
 
 
 def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:

@@ -54,6 +54,8 @@ class Channel(PlainRole):
         super().__init__()
         self._scenario, self._seed = scenario, seed
         self._cycle: _Cycle | None = None
+        # The first draw factors covariances: now, not while a user waits.
+        draw_multipath(scenario, 0, 1, np.random.default_rng(0))
         self._begun: collections.deque[tuple] = collections.deque(maxlen=_MOST_BEGUN)
         # What the surface reports and which beam it holds, of any cycle that may be coming.
         self._reports: dict[tuple[int, m.Mode, int], np.ndarray] = {}

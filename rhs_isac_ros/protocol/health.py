@@ -62,9 +62,22 @@ class Health:
         self._served = 0
         self._codebook_id = ''
         self._missing: tuple[str, ...] = ()
+        self._lacks: set[str] = set()
         self._began_s: float | None = None
         self._durations_s: dict[str, collections.deque[float]] = {}
         self._faults = 0
+
+    def lack(self, what: str, lacks: bool) -> None:
+        """Enter something that the role can do without, for a while.
+
+        Parameters
+        ----------
+        what
+            Its name.
+        lacks
+            Whether it is missing now.
+        """
+        (self._lacks.add if lacks else self._lacks.discard)(what)
 
     def receive(self, kind: type[m.Message]) -> None:
         """Count a message that has come, whatever becomes of it.
@@ -154,6 +167,8 @@ class Health:
         new, self._faults = faults - self._faults, faults
         if self._missing:
             return Report(True, f'waiting for {", ".join(self._missing)}', values)
+        if self._lacks:
+            return Report(True, f'without {", ".join(sorted(self._lacks))}', values)
         if lacking:
             return Report(True, f'cannot work: {phase}', values)
         if new:

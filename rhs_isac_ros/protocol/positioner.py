@@ -46,6 +46,8 @@ class Positioner(PlainRole):
         self._making: Codebook | None = None
         self._next: Codebook | None = None
         self._waiting: m.ReceivedSignals | None = None
+        # Whether the last signals told no position: said once in a row.
+        self._is_lost = False
         # The signals that were answered last, and the answer.
         self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
 
@@ -122,6 +124,7 @@ class Positioner(PlainRole):
         latency_s = self._stopwatch() - begin
         if not estimate.fix:
             return self._no_fix(received, estimate.reason)
+        self._is_lost = False
         bound = float(crlb(self._scenario, codebook, estimate.mean[None], factors)[0])
         return [Send(m.PositionEstimate(
             received.cycle_id, received.user, received.codebook_id,
@@ -130,9 +133,10 @@ class Positioner(PlainRole):
 
     def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
         self.counters['no_fix'] += 1
-        return [
-            Send(m.NoFix(received.cycle_id, received.user, received.codebook_id, reason)),
-            Note(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)]
+        sent = Send(m.NoFix(received.cycle_id, received.user, received.codebook_id, reason))
+        note = Note(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)
+        said, self._is_lost = self._is_lost, True
+        return [sent] if said else [sent, note]
 
 
 def make_estimator_for(

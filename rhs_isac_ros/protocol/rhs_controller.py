@@ -68,7 +68,8 @@ class RhsController(Machine):
         # Cycle, band and codebook of what was applied, the present one last.
         self._applied: collections.deque[tuple[int, int, str]] = collections.deque(
             maxlen=_MOST_KNOWN)
-        self._complaint = ''
+        # Said once until a command is obeyed.
+        self._has_complained = False
 
     def _classify(self, event: Event) -> Input:
         match event:
@@ -108,7 +109,7 @@ class RhsController(Machine):
         self._codebooks.put(event.codebook.id, event.codebook)
 
     def _apply_band(self, event: m.RhsCommand, now_s: float) -> list[Action]:
-        self._cycle_id = event.cycle_id
+        self._cycle_id, self._has_complained = event.cycle_id, False
         key = event.cycle_id, event.band, event.codebook_id
         if key not in self._applied:
             self._applied.append(key)
@@ -122,8 +123,8 @@ class RhsController(Machine):
             event.analog[None]))]
 
     def _complain(self, event: m.RhsCommand | m.Beam, now_s: float) -> list[Action]:
-        if event.codebook_id == self._complaint:
+        if self._has_complained:
             return []
-        self._complaint = event.codebook_id
+        self._has_complained = True
         return [Note(f'codebook {event.codebook_id!r} asked for, known: '
                      f'{self._codebooks.ids()}', warning=True)]

@@ -37,11 +37,16 @@ class CodebookSource:
         The scenario that it must fit.
     on_codebook
         Called with each new codebook.
+    on_holder
+        Called with whether the optimizer is there, when that changes after it was there.
     """
 
     def __init__(
-            self, node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
-        self._node, self._scenario, self._on_codebook = node, scenario, on_codebook
+            self, node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None],
+            on_holder: Callable[[bool], None] = lambda there: None) -> None:
+        self._node, self._scenario = node, scenario
+        self._on_codebook, self._on_holder = on_codebook, on_holder
+        self._held = True
         self._client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
         # Counts the offers; an answer that was asked for before the last one is out of date.
         self._wanted, self._fetched, self._asked = 1, 0, 0
@@ -49,14 +54,32 @@ class CodebookSource:
         self._complaint = ''
         self._known = ''
         node.create_subscription(
-            ros.Codebook, topics.CODEBOOK, self._on_offer, qos.LATCHED,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+            ros.Codebook, topics.CODEBOOK, self._on_offer, qos.HELD, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                liveliness=self._on_liveliness, use_default_callbacks=False))
         self._timer = steady_timer(node, _RETRY_S, self._ask)
 
-    def _on_offer(self, message: ros.Codebook) -> None:
+    def _on_offer(self, content: bytes) -> None:
+        # What it says does not matter, not even whether it can be decoded.
         # Even if the id is known: a change that is taken back must not stay.
         self._wanted += 1
         self._timer.reset()
+
+    def _on_liveliness(self, event: Any) -> None:
+        held = event.alive_count > 0
+        if held == self._held:
+            return
+        self._held = held
+        self._on_holder(held)
+        if held:
+            self._node.get_logger().info(f'{self._owner} is back')
+        else:
+            self._node.get_logger().warning(
+                f'{self._owner} is gone; {self._known or "no codebook"} stays in use')
+
+    @property
+    def _owner(self) -> str:
+        return f'{self._node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
 
     def _ask(self) -> None:
         if self._fetched == self._wanted:
@@ -89,5 +112,4 @@ class CodebookSource:
     def _complain(self, text: str) -> None:
         if text != self._complaint:
             self._complaint = text
-            owner = f'{self._node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
-            self._node.get_logger().error(f'codebook of {owner} not used: {text}')
+            self._node.get_logger().error(f'codebook of {self._owner} not used: {text}')

@@ -50,6 +50,7 @@ class Processes:
         self._logs = logs
         self._environment = {**os.environ, **environment}
         self._running: dict[str, subprocess.Popen] = {}
+        self._commands: dict[str, list[str]] = {}
 
     def start(self, executable: str, name: str = '', **parameters: Any) -> None:
         """Start an executable.
@@ -72,10 +73,62 @@ class Processes:
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']
-        with open(self._logs / f'{name}.log', 'wb') as log:
+        self._commands[name] = command
+        self._spawn(name, 'wb')
+
+    def kill(self, name: str) -> None:
+        """End a process with SIGKILL, as a crash or a pulled plug would.
+
+        Parameters
+        ----------
+        name
+            Name of its node.
+        """
+        process = self._running.pop(name)
+        process.kill()
+        process.wait()
+
+    def restart(self, name: str) -> None:
+        """Start a process again as it was started before; it goes on in the same log.
+
+        Parameters
+        ----------
+        name
+            Name of its node.
+        """
+        self._spawn(name, 'ab')
+
+    def memory_bytes(self) -> dict[str, int]:
+        """Return the resident memory of the processes.
+
+        Returns
+        -------
+        dict
+            Memory by name [bytes], of those that run.
+        """
+        page = os.sysconf('SC_PAGE_SIZE')
+        result = {}
+        for name, process in self._running.items():
+            if process.poll() is None:
+                pages = Path(f'/proc/{process.pid}/statm').read_text(encoding='ascii').split()[1]
+                result[name] = int(pages) * page
+        return result
+
+    def _spawn(self, name: str, mode: str) -> None:
+        with open(self._logs / f'{name}.log', mode) as log:
             self._running[name] = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                self._commands[name], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 env=self._environment, start_new_session=True, preexec_fn=_end_with_parent)
+
+    def names(self) -> list[str]:
+        """Return the names of all processes that were ever started.
+
+        Returns
+        -------
+        list of str
+            The names.
+        """
+        return list(self._commands)
 
     def ended(self) -> dict[str, int]:
         """Return the processes that have ended by themselves.

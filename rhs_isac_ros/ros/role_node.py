@@ -8,11 +8,13 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Note, Send, Tick
 from rhs_isac_ros.protocol.health import Health, Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
+from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.timers import steady_timer
 
@@ -108,6 +110,18 @@ class RoleNode(Node):
             return self._health.report('', self._role.counters)
         return self._health.report(
             state.value, self._role.counters, state in self._role.LACKING)
+
+    def follow_codebook(self, on_codebook: Callable[[Codebook], None]) -> None:
+        """Fetch the codebook from the optimizer, and every change of it.
+
+        Parameters
+        ----------
+        on_codebook
+            Called with each new codebook.
+        """
+        self._codebook_source = CodebookSource(
+            self, self.scenario, on_codebook,
+            lambda there: self._health.lack(topics.OPTIMIZER_NODE, not there))
 
     def advertise(self, sends: Iterable[type[m.Message]]) -> None:
         """Create publishers; the graph then shows that the role is there.

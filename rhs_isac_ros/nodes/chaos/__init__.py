@@ -1,0 +1,1 @@
+"""Trying the promises of the network: crashes, a bad air, hostile messages."""
