@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rcl_interfaces.srv import GetParameters
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
@@ -47,7 +47,9 @@ class CodebookSource:
         self._node, self._scenario = node, scenario
         self._on_codebook, self._on_holder = on_codebook, on_holder
         self._held = True
-        self._client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
+        # Of the parameter services, only this one: a policy need not allow the others.
+        self._client = node.create_client(
+            GetParameters, f'{topics.OPTIMIZER_NODE}/get_parameters')
         # Counts the offers; an answer that was asked for before the last one is out of date.
         self._wanted, self._fetched, self._asked = 1, 0, 0
         self._asked_s = -math.inf
@@ -87,10 +89,10 @@ class CodebookSource:
             return
         now_s = time.monotonic()
         waiting = self._asked == self._wanted and now_s - self._asked_s < _ANSWER_S
-        if not waiting and self._client.services_are_ready():
+        if not waiting and self._client.service_is_ready():
             self._asked, self._asked_s = self._wanted, now_s
-            self._client.get_parameters(
-                _NAMES, callback=functools.partial(self._on_answer, self._wanted))
+            future = self._client.call_async(GetParameters.Request(names=_NAMES))
+            future.add_done_callback(functools.partial(self._on_answer, self._wanted))
 
     def _on_answer(self, asked: int, future: Any) -> None:
         values = future.result().values if future.exception() is None else ()
