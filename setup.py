@@ -31,7 +31,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        (f'share/{NAME}/config/sros2', sorted(glob('config/sros2/*.*'))),
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.*'))),
     ],
     python_requires='>=3.10',

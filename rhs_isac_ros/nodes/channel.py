@@ -10,6 +10,7 @@ from rhs_isac_ros.protocol.impairments import Impaired, Impairments
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
+SENDS = (m.FeedSignals, m.Data)
 RECEIVES = (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data)
 
 
@@ -17,7 +18,7 @@ class ChannelNode(RoleNode):
     """Air, multipath, surface and on-board propagation."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('channel', (m.FeedSignals, m.Data), **node_options)
+        super().__init__('channel', SENDS, **node_options)
         values = self.values
         ideal = Channel(self.scenario, values.seed)
         impairments = Impairments(

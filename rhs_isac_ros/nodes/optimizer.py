@@ -24,6 +24,7 @@ from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import run
 
+PUSHER_NODE = 'codebook_pusher'
 DESCRIPTIONS = {
     'codebook.id': 'Hash of the content; must match it.',
     'codebook.shape': 'Sizes N_B, N_SB, F, K, N_E.',
@@ -141,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _push(codebook: Codebook, args: Sequence[str]) -> int:
     rclpy.init(args=args)
-    node = Node('codebook_pusher')
+    node = Node(PUSHER_NODE)
     try:
         push(node, codebook)
     except PushError as error:

@@ -32,12 +32,15 @@ from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
+SENDS = (m.PositionEstimate, m.NoFix)
+RECEIVES = (m.ReceivedSignals,)
+
 
 class PositionerNode(RoleNode):
     """The positioner; it listens to received signals once its tables are built."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('positioner', (m.PositionEstimate, m.NoFix), **node_options)
+        super().__init__('positioner', SENDS, **node_options)
         if self.values.estimator == NeuralEstimator.name:
             self._check_model(self.values.model_file)
         self._background = Background(self)
@@ -89,7 +92,7 @@ class PositionerNode(RoleNode):
     def _on_estimator(self, event: EstimatorMade | EstimatorFailed) -> None:
         self.tell(event)
         if isinstance(event, EstimatorMade):
-            self.listen((m.ReceivedSignals,))
+            self.listen(RECEIVES)
 
     def publish(self, message: m.Message) -> bool:
         """Publish an estimate, and the same as a standard pose.

@@ -11,6 +11,7 @@ from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
+SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
 RECEIVES = (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth)
 
 
@@ -28,7 +29,7 @@ class TransmissionNode(RoleNode):
 
     def _on_codebook(self, codebook: Codebook) -> None:
         self.tell(CodebookOffered(codebook))
-        self.advertise((m.Beam, m.Capacity, m.CapacityStatistics))
+        self.advertise(SENDS)
         self.listen(RECEIVES)
 
 

@@ -13,6 +13,8 @@ from rhs_isac_ros.ros import convert, parameters, qos, scene, topics
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.timers import steady_timer
 
+RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.PositionEstimate)
+
 
 class VisualizerNode(Node):
     """Publishes board, region of interest, users and estimates as markers."""
@@ -24,7 +26,7 @@ class VisualizerNode(Node):
             Scenario.from_yaml(values.scenario_file) if values.scenario_file else Scenario())
         self._latest: dict[tuple[type, int], m.Message] = {}
         self._publisher = self.create_publisher(MarkerArray, topics.MARKERS, qos.EXCHANGE)
-        for kind in (m.RhsConfiguration, m.GroundTruth, m.PositionEstimate):
+        for kind in RECEIVES:
             self.create_subscription(
                 convert.ros_type(kind), topics.NAMES[kind],
                 lambda message, kind=kind: self._on_message(kind, message), qos.of(kind),
