@@ -19,7 +19,7 @@ from rhs_isac_ros.protocol import messages as m
 RECEIVES = (m.Grant, m.RhsConfiguration, m.FeedSignals, m.ReceivedSignals, m.PositionEstimate,
             m.Beam, m.Capacity)
 # Topics have no common order: a result is judged when so much more must have been heard.
-_PATIENCE_S = 1.0
+SETTLE_S = 1.0
 # Cycles whose messages are kept.
 _MOST_CYCLES = 64
 # What is wrong, and the kind of message whose absence it is, if any.
@@ -107,7 +107,7 @@ class Promises:
         """
         self._note(message)
         if isinstance(message, m.PositionEstimate | m.Capacity):
-            self._results.append((now_s + _PATIENCE_S, message))
+            self._results.append((now_s + SETTLE_S, message))
         while self._results and self._results[0][0] <= now_s:
             self._judge(self._results.popleft()[1])
 

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -44,10 +44,15 @@ class Processes:
         Directory for what each process prints: one file ``<name>.log`` each.
     environment
         Environment variables to set for all of them.
+    within
+        Function of a node's name that returns what to put before its command, such as
+        ``ip netns exec lab``; by default nothing.
     """
 
-    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
-        self._logs = logs
+    def __init__(
+            self, logs: Path, environment: Mapping[str, str],
+            within: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
+        self._logs, self._within = logs, within
         self._environment = {**os.environ, **environment}
         self._running: dict[str, subprocess.Popen] = {}
         self._commands: dict[str, list[str]] = {}
@@ -70,6 +75,7 @@ class Processes:
         if name:
             command += ['-r', f'__node:={name}']
         name = name or executable
+        command = [*self._within(name), *command]
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']
@@ -120,15 +126,10 @@ class Processes:
                 self._commands[name], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 env=self._environment, start_new_session=True, preexec_fn=_end_with_parent)
 
-    def names(self) -> list[str]:
-        """Return the names of all processes that were ever started.
-
-        Returns
-        -------
-        list of str
-            The names.
-        """
-        return list(self._commands)
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the nodes that were started."""
+        return tuple(self._commands)
 
     def ended(self) -> dict[str, int]:
         """Return the processes that have ended by themselves.

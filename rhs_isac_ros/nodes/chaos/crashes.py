@@ -188,7 +188,7 @@ def _kill_in(watcher: Watcher, processes: Processes, node: str, phase: m.Phase) 
 
 
 def _log_lengths(processes: Processes) -> dict[str, int]:
-    return {name: len(processes.log(name)) for name in processes.names()}
+    return {name: len(processes.log(name)) for name in processes.names}
 
 
 def _warnings_since(

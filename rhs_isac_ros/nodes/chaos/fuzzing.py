@@ -214,7 +214,7 @@ def _settle(
                 dropped[key.removeprefix('dropped.')] += count - before[node].get(key, 0)
         counted[node] = counts.get('dropped.malformed', 0) - before[node].get(
             'dropped.malformed', 0)
-    traces = [f'{name}: {line}' for name in processes.names()
+    traces = [f'{name}: {line}' for name in processes.names
               for line in processes.log(name).splitlines()
               if line.startswith('Traceback') or 'terminate called' in line
               or 'rcutils' in line]

@@ -1,0 +1,1 @@
+"""The network on several hosts of one machine: network namespaces whose links are pulled."""
