@@ -31,7 +31,7 @@ _PATIENCE_S = 60.0
 _CALM_S = 5.0
 _WATCH_S = 20.0
 # A node notices that another one is gone this long after the lease at the latest [s].
-_NOTICE_S = 2.0
+_NOTICE_S = 3.0
 
 
 class NetworkBroken(RuntimeError):
@@ -99,6 +99,8 @@ class Trial:
         self._hosts.pull(host)
         marks_s.append(time.monotonic())
         self._spin(seconds)
+        said = {node: self._processes.log(node)[size:] for node, size in sizes.items()}
+        warnings = {node: tuple(texts) for node, texts in self._observer.warnings.items()}
         marks_s.append(time.monotonic())
         # Others may find those behind the link again before this observer does.
         self._observer.promises.expect_silence(promises.RECEIVES)
@@ -107,9 +109,7 @@ class Trial:
         marks_s.append(time.monotonic())
         kinds = plan.WAITERS[host] if seconds >= self._lease_s + _NOTICE_S else ()
         return judge(
-            host, marks_s, self._observer.log.complete,
-            {node: self._processes.log(node)[size:] for node, size in sizes.items()},
-            self._observer.warnings,
+            host, marks_s, self._observer.log.complete, said, warnings,
             [node for node in sizes if node.partition('_')[0] in kinds])
 
     def settle(self) -> None:
@@ -241,7 +241,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--pull', action='append', choices=list(plan.HOSTS), metavar='NAME',
                         help=f'host to cut off: {", ".join(plan.HOSTS)}; may be repeated; each '
                         'in turn if none')
-    parser.add_argument('--seconds', type=_positive, default=5.0, help='for how long')
+    parser.add_argument('--seconds', type=_positive, default=6.0, help='for how long')
     parser.add_argument('--users', type=int, choices=range(1, 65), metavar='N', default=2,
                         help='number of users')
     parser.add_argument('--seed', type=int, default=0, help='seed of all random numbers')

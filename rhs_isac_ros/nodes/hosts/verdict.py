@@ -33,7 +33,7 @@ class Pull:
         and after it until the end of the watch. A network lacks something without any of its
         hosts: a cycle during the pull has found another way than the link.
     said, diagnosed
-        Nodes that said in their log, or in their diagnostics, for whom they wait.
+        Nodes that said during the pull, in their log or diagnostics, for whom they wait.
     untold
         Nodes that should have said so, and did not.
     repeated
@@ -92,9 +92,9 @@ def judge(
     cycles
         Complete cycles.
     said
-        What each node has written into its log since the pull.
+        What each node has written into its log during the pull.
     warnings
-        What the diagnostics of each node have warned of since the pull.
+        What the diagnostics of each node have warned of during the pull.
     waiters
         Nodes that must say that they wait.
 
