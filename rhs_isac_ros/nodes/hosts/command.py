@@ -144,7 +144,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0 if all went as promised; 1 if not; 2 if an argument or a file is wrong; 77
         if network namespaces are not allowed; 130 after Ctrl-C or SIGTERM.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.json and not options.json.resolve().parent.is_dir():
+        parser.error(f'argument --json: {options.json}, expected a file in a directory that '
+                     'exists')
     try:
         scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
         codebook_file = Path(options.codebook or default_codebook_file()).resolve()

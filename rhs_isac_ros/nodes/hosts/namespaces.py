@@ -146,7 +146,7 @@ def _remove(name: str) -> None:
         for pid in _run(('ip', 'netns', 'pids', name)).split():
             # This process itself may have moved there.
             if int(pid) != os.getpid():
-                with contextlib.suppress(ProcessLookupError):
+                with contextlib.suppress(ProcessLookupError, PermissionError):
                     os.kill(int(pid), signal.SIGKILL)
         _run(('ip', 'netns', 'del', name))
 

@@ -108,7 +108,8 @@ def test_where_there_is_no_ip_it_says_skipped(files, monkeypatch, capsys):
 
 
 def test_wrong_arguments_are_refused(capsys):
-    for arguments in (['--pull', 'radio'], ['--seconds', '0'], ['--users', '0']):
+    for arguments in (['--pull', 'radio'], ['--seconds', '0'], ['--users', '0'],
+                      ['--json', '/nonexistent/figures.json']):
         with pytest.raises(SystemExit):
             main(arguments)
         assert 'error: argument' in capsys.readouterr().err
