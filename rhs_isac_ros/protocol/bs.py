@@ -135,7 +135,8 @@ class BaseStation(Machine):
     def _classify_tick(self) -> Input:
         if self.state is State.BEACONING and self._roster.answered:
             return Input.WINDOW_OVER
-        if self.state is State.RESTING and (self._missing or not self._offered):
+        idle = self.state in (State.RESTING, State.BEACONING)
+        if idle and (self._missing or not self._offered):
             return Input.NOT_READY
         again = self.state in STEPS and self.repeats < self._retries
         return Input.RETRY if again else Input.TIMEOUT
@@ -218,9 +219,12 @@ class BaseStation(Machine):
         self._roster.welcome(event.user)
 
     def _grant(self, event: Event, now_s: float) -> list[Action]:
+        lost = self._roster.give_up()
+        self.counters.update({'user_lost': len(lost)} if lost else {})
         self._user = self._roster.select()
         self._band = -1
-        return [Send(m.Grant(self._cycle_id, self._user))]
+        return [Send(m.Grant(self._cycle_id, self._user)),
+                *(Note(f'user {user} answers no more', warning=True) for user in lost)]
 
     def _announce_positioning(self, event: Event, now_s: float) -> list[Action]:
         return self._announce(m.Phase.POSITIONING, now_s)

@@ -97,6 +97,7 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
         S.CONFIGURING, ('note_ack', 'grant', 'command_band', 'announce_positioning')),
     (S.BEACONING, I.WINDOW_OVER): Step(
         S.CONFIGURING, ('grant', 'command_band', 'announce_positioning')),
+    (S.BEACONING, I.NOT_READY): Step(S.WAITING, ('complain',)),
     (S.BEACONING, I.TIMEOUT): Step(SAME, ('beacon_again',), counts='unanswered', rearm=True),
     (ANY, I.LATE_ACK): Step(SAME, ('welcome',), counts='late_ack'),
     # Positioning.

@@ -17,6 +17,7 @@ _PERCENTS = (50, 95, 99)
 # Of the counters of a role: beacons without an ack, or none at all; steps that were asked for
 # again; and what ends a cycle, as base station or user see it. All else was dropped.
 UNANSWERED = bs_table.TABLE[bs_table.State.BEACONING, bs_table.Input.TIMEOUT].counts
+USER_LOST = 'user_lost'
 NO_BEACON = user.TABLE[user.State.LISTENING, user.Input.TIMEOUT].counts
 RETRIES = frozenset(
     step.counts for table, name in ((bs_table.TABLE, 'retry'), (user.TABLE, 'same_request'))
@@ -179,7 +180,7 @@ class Health:
 
 def _section(reason: str) -> str:
     """What a counter is about."""
-    if reason in (UNANSWERED, NO_BEACON):
+    if reason in (UNANSWERED, NO_BEACON, USER_LOST):
         return 'beacons'
     if reason in RETRIES:
         return 'retries'

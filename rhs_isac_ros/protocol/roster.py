@@ -106,18 +106,30 @@ class Roster:
             return True
         return self._missed.keys() <= {*self.answered, user}
 
+    def give_up(self) -> list[int]:
+        """Wait no longer for users that have not answered for some cycles; the list closes.
+
+        Returns
+        -------
+        list of int
+            Who is not waited for any more.
+        """
+        lost = []
+        for user in sorted(self._missed.keys() - set(self.answered)):
+            self._missed[user] += 1
+            if self._missed[user] >= _PATIENCE:
+                self.forget(user)
+                lost.append(user)
+        return lost
+
     def select(self) -> int:
-        """Choose among those that answered and close the cycle's list.
+        """Choose among those that answered.
 
         Returns
         -------
         int
             The user to serve.
         """
-        for user in self._missed.keys() - set(self.answered):
-            self._missed[user] += 1
-            if self._missed[user] >= _PATIENCE:
-                self.forget(user)
         if self._policy == 'first':
             chosen = self.answered[0]
         elif self._policy == 'random':

@@ -115,7 +115,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         Parameter('ground_truth_period_s', 0.1, 'How often it tells its true position.', 's',
                   0.01, 60.0),
         STEP_TIMEOUT,
-        Parameter('beacon_timeout_s', 3.0, 'Without a beacon for so long, it says so.', 's', 0.1,
+        Parameter('beacon_timeout_s', 1.5, 'Without a beacon for so long, it says so.', 's', 0.1,
                   7200.0),
     ),
     'rhs_controller': (SCENARIO,),

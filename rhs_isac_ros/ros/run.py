@@ -1,5 +1,6 @@
 """How every node spins and ends."""
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -14,9 +15,18 @@ from rclpy.signals import SignalHandlerOptions
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.resources import discovery_profile_file
 
 # The executor looks at least this often whether a signal has come.
 _POLL_S = 0.1
+
+
+def find_each_other_quickly() -> None:
+    """Have Fast DDS tell sooner than usual who is gone and who is back, in this process.
+
+    It reads a profile when the first node is made; one that the environment names already stays.
+    """
+    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(discovery_profile_file()))
 
 
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None) -> int:
@@ -41,6 +51,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None) -
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))
+    find_each_other_quickly()
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:

@@ -29,7 +29,7 @@ from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
-from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.run import find_each_other_quickly, run
 
 # The chain of a cycle; the pilots of a band travel side by side and count once.
 BEFORE = ('beacon', 'ack')
@@ -53,6 +53,7 @@ def main() -> int:
     os.environ.update(private_domain())
     scenario = Scenario()
     hops = len(BEFORE) + scenario.n_bands * len(PER_BAND) + len(AFTER)
+    find_each_other_quickly()
     rclpy.init(args=[])
     try:
         before_s = ping_pong(scenario)

@@ -701,3 +701,32 @@ def test_another_no_fix_does_not_end_the_cycle(network, codebooks, changes):
     net.run_cycles(1)
     assert net.served() == [1, 1]
     assert sum(net['bs'].counters.values()) == 1
+
+
+def test_a_base_station_that_nobody_answers_notices_that_a_role_dies(network):
+    net = network()
+    net.run_cycles(1)
+    net.remove('user1')
+    net.run(limit_s=2.0)
+    assert net['bs'].state is State.BEACONING
+    net.remove('positioner')
+    net.run(limit_s=2.0)
+    assert net['bs'].state is State.WAITING
+    assert net.said('bs') == ['waiting for positioner']
+    net.add('positioner')
+    net.run(limit_s=2.0)
+    assert net['bs'].state is State.BEACONING
+
+
+def test_a_user_that_answers_no_more_is_told_of_once(network):
+    net = network(2)
+    net.run_cycles(2)
+    net.remove('user2', noticed=False)
+    net.run_cycles(8)
+    # It may be in the middle of a cycle of its own when it dies.
+    assert net.said('bs') == ['user 2 answers no more']
+    assert net['bs'].counters['user_lost'] == 1
+    net.add('user2')
+    net.run_cycles(4)
+    assert set(net.served()[-2:]) == {1, 2}
+    assert net.said('bs') == ['user 2 answers no more']

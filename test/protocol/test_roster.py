@@ -18,6 +18,7 @@ def cycle(roster, *users):
     roster.open()
     for user in users:
         roster.answer(user)
+    roster.give_up()
     return roster.select()
 
 
@@ -141,6 +142,7 @@ def test_who_leaves_three_beacons_unanswered_is_not_waited_for(roster):
         r.open()
         assert not r.complete_with(1)
         r.answer(1)
+        r.give_up()
         r.select()
     r.open()
     assert r.complete_with(1)
@@ -156,6 +158,7 @@ def test_an_answer_forgives_what_was_missed(roster):
         r.open()
         assert not r.complete_with(1)
         r.answer(1)
+        r.give_up()
         r.select()
 
 
@@ -167,6 +170,7 @@ def test_who_is_forgotten_is_not_waited_for_until_it_answers(roster):
     assert r.complete_with(1)
     r.answer(1)
     r.answer(2)
+    r.give_up()
     r.select()
     r.open()
     assert not r.complete_with(1)
@@ -180,6 +184,7 @@ def test_who_is_welcome_is_waited_for_but_has_not_answered(roster):
     r.open()
     assert not r.complete_with(1)
     r.answer(1)
+    r.give_up()
     assert r.select() == 1
     assert cycle(r, 1, 2) == 2
 

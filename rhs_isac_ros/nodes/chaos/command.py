@@ -22,6 +22,7 @@ from rhs_isac_ros.nodes.demo import start_network
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
+from rhs_isac_ros.ros.run import find_each_other_quickly
 
 # Pause between cycles [s].
 _REST_S = 0.02
@@ -50,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'error: {error}', file=sys.stderr)
         return 2
     os.environ.update(private_domain())
+    find_each_other_quickly()
     rclpy.init(args=[])
     watcher = Watcher(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:

@@ -23,8 +23,9 @@ PHASES = tuple(m.Phase)
 # What counts as recovered [s].
 LIMIT_S = 3.0
 _PATIENCE_S = 30.0
-# Who tells of a node that is missing has so long to do so: twice the period of the diagnostics.
-_DOWN_S = 2.0
+# Who tells of a node that is missing has so long to do so: users wait 1.5 s for a beacon, and
+# diagnostics come once a second.
+_DOWN_S = 3.0
 
 
 class ChaosError(RuntimeError):
@@ -67,6 +68,12 @@ class Cell:
     def recovered(self) -> bool:
         """Whether the network served again in time and lost nobody else."""
         return self.recovered_s <= LIMIT_S and self.survivors
+
+    @property
+    def told(self) -> bool:
+        """Whether others told of it, in log and diagnostics, and nobody twice the same."""
+        return bool(self.told_log and self.told_diagnostics
+                    and len(set(self.told_log)) == len(self.told_log))
 
 
 def crash_all(

@@ -29,7 +29,7 @@ def crash_line(cell: Cell) -> str:
     speakers = sorted({line.partition(':')[0] for line in cell.told_log})
     told = f'{", ".join(speakers) or "-"}; {", ".join(cell.told_diagnostics) or "-"}'
     others = 'alive' if cell.survivors else 'DIED'
-    mark = '' if cell.recovered else '  NOT IN TIME'
+    mark = ('' if cell.recovered else '  NOT IN TIME') + ('' if cell.told else '  NOT TOLD ONCE')
     row = (f'{cell.node:15s} {cell.phase:14s} {cell.recovered_s:7.2f} s   {others:6s}   '
            f'{told}{mark}')
     return '\n'.join([row, *(f'  WRONG: {fault}' for fault in cell.broken)])
@@ -55,6 +55,7 @@ def crash_figures(cells: Sequence[Cell], promises: Promises) -> dict:
     return {
         'cells': len(cells),
         'cells_recovered': recovered,
+        'cells_told': sum(cell.told for cell in cells),
         'worst_recovery_s': worst_s if math.isfinite(worst_s) else None,
         'wrong_publications': len(promises.broken),
         'checked_publications': promises.checked,
@@ -64,7 +65,8 @@ def crash_figures(cells: Sequence[Cell], promises: Promises) -> dict:
                    'others_alive': cell.survivors, 'told_log': list(cell.told_log),
                    'told_diagnostics': list(cell.told_diagnostics),
                    'wrong': list(cell.broken)} for cell in cells],
-        'passed': recovered == len(cells) and not promises.broken,
+        'passed': (all(cell.recovered and cell.told for cell in cells)
+                   and not promises.broken),
     }
 
 
@@ -83,7 +85,8 @@ def crash_summary(figures: dict) -> str:
     """
     worst_s = figures['worst_recovery_s']
     worst = 'never' if worst_s is None else f'{worst_s:.2f} s'
-    return (f'{figures["cells_recovered"]} of {figures["cells"]} recovered within the limit, '
+    return (f'{figures["cells_told"]} of {figures["cells"]} told of once; '
+            f'{figures["cells_recovered"]} of {figures["cells"]} recovered within the limit, '
             f'the slowest in {worst}; {figures["wrong_publications"]} wrong publications among '
             f'{figures["checked_publications"]}, {figures["unverified_publications"]} of which '
             'were made before this watcher found a node that others had found already')

@@ -197,7 +197,7 @@ def _try(
 
 def _set_environment(profile: Path | None, static_peers: bool) -> None:
     """Set what this process and all nodes need to know of the network."""
-    for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
+    for name in ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
         os.environ.pop(name, None)
     os.environ.update({
         'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp',
@@ -210,8 +210,8 @@ def _set_environment(profile: Path | None, static_peers: bool) -> None:
     if static_peers:
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         os.environ['ROS_STATIC_PEERS'] = ';'.join(plan.addresses().values())
-    if profile is not None:
-        os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
+    # Without a value, nodes would take the profile of the package by themselves.
+    os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile or '')
 
 
 def _report(
