@@ -52,7 +52,8 @@ def lie(kind: type, heard: Sequence[bytes], rng: np.random.Generator) -> bytes:
         for _ in range(rng.integers(1, 9)):
             changed[rng.integers(4, len(changed)) if len(changed) > 4 else 0] = rng.integers(256)
         return bytes(changed)
-    return true[:rng.integers(4, len(true) + 1)]
+    # Whole words: DDS fills them up with zeros, which may make a message whole again.
+    return true[:4 * rng.integers(1, len(true) // 4 + 1)]
 
 
 def random_message(kind: type, rng: np.random.Generator) -> Any:
