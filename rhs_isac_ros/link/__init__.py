@@ -4,9 +4,10 @@ from rhs_isac_ros.link.capacity import Beam, capacity
 from rhs_isac_ros.link.choice import Choice, choose_beam
 from rhs_isac_ros.link.expected import expected_capacity
 from rhs_isac_ros.link.outcome import Outcome, outcome
+from rhs_isac_ros.link.pattern import Pattern, pattern
 from rhs_isac_ros.link.quartiles import RunningQuartiles
 from rhs_isac_ros.link.steer import steer
 
 __all__ = [
-    'Beam', 'Choice', 'Outcome', 'RunningQuartiles', 'capacity', 'choose_beam',
-    'expected_capacity', 'outcome', 'steer']
+    'Beam', 'Choice', 'Outcome', 'Pattern', 'RunningQuartiles', 'capacity', 'choose_beam',
+    'expected_capacity', 'outcome', 'pattern', 'steer']
