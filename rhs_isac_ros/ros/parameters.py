@@ -147,6 +147,8 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'visualizer': (
         SCENARIO,
         Parameter('period_s', 0.2, 'How often it shows the scene.', 's', 0.01, 60.0),
+        Parameter('forget_s', 10.0, 'After how long without a word a user is taken away.', 's',
+                  0.1, 3600.0),
     ),
     'network': (
         Parameter('users', 2, 'Number of users.', low=1, high=1000),

@@ -1,15 +1,18 @@
 """The scene of a network as markers for RViz: metres in the frame ``map``, x outward, z up."""
 
 import colorsys
+from collections.abc import Iterable
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Quaternion, Vector3
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
+from nav_msgs.msg import Path
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
+from rhs_isac_ros.link import Pattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions
 from rhs_isac_ros.protocol import messages as m
@@ -20,6 +23,9 @@ _CHI_SQUARE_95 = float(chdtri(3, 0.05))
 _USER_SIZE_M = 0.25
 # A body without extent is not drawn, and RViz complains about it [m].
 _THINNEST_M = 1e-3
+# A lobe is as long as the pattern's distance where the beam is strongest, and has no length where
+# it is weaker by so much.
+_WEAKEST_DB = -20.0
 # Hues of users whose numbers follow on each other differ by the golden ratio.
 _HUE_STEP = 0.618034
 
@@ -124,6 +130,95 @@ def estimate(message: m.PositionEstimate, stamp: Time) -> Marker:
     marker.scale = _vector(np.maximum(diameters_m, _THINNEST_M))
     marker.color = _colour(message.user, 0.35)
     return marker
+
+
+def lobe_m(pattern: Pattern) -> np.ndarray:
+    """Return a pattern as a body around the surface, whose radius tells the power in decibels.
+
+    Parameters
+    ----------
+    pattern
+        The pattern.
+
+    Returns
+    -------
+    numpy.ndarray
+        Points of the body, float64 [n_el, n_az, 3] [m].
+    """
+    weakest = 10**(_WEAKEST_DB / 10)
+    power_db = 10 * np.log10(np.maximum(pattern.relative, weakest))
+    return pattern.distance_m * (1 - power_db / _WEAKEST_DB)[..., None] * pattern.directions
+
+
+def beam(pattern: Pattern, user: int, stamp: Time) -> Marker:
+    """Return the pattern of a data beam.
+
+    Parameters
+    ----------
+    pattern
+        The pattern.
+    user
+        For whom the beam is.
+    stamp
+        Time of the marker.
+
+    Returns
+    -------
+    visualization_msgs.msg.Marker
+        The body of `lobe_m` as triangles, in the colour of the user.
+    """
+    points = lobe_m(pattern)
+    # Two triangles of each mesh of four neighbours; their fronts look outward.
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    corners = np.stack([a, b, c, a, c, d], axis=2).reshape(-1, 3, 3)
+    # What has no extent is not drawn, but would be sent.
+    corners = corners[np.linalg.norm(np.cross(
+        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0]
+    marker = _marker('beam', 0, Marker.TRIANGLE_LIST, stamp)
+    marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
+    marker.points = [_point(corner) for corner in corners.reshape(-1, 3)]
+    marker.color = _colour(user, 0.25)
+    return marker
+
+
+def gone(namespace: str, number: int, stamp: Time) -> Marker:
+    """Return what takes a marker away.
+
+    Parameters
+    ----------
+    namespace, number
+        Namespace and id of the marker.
+    stamp
+        Time of its end.
+
+    Returns
+    -------
+    visualization_msgs.msg.Marker
+        A marker that deletes the other one.
+    """
+    marker = _marker(namespace, number, Marker.SPHERE, stamp)
+    marker.action = Marker.DELETE
+    return marker
+
+
+def path(positions: Iterable[np.ndarray], stamp: Time) -> Path:
+    """Return a user's way.
+
+    Parameters
+    ----------
+    positions
+        Its positions, float64 [3] [m] each, in their order.
+    stamp
+        Time of the path.
+
+    Returns
+    -------
+    nav_msgs.msg.Path
+        The same; the orientation is unknown.
+    """
+    header = Header(stamp=stamp, frame_id=MAP_FRAME)
+    return Path(header=header, poses=[
+        PoseStamped(header=header, pose=Pose(position=_point(place))) for place in positions])
 
 
 def _marker(namespace: str, number: int, kind: int, stamp: Time) -> Marker:

@@ -29,6 +29,10 @@ CODEBOOK = 'codebook'
 DIAGNOSTICS = 'diagnostics'
 MARKERS = 'markers'
 
+# Of each user: where it is estimated to have been, and where it really was.
+PATH = 'users/user_{user}/path'
+TRUE_PATH = 'users/user_{user}/true_path'
+
 # The node that holds the codebook as its parameters.
 OPTIMIZER_NODE = 'optimizer'
 # Frame of all positions: the surface's centre, x outward, z up.

@@ -5,6 +5,8 @@ import pytest
 from builtin_interfaces.msg import Time
 from visualization_msgs.msg import Marker
 
+from rhs_isac_ros.link import Pattern, pattern, steer
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import scene
@@ -83,3 +85,42 @@ def test_the_region_is_where_the_scenario_says(small):
     assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
     assert (marker.header.frame_id, marker.header.stamp) == ('map', STAMP)
     assert marker.pose.orientation.w == 1
+
+
+def test_the_lobe_has_the_radius_of_the_power_in_decibels():
+    """From 0 dB, at the distance of the pattern, to -20 dB, at the centre."""
+    directions = np.array([[[1.0, 0, 0], [0, 1, 0]], [[0, 0, 1], [0.6, 0.8, 0]]])
+    relative = np.array([[1.0, 0.1], [0.01, 0.0]])
+    points = scene.lobe_m(Pattern(directions, relative, 8.0))
+    assert points == pytest.approx(np.array([[[8, 0, 0], [0, 4, 0]], [[0, 0, 0], [0, 0, 0]]]))
+
+
+def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
+    scenario, place = Scenario(), np.array([9.0, 3.0, 0.3])
+    found = pattern(scenario, steer(scenario, place), 10.0)
+    marker = scene.beam(found, 3, STAMP)
+    corners = np.array([of(point) for point in marker.points]).reshape(-1, 3, 3)
+    assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'map')
+    lengths = np.linalg.norm(corners, axis=-1)
+    assert lengths.max() == pytest.approx(10.0)
+    tip = corners.reshape(-1, 3)[lengths.argmax()] / 10.0
+    assert np.degrees(np.arccos(tip @ place / np.linalg.norm(place))) < 8.0
+    assert corners[..., 0].min() >= -1e-9
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum('nu,nu->n', normals, corners.mean(axis=1)) >= -1e-9).all()
+    assert 0 < marker.color.a < 1
+    assert marker.color.r == scene.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
+
+
+def test_a_path_goes_through_its_positions_in_their_order():
+    places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
+    path = scene.path(places, STAMP)
+    assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
+    assert np.array([of(pose.pose.position) for pose in path.poses]) == pytest.approx(places)
+    assert all(pose.header == path.header and pose.pose.orientation.w == 1
+               for pose in path.poses)
+
+
+def test_what_takes_a_marker_away_names_it():
+    marker = scene.gone('truth', 4, STAMP)
+    assert (marker.ns, marker.id, marker.action) == ('truth', 4, Marker.DELETE)

@@ -1,7 +1,10 @@
 """The node that shows a network."""
 
+import math
+
 import numpy as np
 import pytest
+from nav_msgs.msg import Path
 from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -12,16 +15,21 @@ from rhs_isac_ros.ros import convert, qos, topics
 
 
 @pytest.fixture
-def shown(bench, probe, small_files):
+def shown(bench, probe, small_files, request):
     """What the node publishes, by namespace and id, always the latest."""
     bench.add(VisualizerNode, parameter_overrides=[
         Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
-        Parameter('period_s', value=0.02)])
+        Parameter('period_s', value=0.02),
+        Parameter('forget_s', value=getattr(request, 'param', 60.0))])
     latest = {}
 
     def take(array):
-        latest.clear()
-        latest.update({(marker.ns, marker.id): marker for marker in array.markers})
+        # As RViz does: what is not taken away stays.
+        for marker in array.markers:
+            if marker.action == Marker.DELETE:
+                del latest[marker.ns, marker.id]
+            else:
+                latest[marker.ns, marker.id] = marker
     probe.create_subscription(MarkerArray, topics.MARKERS, take, qos.EXCHANGE)
     return latest
 
@@ -31,20 +39,22 @@ def test_the_scene_is_there_before_anybody_speaks(bench, shown):
     assert set(shown) == {('region', 0), ('board', 0)}
 
 
+def a_truth(user, x):
+    return m.GroundTruth(0, user, np.array([x, user, 0.0]), np.zeros(3))
+
+
 def test_users_and_estimates_come_as_they_are_told(bench, probe, shown):
     truths, estimates = (bench.outlet(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()
     for user in (1, 2):
-        truths.publish(convert.to_ros(m.GroundTruth(
-            0, user, np.array([9.0, user, 0.0]), np.zeros(3)), stamp))
+        truths.publish(convert.to_ros(a_truth(user, 9.0), stamp))
     estimates.publish(convert.to_ros(m.PositionEstimate(
         1, 2, 'cb', np.array([8.0, 2.5, 0.1]), np.eye(3), 0.1, 'bayes', 0.01), stamp))
     bench.until(lambda: {('truth', 1), ('truth', 2), ('estimate', 2)} <= shown.keys(), 'the users')
     assert shown['truth', 2].pose.position.y == 2.0
     assert shown['estimate', 2].pose.position.x == 8.0
     assert shown['estimate', 2].type == Marker.SPHERE
-    truths.publish(convert.to_ros(m.GroundTruth(
-        0, 1, np.array([9.5, 1.0, 0.0]), np.zeros(3)), stamp))
+    truths.publish(convert.to_ros(a_truth(1, 9.5), stamp))
     bench.until(lambda: shown['truth', 1].pose.position.x == 9.5, 'the step')
 
 
@@ -56,3 +66,47 @@ def test_the_board_takes_the_colours_of_its_configuration(bench, probe, shown, s
     outlet.publish(convert.to_ros(m.RhsConfiguration(1, m.Mode.POSITIONING, 0, 'cb', analog),
                                   probe.get_clock().now().to_msg()))
     bench.until(lambda: shown and shown['board', 0].colors[0].r == 1.0, 'the colours')
+
+
+@pytest.mark.parametrize('shown', [0.5], indirect=True)
+def test_a_user_that_falls_silent_is_taken_away(bench, probe, shown, small):
+    """With its beam and its topics; one that goes on stays."""
+    truths, beams = (bench.outlet(probe, kind) for kind in (m.GroundTruth, m.Beam))
+    stamp, sizes = probe.get_clock().now().to_msg(), small.scenario.sizes
+    truths.publish(convert.to_ros(a_truth(1, 9.0), stamp))
+    beams.publish(convert.to_ros(m.Beam(
+        1, 1, 'cb', 0, np.ones(sizes['N_E']), np.ones((sizes['N_SB'], sizes['K']), complex), 1.0),
+        stamp))
+    bench.until(lambda: {('truth', 1), ('beam', 0)} <= shown.keys(), 'user and beam')
+    lobe = np.array([[p.x, p.y, p.z] for p in shown['beam', 0].points])
+    distance = math.hypot(*small.scenario.roi_center_m)
+    assert np.linalg.norm(lobe, axis=1).max() == pytest.approx(distance)
+    timer = probe.create_timer(
+        0.05, lambda: truths.publish(convert.to_ros(a_truth(2, 8.0), stamp)))
+    bench.until(lambda: ('truth', 2) in shown and ('truth', 1) not in shown, 'the end of user 1')
+    timer.cancel()
+    assert ('beam', 0) not in shown
+    bench.until(lambda: not probe.count_publishers('users/user_1/true_path'), 'its path to end')
+    assert set(shown) >= {('region', 0), ('board', 0)}
+
+
+def test_each_user_has_a_path(bench, probe, shown):
+    ways = {}
+    for name in (topics.PATH, topics.TRUE_PATH):
+        probe.create_subscription(
+            Path, name.format(user=7), lambda path, name=name: ways.update({name: path}),
+            qos.EXCHANGE)
+    truths, estimates = (bench.outlet(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
+    stamp = probe.get_clock().now().to_msg()
+    for cycle_id, x in enumerate((8.0, 8.5, 9.0), start=1):
+        truths.publish(convert.to_ros(a_truth(7, x), stamp))
+        estimates.publish(convert.to_ros(m.PositionEstimate(
+            cycle_id, 7, 'cb', np.array([x + 0.1, 2.5, 0.1]), np.eye(3), 0.1, 'bayes', 0.01),
+            stamp))
+
+    def places(name):
+        return [pose.pose.position.x for pose in ways[name].poses] if name in ways else []
+    bench.until(lambda: len(places(topics.PATH)) == len(places(topics.TRUE_PATH)) == 3, 'paths')
+    assert places(topics.TRUE_PATH) == [8.0, 8.5, 9.0]
+    assert places(topics.PATH) == [8.1, 8.6, 9.1]
+    assert ways[topics.PATH].header.frame_id == 'map'
