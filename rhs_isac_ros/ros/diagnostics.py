@@ -1,6 +1,6 @@
 """What every node tells of itself, once a second, as `diagnostic_msgs/DiagnosticArray`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -36,6 +36,25 @@ def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
     status = DiagnosticStatus(
         level=level, name=name.lstrip('/'), message=report.summary, values=values)
     return DiagnosticArray(header=Header(stamp=stamp), status=[status])
+
+
+def from_ros(message: DiagnosticArray) -> Iterator[tuple[str, Report]]:
+    """Convert reports from ROS.
+
+    Parameters
+    ----------
+    message
+        The message.
+
+    Yields
+    ------
+    tuple
+        Full name of a node without its first slash, and its report.
+    """
+    for status in message.status:
+        yield status.name, Report(
+            status.level != DiagnosticStatus.OK, status.message,
+            {pair.key: pair.value for pair in status.values})
 
 
 class Diagnostics:

@@ -10,7 +10,7 @@ from rhs_isac_ros.ros import convert, qos, topics
 
 
 def listen(
-        node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int],
+        node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         then: Callable[[m.Message], None],
         dropped: Callable[[m.MessageError], None] | None = None) -> None:
     """Subscribe to messages of the protocol.
@@ -22,7 +22,7 @@ def listen(
     kinds
         Classes of the messages.
     sizes
-        Sizes by symbol, as `Scenario.sizes` gives them, that the messages must have.
+        Sizes by symbol, as `Scenario.sizes` gives them, that the messages must have; None: any.
     then
         Called with each message.
     dropped
@@ -34,7 +34,8 @@ def listen(
     def take(kind: type[m.Message], message: object) -> None:
         try:
             plain = convert.from_ros(kind, message)
-            m.check(plain, sizes)
+            if sizes is not None:
+                m.check(plain, sizes)
         except m.MessageError as error:
             (dropped or complain)(error)
             return

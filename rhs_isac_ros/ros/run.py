@@ -29,7 +29,8 @@ def find_each_other_quickly() -> None:
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(discovery_profile_file()))
 
 
-def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None) -> int:
+def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
+        done: Callable[[], bool] = lambda: False) -> int:
     """Make nodes, spin them in this thread until a signal comes, and clean up.
 
     SIGINT and SIGTERM only set a flag: rclpy's own handlers would take the context away from a
@@ -41,11 +42,13 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None) -
         Makes the nodes.
     args
         Command line; by default the process's.
+    done
+        Asked again and again whether to end without a signal.
 
     Returns
     -------
     int
-        Exit code: 0 after a signal or a shutdown, 2 if a parameter or a file is wrong.
+        Exit code: 0 after a signal, a shutdown or when done, 2 if a parameter or a file is wrong.
     """
     # A list: a handler may interrupt the other one, and must take no lock.
     signals: list[int] = []
@@ -64,7 +67,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None) -
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
-        while rclpy.ok() and not signals:
+        while rclpy.ok() and not signals and not done():
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass

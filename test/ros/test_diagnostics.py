@@ -6,7 +6,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from rhs_isac_ros.protocol.health import Report
 from rhs_isac_ros.ros import qos, topics
-from rhs_isac_ros.ros.diagnostics import Diagnostics, to_ros
+from rhs_isac_ros.ros.diagnostics import Diagnostics, from_ros, to_ros
 
 
 @pytest.mark.parametrize(('fault', 'level'), [
@@ -18,6 +18,12 @@ def test_a_report_becomes_one_status(fault, level):
     assert told.header.stamp.sec == 4
     assert (status.level, status.name, status.message) == (level, 'a/bs', 'in words')
     assert {pair.key: pair.value for pair in status.values} == values
+
+
+@pytest.mark.parametrize('fault', [False, True])
+def test_a_report_comes_back_from_ros(fault):
+    report = Report(fault, 'in words', {'phase': 'resting', 'cycles.served': '3'})
+    assert list(from_ros(to_ros(report, '/a/bs', Time()))) == [('a/bs', report)]
 
 
 def test_a_node_tells_once_a_second(bench, probe):
