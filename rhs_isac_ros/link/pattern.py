@@ -29,29 +29,34 @@ class Pattern:
     relative: np.ndarray
     distance_m: float
 
-    def horizontal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern along the horizontal plane.
+    def azimuth_cut(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cut the pattern at the elevation of the strongest direction.
 
         Returns
         -------
         tuple of numpy.ndarray
             Azimuths, float64 [n_az] [rad], and `relative` there, float64 [n_az].
         """
-        middle = len(self.relative) // 2
-        x, y, _ = self.directions[middle].T
-        return np.arctan2(y, x), self.relative[middle]
+        row, _ = self.peak
+        x, y, _ = self.directions[len(self.directions) // 2].T
+        return np.arctan2(y, x), self.relative[row]
 
-    def vertical(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern along the plane y = 0.
+    def elevation_cut(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cut the pattern at the azimuth of the strongest direction.
 
         Returns
         -------
         tuple of numpy.ndarray
             Elevations, float64 [n_el] [rad], and `relative` there, float64 [n_el].
         """
-        middle = self.relative.shape[1] // 2
-        x, _, z = self.directions[:, middle].T
-        return np.arctan2(z, x), self.relative[:, middle]
+        _, column = self.peak
+        return np.arcsin(self.directions[:, column, 2]), self.relative[:, column]
+
+    @property
+    def peak(self) -> tuple[int, int]:
+        """Row and column of the strongest direction."""
+        row, column = np.unravel_index(np.argmax(self.relative), self.relative.shape)
+        return int(row), int(column)
 
 
 def pattern(

@@ -8,12 +8,11 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.nodes.ellipses import ellipse_95
 from rhs_isac_ros.protocol.cycle_log import CycleRecord
 from rhs_isac_ros.protocol.messages import Phase
 
 _PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
-# Quantile of the squared distance that holds 95 % of a Gaussian in two dimensions.
-_CHI_SQUARE_95 = -2 * math.log(0.05)
 
 
 def table(cycles: Sequence[CycleRecord]) -> str:
@@ -121,9 +120,7 @@ def draw(cycles: Sequence[CycleRecord], scenario: Scenario, path: Path) -> None:
         axes.plot([truth[:, 0], mean[:, 0]], [truth[:, 1], mean[:, 1]], color=color,
                   linewidth=0.7)
         for record in own:
-            variances, directions = np.linalg.eigh(record.estimate.covariance_m2[:2, :2])
-            width, height = 2 * np.sqrt(_CHI_SQUARE_95 * np.maximum(variances, 0))
-            angle = math.degrees(math.atan2(directions[1, 0], directions[0, 0]))
+            width, height, angle = ellipse_95(record.estimate.covariance_m2[:2, :2])
             axes.add_patch(Ellipse(record.estimate.position[:2], width, height, angle=angle,
                                    fill=False, color=color, alpha=0.4))
     axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal',

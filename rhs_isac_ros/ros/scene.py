@@ -25,7 +25,7 @@ _USER_SIZE_M = 0.25
 _THINNEST_M = 1e-3
 # A lobe is as long as the pattern's distance where the beam is strongest, and has no length where
 # it is weaker by so much.
-_WEAKEST_DB = -20.0
+WEAKEST_DB = -20.0
 # Hues of users whose numbers follow on each other differ by the golden ratio.
 _HUE_STEP = 0.618034
 
@@ -145,9 +145,9 @@ def lobe_m(pattern: Pattern) -> np.ndarray:
     numpy.ndarray
         Points of the body, float64 [n_el, n_az, 3] [m].
     """
-    weakest = 10**(_WEAKEST_DB / 10)
+    weakest = 10**(WEAKEST_DB / 10)
     power_db = 10 * np.log10(np.maximum(pattern.relative, weakest))
-    return pattern.distance_m * (1 - power_db / _WEAKEST_DB)[..., None] * pattern.directions
+    return pattern.distance_m * (1 - power_db / WEAKEST_DB)[..., None] * pattern.directions
 
 
 def beam(pattern: Pattern, user: int, stamp: Time) -> Marker:

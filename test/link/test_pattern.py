@@ -29,23 +29,24 @@ def test_it_is_that_of_plain_loops(small, link_of):
     assert found.distance_m == 4.0
 
 
-def test_the_cuts_are_those_of_the_planes(small):
+def test_the_cuts_go_through_the_strongest_direction(small):
     found = pattern(small.scenario, random_beam(small.scenario, np.random.default_rng(4)), 7.0)
-    azimuth, across = found.horizontal()
-    elevation, upward = found.vertical()
+    azimuth, across = found.azimuth_cut()
+    elevation, upward = found.elevation_cut()
     assert np.degrees(azimuth) == pytest.approx(np.arange(-90, 91, 5))
     assert np.degrees(elevation) == pytest.approx(np.arange(-90, 91, 5))
-    straight = found.relative[18, 18]
-    assert across[18] == upward[18] == straight
-    assert (across == found.relative[18]).all()
-    assert (upward == found.relative[:, 18]).all()
+    assert across.max() == upward.max() == 1.0
+    (row,), (column,) = np.nonzero(found.relative == 1.0)
+    assert found.peak == (row, column)
+    assert (across == found.relative[row]).all()
+    assert (upward == found.relative[:, column]).all()
 
 
 @pytest.mark.parametrize('azimuth_deg', [-30.0, 0.0, 25.0])
 def test_a_beam_is_strongest_where_it_is_steered_to(azimuth_deg):
     scenario, azimuth = Scenario(), np.radians(azimuth_deg)
     place = 10.0 * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    angles, power = pattern(scenario, steer(scenario, place), 10.0, step_deg=1.0).horizontal()
+    angles, power = pattern(scenario, steer(scenario, place), 10.0, step_deg=1.0).azimuth_cut()
     assert np.degrees(angles[np.argmax(power)]) == pytest.approx(azimuth_deg, abs=5.0)
 
 
