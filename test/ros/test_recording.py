@@ -1,6 +1,7 @@
 """Recordings: written from a node, read back here and by an independent decoder."""
 
 import array
+import importlib
 import sys
 
 import numpy as np
@@ -161,3 +162,87 @@ def test_without_the_library_the_error_says_so(tmp_path, monkeypatch):
     with pytest.raises(RecordingError, match='^reading a recording needs mcap'):
         list(read(tmp_path / 'run.mcap'))
     assert not list(tmp_path.iterdir())
+
+
+def filled(kind, rng):
+    """A message with a random value in every field."""
+    message = kind()
+    for name, text in kind.get_fields_and_field_types().items():
+        value = getattr(message, name)
+        part = text.removeprefix('sequence<').removesuffix('>')
+        if hasattr(value, 'get_fields_and_field_types'):
+            setattr(message, name, filled(type(value), rng))
+        elif '/' in part:
+            package, short = part.split('/')
+            module = importlib.import_module(f'{package}.msg')
+            setattr(message, name, [filled(getattr(module, short), rng) for _ in range(2)])
+        elif isinstance(value, np.ndarray):
+            setattr(message, name, rng.normal(size=value.shape))
+        elif isinstance(value, array.array):
+            numbers = rng.normal(size=5) if value.typecode == 'd' else rng.integers(1000, size=5)
+            setattr(message, name, array.array(value.typecode, numbers.tolist()))
+        else:
+            made = {str: lambda: f'é{rng.integers(1000)}', float: rng.normal,
+                    bytes: lambda: bytes([rng.integers(3)]),
+                    int: lambda: int(rng.integers(1, 100))}
+            setattr(message, name, made[type(value)]())
+    return message
+
+
+def agree(ours, theirs):
+    """Whether two messages of different libraries have equal values in the same fields."""
+    if hasattr(ours, 'get_fields_and_field_types'):
+        names = set(ours.get_fields_and_field_types())
+        fields = {name for name in theirs.__dataclass_fields__ if name.islower()}
+        # Constants are in capitals.
+        return names == fields - {'__msgtype__'} and all(
+            agree(getattr(ours, name), getattr(theirs, name)) for name in names)
+    if isinstance(ours, list):
+        return len(ours) == len(theirs) and all(map(agree, ours, theirs))
+    if isinstance(ours, bytes):
+        return ours == bytes([theirs])
+    return np.array_equal(np.asarray(ours), np.asarray(theirs))
+
+
+def test_all_topics_are_read_by_a_reader_of_bags(bench, probe, tmp_path):
+    """By the definitions in the file alone: types, counts and contents."""
+    highlevel = pytest.importorskip('rosbags.highlevel', reason='there is no rosbags here')
+    recorder, rng, sent = Recorder(tmp_path / 'all.mcap', Scenario()), np.random.default_rng(0), {}
+    recorder.listen(probe)
+    for number, (name, (kind, profile)) in enumerate(outlets().items()):
+        publisher = probe.create_publisher(kind, name, profile)
+        bench.until(publisher.get_subscription_count, 'the recorder')
+        sent[f'/{name}'] = [filled(kind, rng) for _ in range(1 + number % 3)]
+        for message in sent[f'/{name}']:
+            before = recorder.count
+            publisher.publish(message)
+            bench.until(lambda before=before: recorder.count > before, 'the message')
+    recorder.close()
+    with highlevel.AnyReader([tmp_path / 'all.mcap']) as reader:
+        assert {connection.topic: (connection.msgtype, connection.msgcount)
+                for connection in reader.connections} == {
+            topic: (type_name(type(messages[0])), len(messages))
+            for topic, messages in sent.items()}
+        assert {connection.topic: [policy.durability.name.lower()
+                                   for policy in connection.ext.offered_qos_profiles]
+                for connection in reader.connections} == {
+            f'/{name}': [profile.durability.short_key]
+            for name, (_, profile) in outlets().items()}
+        for connection, _, content in reader.messages():
+            ours = sent[connection.topic].pop(0)
+            assert agree(ours, reader.deserialize(content, connection.msgtype)), connection.topic
+    assert not any(sent.values())
+
+
+def test_the_file_says_what_it_is(recording):
+    """As ``ros2 bag`` looks for it where there is no ``metadata.yaml``."""
+    from mcap.reader import make_reader
+    path, _ = recording
+    with path.open('rb') as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+    assert summary.statistics.message_count == 3
+    assert {found.encoding for found in summary.schemas.values()} == {'ros2msg'}
+    assert {channel.message_encoding for channel in summary.channels.values()} == {'cdr'}
+    assert len(summary.channels) == len(outlets())
