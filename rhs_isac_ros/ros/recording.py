@@ -6,7 +6,7 @@ They open in Foxglove and in ``ros2 bag info`` and ``play``. The library mcap is
 import contextlib
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -190,13 +190,17 @@ class Recorder:
             self._aside.replace(self._path)
 
 
-def read(path: str | Path) -> Iterator[tuple[str, Any, float]]:
+def read(
+        path: str | Path, names: Collection[str] | None = None
+) -> Iterator[tuple[str, Any, float]]:
     """Read the messages of a recording in the order in which they were written.
 
     Parameters
     ----------
     path
         The file.
+    names
+        Full names of the topics to read; None: all.
 
     Yields
     ------
@@ -210,7 +214,7 @@ def read(path: str | Path) -> Iterator[tuple[str, Any, float]]:
     """
     kinds = {type_name(kind): kind for kind, _ in outlets().values()}
     with _opened(path) as reader:
-        for found, channel, message in reader.iter_messages():
+        for found, channel, message in reader.iter_messages(topics=names):
             if found is not None and found.name in kinds:
                 yield (channel.topic, deserialize_message(message.data, kinds[found.name]),
                        1e-9 * message.log_time)

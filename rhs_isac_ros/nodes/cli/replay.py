@@ -1,4 +1,7 @@
-"""``scripts/replay FILE``: what estimators make of the received signals of a recording."""
+"""``scripts/replay FILE``: what estimators make of the received signals of a recording.
+
+With ``--publish``, live nodes get them again: see `rhs_isac_ros.nodes.cli.republish`.
+"""
 
 import argparse
 import dataclasses
@@ -7,16 +10,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from rclpy.utilities import remove_ros_args
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.nodes.cli.republish import RepublishError, republish, root_of
 from rhs_isac_ros.positioning import ESTIMATORS, Estimator, ModelError, make_estimator
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.cycle_log import RECEIVES, CycleLog, CycleRecord
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
+from rhs_isac_ros.ros.recording import RecordingError, outlets, read, read_scenario
+
+# What can be published again: the codebook is a parameter first, and diagnostics are of nodes.
+_TOPICS = sorted(set(outlets()) - {topics.CODEBOOK, topics.DIAGNOSTICS})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +72,7 @@ def load(path: str | Path, namespace: str = '/', scenario: Scenario | None = Non
         If the scenario or a codebook in it is wrong.
     """
     scenario = scenario or read_scenario(path) or Scenario()
-    root = f'/{namespace.strip("/")}/'.replace('//', '/')
+    root = root_of(namespace)
     kinds = {f'{root}{topics.NAMES[kind]}': kind for kind in RECEIVES}
     log, codebooks = CycleLog(), {}
     for topic, message, time_s in read(path):
@@ -113,15 +121,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments
-        Command line; by default the process's.
+        Command line, ROS arguments among it; by default the process's.
 
     Returns
     -------
     int
-        Exit code: 0, or 2 if an argument or a file is wrong.
+        Exit code: 0, also after a signal; 1 if live nodes cannot be served; 2 if an argument or a
+        file is wrong.
     """
-    options = _parser().parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    options = _parser().parse_args(remove_ros_args(['replay', *arguments])[1:])
     try:
+        if options.publish:
+            return republish(options, ['replay', *arguments])
         scenario = Scenario.from_yaml(options.config) if options.config else None
         recording = load(options.file, options.namespace, scenario)
         codebooks = _codebooks(recording, options.codebook)
@@ -137,6 +149,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (RecordingError, ScenarioError, CodebookError, ModelError, OSError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
+    except RepublishError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
     return 0
 
 
@@ -187,7 +202,25 @@ def _parser() -> argparse.ArgumentParser:
                         help="scenario file; the recording's if none")
     parser.add_argument('--model', type=Path, metavar='FILE', help='model of the estimator neural')
     parser.add_argument('--namespace', default='/', help='network of the recording (default: /)')
+    live = parser.add_argument_group(
+        'live nodes', 'Publish the recorded signals again, with their timing, in the namespace '
+        'of --ros-args -r __ns:=... The codebook goes with them: unless the namespace has an '
+        'optimizer, the replay holds it as one would.')
+    live.add_argument('--publish', action='store_true', help='publish instead of estimating')
+    live.add_argument('--rate', type=_positive, default=1.0, metavar='R',
+                      help='how many times as fast as recorded (default: 1)')
+    live.add_argument('--topic', action='append', choices=_TOPICS, metavar='NAME',
+                      help='relative name; may be given more than once (default: '
+                      f'{topics.NAMES[m.ReceivedSignals]})')
+    live.add_argument('--timeout', type=_positive, default=60.0, metavar='S',
+                      help='how long to wait for listeners (default: 60 s)')
     return parser
+
+
+def _positive(text: str) -> float:
+    if not 0 < float(text) < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text}, expected a positive number')
+    return float(text)
 
 
 if __name__ == '__main__':

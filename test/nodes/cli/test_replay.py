@@ -18,6 +18,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.cli import record
 from rhs_isac_ros.nodes.cli.replay import errors_m, load, main
 from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import Recorder, read
 
@@ -108,6 +110,69 @@ def test_what_does_not_fit_is_named(run, capsys, arguments, error):
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith('error: ')
     assert error in line
+
+
+def estimates_of(path):
+    """Estimates of a recording, by cycle, without the time that they took."""
+    return {message.cycle_id: content(message)
+            for _, message, _ in read(path, ['/position_estimate'])}
+
+
+def content(message):
+    plain = convert.from_ros(m.PositionEstimate, message)
+    return (plain.user, plain.codebook_id, plain.position.tobytes(),
+            plain.covariance_m2.tobytes(), plain.crlb_m2, plain.estimator)
+
+
+@pytest.fixture
+def positioner(shared_session):
+    """A live positioner in a namespace without anything else."""
+    with subprocess.Popen(
+            [SCRIPTS / 'run', 'positioner', '--ros-args', '-r', '__ns:=/again', '-p',
+             f'scenario_file:={CONFIG}/quick.yaml'], stderr=subprocess.DEVNULL) as process:
+        yield process
+        process.send_signal(signal.SIGINT)
+
+
+def test_a_live_positioner_makes_the_recorded_estimates_again(run, shared_session, positioner):
+    """Bit for bit: the codebook comes with the signals."""
+    heard = {}
+    subscription = shared_session.node.create_subscription(
+        convert.ros_type(m.PositionEstimate), '/again/position_estimate',
+        lambda message: heard.update({message.cycle_id: content(message)}), qos.EXCHANGE)
+    assert shared_session.until(lambda: subscription.get_publisher_count() > 0, 60)
+    signals = {message.cycle_id for _, message, _ in read(run.path, ['/received_signals'])}
+    with subprocess.Popen(
+            [SCRIPTS / 'replay', run.path, '--publish', '--rate', '20', '--ros-args', '-r',
+             '__ns:=/again'], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True) as process:
+        everything = shared_session.until(lambda: heard.keys() >= signals, 60)
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (0, f'{len(signals)} messages published\n'), err
+    assert everything
+    shared_session.node.destroy_subscription(subscription)
+    recorded = estimates_of(run.path)
+    both = recorded.keys() & heard.keys()
+    assert both >= {cycle.cycle_id for cycle in run.cycles}
+    assert {cycle: heard[cycle] for cycle in both} == {cycle: recorded[cycle] for cycle in both}
+
+
+def test_what_a_network_says_itself_is_not_published_beside_it(run, shared_session):
+    done = subprocess.run(
+        [SCRIPTS / 'replay', run.path, '--publish'], capture_output=True, text=True, timeout=60,
+        check=False)
+    assert (done.returncode, done.stdout) == (1, '')
+    assert done.stderr.splitlines()[-1] == (
+        'error: received_signals: another node publishes it, expected none')
+
+
+@pytest.mark.parametrize('arguments, error', [
+    (['--namespace', '/lab'], 'no received_signals in the namespace /lab'),
+    (['--codebook', CONFIG / 'codebook.yaml'], 'live nodes would drop them'),
+])
+def test_what_live_nodes_cannot_use_is_named(run, capsys, arguments, error):
+    assert main([str(run.path), '--publish', *map(str, arguments)]) == 2
+    assert error in capsys.readouterr().err
 
 
 def test_record_takes_down_everything_until_it_is_interrupted(shared_session, tmp_path):
