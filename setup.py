@@ -17,6 +17,8 @@ NODES = (
     'user',
     'visualizer',
 )
+# Of the tools for the terminal, those that `ros2` lacks.
+TOOLS = ('record', 'replay', 'snapshot', 'watch')
 
 setup(
     name=NAME,
@@ -31,7 +33,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        (f'share/{NAME}/config', sorted(glob('config/*.*'))),
+        (f'share/{NAME}/config/rviz', sorted(glob('config/rviz/*.*'))),
         (f'share/{NAME}/config/sros2', sorted(glob('config/sros2/*.*'))),
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.*'))),
     ],
@@ -43,10 +46,14 @@ setup(
         'neural': ['scikit-learn'],
         'genetic': ['pymoo'],
         'recording': ['mcap'],
-        'test': ['mcap-ros2-support', 'pytest'],
+        'watch': ['rich'],
+        'test': ['mcap-ros2-support', 'pytest', 'rosbags'],
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{node} = {NAME}.nodes.{node}:main' for node in NODES],
+        'console_scripts': [
+            *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
+            *(f'{tool} = {NAME}.nodes.cli.{tool}:main' for tool in TOOLS),
+        ],
     },
 )

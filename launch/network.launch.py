@@ -3,13 +3,18 @@
 ``--show-args`` lists the arguments. ``network.launch.xml`` starts the same in one process.
 """
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from ament_index_python.packages import (
+    PackageNotFoundError,
+    get_package_prefix,
+    get_package_share_directory,
+)
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, OrSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from launch import LaunchContext, LaunchDescription
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 
 PACKAGE = 'rhs_isac_ros'
 # A launch that gets SIGTERM leaves its processes to themselves: so the kernel ends them with it.
@@ -21,6 +26,8 @@ ARGUMENTS = {
     'seed': ('0', 'Seed of all random numbers.'),
     'estimator': ('bayes', 'Estimator of the position.'),
     'visualizer': ('false', 'Whether to publish markers for RViz and Foxglove.'),
+    'rviz': ('false', 'Whether to start the visualizer and RViz.'),
+    'record': ('', 'Recording to write (MCAP); empty: none.'),
     'namespace': ('', 'Namespace of all nodes and topics: one for each of many networks.'),
 }
 
@@ -40,7 +47,7 @@ def generate_launch_description() -> LaunchDescription:
     ])
 
 
-def start_nodes(context: LaunchContext) -> list[Node]:
+def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """Make the nodes, once the number of users is known.
 
     Parameters
@@ -50,7 +57,7 @@ def start_nodes(context: LaunchContext) -> list[Node]:
 
     Returns
     -------
-    list of launch_ros.actions.Node
+    list of launch.LaunchDescriptionEntity
         The nodes.
 
     Raises
@@ -62,7 +69,10 @@ def start_nodes(context: LaunchContext) -> list[Node]:
     if not text.isdecimal() or not int(text):
         raise ValueError(f'users: {text!r}, expected a positive integer')
     seed = {'seed': _typed('seed', int)}
+    shown = IfCondition(
+        OrSubstitution(LaunchConfiguration('visualizer'), LaunchConfiguration('rviz')))
     return [
+        *_recorder(context),
         _node('rhs_controller'),
         _node('positioner', estimator=_typed('estimator', str)),
         _node('transmission'),
@@ -71,8 +81,35 @@ def start_nodes(context: LaunchContext) -> list[Node]:
         *(_node('user', f'user_{number}', user_id=number, **seed)
           for number in range(1, int(text) + 1)),
         _node('bs', **seed),
-        _node('visualizer', condition=IfCondition(LaunchConfiguration('visualizer'))),
+        _node('visualizer', condition=shown),
+        *_rviz(),
     ]
+
+
+def _recorder(context: LaunchContext) -> list[Node]:
+    """Start the recorder first, so that it misses nothing of what is not latched."""
+    file = LaunchConfiguration('record').perform(context)
+    if not file:
+        return []
+    return [Node(
+        package=PACKAGE, executable='record', name='recorder', exec_name='record',
+        output='screen', namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
+        arguments=[file, '--config', LaunchConfiguration('config')])]
+
+
+def _rviz() -> list[LaunchDescriptionEntity]:
+    wanted = IfCondition(LaunchConfiguration('rviz'))
+    try:
+        get_package_prefix('rviz2')
+    except PackageNotFoundError:
+        return [LogInfo(msg='there is no rviz2 here: apt install ros-jazzy-rviz2',
+                        condition=wanted)]
+    file = f'{get_package_share_directory(PACKAGE)}/config/rviz/network.rviz'
+    return [Node(
+        package='rviz2', executable='rviz2', name='rviz', exec_name='rviz', output='screen',
+        # The names of topics in the file are relative.
+        namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
+        arguments=['-d', file], condition=wanted)]
 
 
 def _typed(argument: str, kind: type) -> ParameterValue:

@@ -1,15 +1,18 @@
 """The launch files: what they declare, and whether they serve all users and end cleanly."""
 
+import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ElementTree
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from rhs_isac_ros.model import Scenario
 
 ROOT = Path(__file__).parents[1]
 FILES = ('network.launch.py', 'network.launch.xml')
@@ -31,7 +34,7 @@ sys.exit(service.run())
 # Its parser, and that of type supports, is older than this Python.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 needs_launch = pytest.mark.skipif(
-    not all(map(find_spec, ('launch', 'launch_ros', 'launch_xml'))),
+    not all(map(importlib.util.find_spec, ('launch', 'launch_ros', 'launch_xml'))),
     reason='there is no launch_ros here: it comes with a full ROS 2, not as a wheel')
 
 
@@ -56,9 +59,10 @@ def test_parameters_of_the_xml_variant_are_declared():
     root = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
     values = {param.get('name'): param.get('value') for param in root.iter('param')}
     assert values.keys() <= declared
-    assert {f'$(var {name})' for name in arguments_of_xml()} == {
-        *values.values(), '$(var visualizer)',
-        *(node.get('namespace') for node in root.iter('node'))}
+    used = {name for node in root.iter() for text in node.attrib.values()
+            for name in re.findall(r'\$\(var (\w+)\)', text)}
+    assert used == arguments_of_xml().keys()
+    assert {node.get('namespace') for node in root.iter('node')} == {'$(var namespace)'}
 
 
 @needs_launch
@@ -110,7 +114,7 @@ def test_all_users_are_served_and_nothing_is_left_behind(file, number, observer,
     with open(tmp_path / 'log', 'w+', encoding='utf-8') as log, subprocess.Popen(
             [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, 'users:=3', 'seed:=4',
              f'config:={ROOT}/config/quick.yaml', f'codebook:={ROOT}/config/codebook_quick.yaml',
-             'namespace:=launched', 'visualizer:=true'],
+             'namespace:=launched', 'visualizer:=true', f'record:={tmp_path}/run.mcap'],
             stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, 'ROS_LOG_DIR': str(tmp_path)}) as process:
         try:
@@ -131,3 +135,38 @@ def test_all_users_are_served_and_nothing_is_left_behind(file, number, observer,
     text = (tmp_path / 'log').read_text(encoding='utf-8')
     assert 'Traceback' not in text, text
     assert 'process has died' not in text, text
+    assert_whole(tmp_path / 'run.mcap', node.log.complete)
+
+
+def assert_whole(path, cycles):
+    """The recording has its name, and every cycle that was seen since it began is in it."""
+    from rhs_isac_ros.ros.recording import read, read_scenario
+    assert read_scenario(path) == Scenario.from_yaml(ROOT / 'config' / 'quick.yaml')
+    topics = [topic for topic, _, _ in read(path)]
+    assert topics.count('/launched/capacity') >= len(cycles) - 2
+    assert '/launched/codebook' in topics
+    assert not list(path.parent.glob('*.part'))
+
+
+@needs_launch
+def test_without_rviz_the_launch_says_so_and_goes_on(monkeypatch):
+    from launch.actions import LogInfo
+    from launch_ros.actions import Node
+
+    from launch import LaunchContext
+    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(
+        path for path in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep)
+        if not (Path(path) / 'share' / 'rviz2').exists()))
+    spec = importlib.util.spec_from_file_location(
+        'network_launch', ROOT / 'launch' / 'network.launch.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    context = LaunchContext()
+    context.launch_configurations.update(
+        {name: default for name, (default, _) in module.ARGUMENTS.items()} | {'rviz': 'true'})
+    *nodes, word = module.start_nodes(context)
+    assert all(isinstance(node, Node) for node in nodes)
+    assert isinstance(word, LogInfo) and word.condition.evaluate(context)
+    assert nodes[-1].condition.evaluate(context)
+    context.launch_configurations['rviz'] = 'false'
+    assert not word.condition.evaluate(context) and not nodes[-1].condition.evaluate(context)

@@ -74,8 +74,9 @@ def _parser() -> argparse.ArgumentParser:
         prog='record', description='Record a network as MCAP until Ctrl-C. ROS arguments choose '
         'the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('file', type=Path, help='recording to write')
-    parser.add_argument('--config', type=Path, metavar='FILE',
-                        help="scenario file of the network; the paper's Table I if none")
+    # Launch files pass an empty name where none is given.
+    parser.add_argument('--config', metavar='FILE',
+                        help="scenario file of the network; the paper's Table I if none or empty")
     return parser
 
 
