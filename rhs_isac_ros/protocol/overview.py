@@ -18,6 +18,8 @@ RESTING = 'resting'
 _WINDOW_S = 10.0
 # A node tells of itself once a second; one that misses three reports is silent.
 _SILENT_S = 3.5
+# A longer number is no count.
+_MOST_DIGITS = 18
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +87,8 @@ class NodeHealth:
             Counts by reason, without those that are 0.
         """
         found = {name.partition('.')[2]: int(value) for name, value in self.report.values.items()
-                 if name.startswith(f'{section}.') and value.isdecimal()}
+                 if name.startswith(f'{section}.') and value.isdecimal()
+                 and len(value) <= _MOST_DIGITS}
         return {reason: n for reason, n in found.items() if n}
 
 

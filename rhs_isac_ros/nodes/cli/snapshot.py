@@ -17,7 +17,8 @@ from rhs_isac_ros.protocol.sightings import RECEIVES, Sightings
 from rhs_isac_ros.ros.listening import listen
 from rhs_isac_ros.ros.run import run
 
-# Every user tells its true position in this time; with some room.
+# Every user tells its true position in this time, and in twice this the surface what it applies;
+# with some room.
 _ROUND_S = 0.5
 
 
@@ -57,8 +58,16 @@ class SnapshotNode(Node):
     @property
     def complete(self) -> bool:
         """Whether there was time to hear of every user, and the scene is complete."""
-        return (self.began_s is not None and self.sightings.complete
-                and time.monotonic() > self.began_s + _ROUND_S)
+        return self.sightings.complete and self._heard_for(_ROUND_S)
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the network is of another scenario: nothing of the surface fits."""
+        return bool(self.misfit and self.sightings.configuration is None
+                    and self._heard_for(2 * _ROUND_S))
+
+    def _heard_for(self, duration_s: float) -> bool:
+        return self.began_s is not None and time.monotonic() > self.began_s + duration_s
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -91,16 +100,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def make() -> list[SnapshotNode]:
         nodes.append(SnapshotNode(scenario))
         return nodes
-    code = run(make, ['snapshot', *arguments],
-               lambda: nodes[0].complete or time.monotonic() > end_s)
-    if not nodes or not (nodes[0].complete or time.monotonic() > end_s):
+    def done() -> bool:
+        node = nodes[0]
+        return node.complete or node.foreign or time.monotonic() > end_s
+    code = run(make, ['snapshot', *arguments], done)
+    if not nodes or not done():
         return code
     return _finish(nodes[0], scenario, options)
 
 
 def _finish(node: SnapshotNode, scenario: Scenario, options: argparse.Namespace) -> int:
     sightings = node.sightings
-    if node.misfit and not sightings.complete:
+    if node.misfit and sightings.configuration is None:
         print(f'error: {node.misfit}: is it a network of another scenario? --config FILE',
               file=sys.stderr)
         return 1

@@ -43,9 +43,9 @@ def _head(overview: Overview, now_s: float) -> object:
         (overview.phase, 'bold cyan'), f' for {now_s - overview.since_s:.2f} s, cycle '
         f'{overview.cycle_id}{whose}\n{overview.rate_hz(now_s):.1f} cycles/s, ',
         f'{overview.served} served, {overview.given_up} given up; ',
-        f'codebook {overview.codebook_id or "not known yet"}')
+        f'codebook {_printable(overview.codebook_id) or "not known yet"}')
     if overview.failure:
-        text.append(f'\nlast given up: {overview.failure}', style='yellow')
+        text.append(f'\nlast given up: {_printable(overview.failure)}', style='yellow')
     return text
 
 
@@ -100,13 +100,21 @@ def _nodes(overview: Overview, now_s: float) -> object:
 def _node_row(name: str, health: NodeHealth, now_s: float) -> list[object]:
     from rich.text import Text
 
-    state = Text(health.report.summary, style='yellow' if health.report.fault else 'green')
+    state = Text(_printable(health.report.summary),
+                 style='yellow' if health.report.fault else 'green')
     if health.silent(now_s):
         state = Text(f'silent for {now_s - health.seen_s:.0f} s', style='red')
     given_up = {reason: n for reason, n in health.counts('cycles').items() if reason != 'served'}
-    return [name, health.report.values.get('phase', ''), state, _counts(given_up),
-            _counts(health.counts('dropped'))]
+    # Text: what others send is no markup.
+    phase = Text(_printable(health.report.values.get('phase', '')))
+    return [Text(_printable(name)), phase, state, Text(_counts(given_up)),
+            Text(_counts(health.counts('dropped')))]
 
 
 def _counts(counts: dict[str, int]) -> str:
-    return ', '.join(f'{n} {reason}' for reason, n in counts.items()) or '0'
+    return _printable(', '.join(f'{n} {reason}' for reason, n in counts.items())) or '0'
+
+
+def _printable(text: str) -> str:
+    """Return a text without what would control the terminal."""
+    return ''.join(sign if sign.isprintable() else '?' for sign in text)

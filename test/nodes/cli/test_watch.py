@@ -49,6 +49,17 @@ def test_the_view_tells_faults_and_silence_and_leaves_nothing_out_at_80_columns(
     assert '…' not in text
 
 
+def test_what_others_send_is_neither_markup_nor_control():
+    overview = Overview()
+    overview.add(m.ProtocolState(1, 2, m.Phase.BEACONING, '\x1b[2J[/red]'), 1.0)
+    overview.hear('a[/b]\x1b[31m', Report(True, '[bold]\n[/x]', {
+        'phase': '[/', 'dropped.[/]\x07': '3', 'dropped.long': '9' * 5000}), 1.0)
+    text = text_of(overview, 2.0, width=120)
+    assert 'of user 2: ?[2J[/red]' in text
+    assert re.search(r'a\[/b\]\?\[31m +\[/ +\[bold\]\?\[/x\] +0 +3 \[/\]\?', text)
+    assert '\x1b' not in text and '\x07' not in text
+
+
 def test_once_prints_a_cycle_and_every_node(network, call_script):
     text = call_script(f'{SCRIPT} --once')
     codebook = Codebook.load(ROOT / 'config' / 'codebook_quick.yaml')
