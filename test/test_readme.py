@@ -23,7 +23,9 @@ def test_table_of_topics_names_every_topic():
     types = dict(rows)
     for kind, name in topics.NAMES.items():
         assert types[name] == kind.__name__
-    assert {topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS} <= types.keys()
+    assert {topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS} <= types.keys()
+    paths = (name.format(user='<n>') for name in (topics.PATH, topics.TRUE_PATH))
+    assert f'| {", ".join(f"`{path}`" for path in paths)} | `nav_msgs/Path` |' in README
 
 
 def test_example_of_the_library_runs(monkeypatch, capsys):

@@ -97,6 +97,7 @@ class Sightings:
         self.configuration: m.RhsConfiguration | None = None
         self.beam: m.Beam | None = None
         self.users: dict[int, Sighting] = {}
+        self._beam_s = math.nan
 
     def add(self, message: m.Message, now_s: float) -> None:
         """Take a message.
@@ -112,7 +113,7 @@ class Sightings:
             case m.RhsConfiguration():
                 self.configuration = message
             case m.Beam():
-                self.beam = message
+                self.beam, self._beam_s = message, now_s
             case m.GroundTruth():
                 self._of(message.user, now_s).move(message)
             case m.PositionEstimate():
@@ -124,12 +125,12 @@ class Sightings:
         return sighting
 
     def forget(self, before_s: float) -> list[int]:
-        """Forget users that were not heard of lately, and a beam that is for one of them.
+        """Forget users that were not heard of lately, a beam for one of them, and an old beam.
 
         Parameters
         ----------
         before_s
-            Who was heard of last before this time is forgotten [s].
+            What was heard of last before this time is forgotten [s].
 
         Returns
         -------
@@ -139,7 +140,7 @@ class Sightings:
         gone = [user for user, sighting in self.users.items() if sighting.seen_s < before_s]
         for user in gone:
             del self.users[user]
-        if self.beam is not None and self.beam.user in gone:
+        if self.beam is not None and (self.beam.user in gone or self._beam_s < before_s):
             self.beam = None
         return gone
 

@@ -84,4 +84,8 @@ def test_who_is_silent_is_forgotten_with_its_beam():
     scene.add(truth(1, [5, 0, 0]), 3.0)
     assert scene.forget(2.5) == []
     assert scene.beam.user == 2
+    scene.add(truth(2, [9, 0, 0]), 5.0)
+    scene.add(truth(1, [5, 0, 0]), 5.0)
+    assert scene.forget(4.0) == []
+    assert scene.beam is None
     assert len(scene.users[1].true_path) == 1

@@ -130,7 +130,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         file is wrong.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = _parser().parse_args(remove_ros_args(['replay', *arguments])[1:])
+    parser = _parser()
+    options = parser.parse_args(remove_ros_args(['replay', *arguments])[1:])
+    if options.publish and (options.estimator or options.model):
+        parser.error('argument --publish: live nodes estimate, expected no --estimator, --model')
     try:
         if options.publish:
             return republish(options, ['replay', *arguments])

@@ -106,10 +106,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     code = run(make, ['snapshot', *arguments], done)
     if not nodes or not done():
         return code
-    return _finish(nodes[0], scenario, options)
+    return finish(nodes[0], scenario, options)
 
 
-def _finish(node: SnapshotNode, scenario: Scenario, options: argparse.Namespace) -> int:
+def finish(node: SnapshotNode, scenario: Scenario, options: argparse.Namespace) -> int:
+    """Draw what a node has seen, or say why there is nothing to draw.
+
+    Parameters
+    ----------
+    node
+        The node.
+    scenario
+        The scenario.
+    options
+        ``output``, ``timeout``.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or 1 as of `main`.
+    """
     sightings = node.sightings
     if node.misfit and sightings.configuration is None:
         print(f'error: {node.misfit}: is it a network of another scenario? --config FILE',

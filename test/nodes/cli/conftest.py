@@ -13,7 +13,7 @@ CONFIG = Path(__file__).parents[3] / 'config'
 PATIENCE_S = 60.0
 
 
-@pytest.fixture(scope='package')
+@pytest.fixture(scope='module')
 def network(tmp_path_factory):
     """A running network of the small scenario, two users in one process."""
     logs = tmp_path_factory.mktemp('logs')
@@ -23,7 +23,7 @@ def network(tmp_path_factory):
         yield processes
 
 
-@pytest.fixture(scope='package')
+@pytest.fixture(scope='module')
 def shared_session(network):
     """A session that knows the network: to discover it anew for each command takes its time."""
     with Session() as session:

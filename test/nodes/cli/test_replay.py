@@ -175,6 +175,14 @@ def test_what_live_nodes_cannot_use_is_named(run, capsys, arguments, error):
     assert error in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('arguments', [['--estimator', 'ml'], ['--rate', '0'],
+                                       ['--topic', 'codebook']])
+def test_options_that_contradict_publishing_are_named(run, capsys, arguments):
+    with pytest.raises(SystemExit):
+        main([str(run.path), '--publish', *arguments])
+    assert 'expected' in (text := capsys.readouterr().err) or 'invalid choice' in text
+
+
 def test_record_takes_down_everything_until_it_is_interrupted(shared_session, tmp_path):
     path = tmp_path / 'all.mcap'
     wanted = {'codebook', 'capacity', 'pilot', 'ground_truth', 'position'}
