@@ -36,8 +36,9 @@ class WatchNode(Node):
     def __init__(self) -> None:
         super().__init__('watch', start_parameter_services=False)
         self.overview = Overview()
+        # What is malformed, the nodes count: a word in the log would go across the view.
         listen(self, RECEIVES, None,
-               lambda message: self.overview.add(message, time.monotonic()))
+               lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
         self.create_subscription(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear, qos.EXCHANGE,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
@@ -98,6 +99,7 @@ def _live(arguments: Sequence[str]) -> int:
         period_s = _REFRESH_S
 
     def refresh() -> bool:
+        """Draw between two turns of the executor, where an error is not lost in a callback."""
         nonlocal drawn_s
         now_s = time.monotonic()
         if now_s > drawn_s + period_s:
