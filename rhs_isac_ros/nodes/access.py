@@ -76,11 +76,11 @@ def accesses(users: int) -> dict[str, Access]:
         'rhs_controller': _access(
             rhs_controller.SENDS, rhs_controller.RECEIVES, told, **codebook),
         'transmission': _access(transmission.SENDS, transmission.RECEIVES, told, **codebook),
-        'visualizer': _access((), visualizer.RECEIVES, (topics.MARKERS,)),
+        'visualizer': _access((), visualizer.RECEIVES, (topics.MARKERS, *_paths(users))),
         **{f'user_{number}': _access(user.SENDS, user.RECEIVES, told)
            for number in range(1, users + 1)},
     }
-    return {**nodes, 'operator': _operator(nodes)}
+    return {**nodes, 'operator': _operator(nodes, users)}
 
 
 def _access(
@@ -94,13 +94,19 @@ def _access(
         request=request)
 
 
-def _operator(nodes: Iterable[str]) -> Access:
+def _paths(users: int) -> tuple[str, ...]:
+    """Names of the topics of the users' paths."""
+    return tuple(name.format(user=number) for number in range(1, users + 1)
+                 for name in (topics.PATH, topics.TRUE_PATH))
+
+
+def _operator(nodes: Iterable[str], users: int) -> Access:
     """Hear everything, say nothing, and set the parameters of all.
 
     Nodes of the terminal have names of their own, those of ``ros2`` with numbers.
     """
     heard = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
-             topics.POSITION}
+             topics.POSITION, *_paths(users)}
     return Access(
         publish=_ALWAYS_PUBLISHED, subscribe=(*sorted(heard), *_ALWAYS_PUBLISHED),
         reply=(*(service.replace('~', PUSHER_NODE) for service in _OFFERED),
