@@ -1,5 +1,6 @@
 """Fixtures that all tests share, and the paper's equations written out index by index."""
 
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -229,3 +230,24 @@ def table1_estimator(shipped):
     """The default estimator for Table I and the shipped codebook."""
     from rhs_isac_ros.positioning import make_estimator
     return make_estimator('bayes', Scenario(), shipped)
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Function that installs a package of one module with entry points, as pip leaves it."""
+    def install(package: str, code: str, points: dict[str, dict[str, str]]) -> Path:
+        """Take code and objects of the module by group and name; return the folder of it all."""
+        folder = tmp_path / 'site'
+        info = folder / f'{package}-1.0.dist-info'
+        info.mkdir(parents=True)
+        (folder / f'{package}.py').write_text(code, encoding='utf-8')
+        (info / 'METADATA').write_text(
+            f'Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n', encoding='utf-8')
+        (info / 'entry_points.txt').write_text(''.join(
+            f'[{group}]\n' + ''.join(f'{name} = {package}:{what}\n'
+                                     for name, what in names.items())
+            for group, names in points.items()), encoding='utf-8')
+        monkeypatch.syspath_prepend(folder)
+        monkeypatch.delitem(sys.modules, package, raising=False)
+        return folder
+    return install

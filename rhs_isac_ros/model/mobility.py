@@ -5,6 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
+from rhs_isac_ros.model import plugins
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import Scenario
 
@@ -153,3 +154,39 @@ class RandomWalk:
 
     def _draw(self) -> np.ndarray:
         return self._scenario.sample_positions(1, self._rng)[0]
+
+
+def make_plugin(
+        name: str, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
+        start: Sequence[float] | None = None) -> Mobility:
+    """Make a mobility of another package: an entry point of the group `plugins.MOBILITIES`.
+
+    Parameters
+    ----------
+    name
+        Name of the entry point. Its object takes the other arguments, as `RandomWalk` does.
+    scenario
+        The scenario.
+    speed_mps
+        Speed [m/s].
+    rng
+        Source of randomness.
+    start
+        First place, float64 [3] [m]; None: of its own choice.
+
+    Returns
+    -------
+    Mobility
+        What it returns.
+
+    Raises
+    ------
+    PluginError
+        If there is none of that name, it cannot be loaded, fails, or makes no mobility.
+    """
+    made = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
+    if not callable(getattr(made, 'state', None)):
+        raise plugins.PluginError(
+            f'{plugins.describe(plugins.MOBILITIES, name)}: made {made!r}, expected a mobility, '
+            'with a method state')
+    return made

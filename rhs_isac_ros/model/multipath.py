@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
@@ -20,7 +21,7 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     The power-angle profile is a product of two Laplacians of `angular_spread_deg`, normalised
     over the half space in front of the surface and scaled by the mean line-of-sight power in the
     region of interest. It is even in azimuth and elevation, which makes the covariance real, and
-    it depends on the elements' lattice offsets only.
+    it depends on the elements' lattice offsets only. A pattern of the elements weighs the profile.
 
     Parameters
     ----------
@@ -43,10 +44,16 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
         # Direction (cos el cos az, cos el sin az, sin el); nodes are shared by both angles.
         across = np.cos(azimuth)[:, None] * np.sin(azimuth)
         along_y = np.cos(wavenumber * across[..., None] * offsets)
+        if isinstance(scenario.element_gain, GainPattern):
+            # The cosine of the angle from the boresight is cos el cos az.
+            angles = np.arccos(np.cos(azimuth)[:, None] * np.cos(azimuth))
+            along_y *= scenario.element_gain.amplitude(angles)[..., None]**2
         along_y = np.einsum('a,eay->ey', weights, along_y)
         along_z = np.cos(wavenumber * np.sin(azimuth)[:, None] * offsets)
         lattice = np.einsum('e,ey,ez->zy', weights, along_y, along_z)
-        scale = mean_los_power(scenario, band) * scenario.element_gain**2
+        scale = mean_los_power(scenario, band)
+        if not isinstance(scenario.element_gain, GainPattern):
+            scale *= scenario.element_gain**2
         covariance[band] = scale * lattice[rows, columns]
     covariance.flags.writeable = False
     return covariance
@@ -65,15 +72,20 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
     Returns
     -------
     float
-        Mean of (v_0 g^U / (4 pi f_c,i r))^2, r being the distance from the surface's centre.
+        Mean of (v_0 g^U / (4 pi f_c,i r))^2, r being the distance from the surface's centre; a
+        pattern g^U is taken at the angle from there.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
     low, high = scenario.roi_bounds_m
     x, y, z = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     squares = x[:, None, None]**2 + y[:, None]**2 + z**2
-    mean_inverse = np.einsum('a,b,c,abc->', weights, weights, weights, 1 / squares) / 8
+    inverse, gain = 1 / squares, scenario.user_gain
+    if isinstance(gain, GainPattern):
+        inverse *= gain.amplitude(np.arccos(x[:, None, None] / np.sqrt(squares)))**2
+        gain = 1.0
+    mean_inverse = np.einsum('a,b,c,abc->', weights, weights, weights, inverse) / 8
     wavelength = SPEED_OF_LIGHT_MPS / scenario.center_frequencies_hz[band]
-    return float((wavelength * scenario.user_gain / (4 * np.pi))**2 * mean_inverse)
+    return float((wavelength * gain / (4 * np.pi))**2 * mean_inverse)
 
 
 def frequency_correlation(

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
+from rhs_isac_ros.model.plugins import PluginError
+
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 
@@ -30,6 +33,9 @@ class Scenario:
     Lengths are in metres in the frame ``map``: the surface lies in the plane x = 0, centred on
     the origin, with x pointing outward and z up.
 
+    A gain is a number, or a pattern: a function of the angle from the boresight, a `GainPattern`,
+    or the name of one that is installed as a plug-in, which is what a file can hold.
+
     Raises
     ------
     ScenarioError
@@ -49,8 +55,10 @@ class Scenario:
     feed_positions_m: tuple[tuple[float, float, float], ...] | None = _field(
         None, -1e3, 1e3, 'Positions of the feeds; none: evenly on the centre line.', 'm')
     refractive_index: float = _field(2.1, 1.0, 100.0, 'Refractive index n_r of the board.')
-    element_gain: float = _field(1.0, 1e-6, 1e6, 'Amplitude gain g^E of an element.')
-    user_gain: float = _field(1.0, 1e-6, 1e6, "Amplitude gain g^U of the user's antenna.")
+    element_gain: float | GainPattern = _field(
+        1.0, 1e-6, 1e6, 'Amplitude gain g^E of an element.')
+    user_gain: float | GainPattern = _field(
+        1.0, 1e-6, 1e6, "Amplitude gain g^U of the user's antenna.")
     delay_spread_s: float = _field(0.5e-6, 0.0, 1.0, 'RMS delay spread of the multipath.', 's')
     max_user_speed_mps: float = _field(20 / 3.6, 0.0, 1e4, 'Highest speed of a user.', 'm/s')
     angular_spread_deg: float = _field(
@@ -125,7 +133,8 @@ class Scenario:
         Returns
         -------
         dict
-            Values by field names, in the form that `from_yaml` reads.
+            Values by field names, in the form that `from_yaml` reads; a pattern with its digest.
+            One that is no plug-in can be told apart, but not read.
         """
         return {field.name: _plain(value) for field in dataclasses.fields(self)
                 if (value := getattr(self, field.name)) != field.default}
@@ -179,6 +188,8 @@ class Scenario:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, GainPattern):
+        return str(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
@@ -187,6 +198,8 @@ def _checked(field: dataclasses.Field, value: Any) -> Any:
     name = field.name
     if name == 'feed_positions_m':
         return None if value is None else _vectors(field, value)
+    if name in ('element_gain', 'user_gain'):
+        return _gain(field, value)
     if field.type is int or isinstance(field.default, int):
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
             raise ScenarioError(f'{name}: {value!r}, expected an integer')
@@ -195,6 +208,25 @@ def _checked(field: dataclasses.Field, value: Any) -> Any:
         length = None if name == 'center_frequencies_hz' else 3
         return _numbers(field, value, length)
     return _number(field, value)
+
+
+def _gain(field: dataclasses.Field, value: Any) -> float | GainPattern:
+    try:
+        if isinstance(value, GainPattern) or callable(value):
+            return value if isinstance(value, GainPattern) else GainPattern(value)
+        if isinstance(value, str) and not _is_number(value):
+            return GainPattern.named(value)
+    except (PatternError, PluginError) as error:
+        raise ScenarioError(f'{field.name}: {error}') from None
+    return _number(field, value)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _vectors(field: dataclasses.Field, value: Any) -> tuple[tuple[float, ...], ...]:

@@ -86,7 +86,7 @@ class WhitenedModel:
         mean = np.empty((n, n_bands, n_rows), complex)
         slopes = np.empty((n, 3, n_bands, n_rows), complex)
         for band, whitener in enumerate(self._whiteners):
-            gain, rate = los_and_rate(self.scenario, positions, band)
+            gain, rate, lift = los_and_rate(self.scenario, positions, band)
             frames, moments = self._frames[band], self._moments[band]
             sums = np.matmul(gain.transpose(1, 0, 2), frames).transpose(1, 0, 2)
             mean[:, band] = sums.reshape(n, n_rows) @ whitener.T
@@ -95,6 +95,9 @@ class WhitenedModel:
             sums = sums.reshape(-1, n, 4, frames.shape[2]).transpose(2, 1, 0, 3)
             sums = sums.reshape(4, n, n_rows)
             by_position = positions.T[:, :, None] * sums[0] - sums[1:]
+            if lift is not None:
+                sums = np.matmul(lift.transpose(1, 0, 2), frames).transpose(1, 0, 2)
+                by_position[0] += sums.reshape(n, n_rows)
             whitened = by_position.reshape(3 * n, n_rows) @ whitener.T
             slopes[:, :, band] = whitened.reshape(3, n, n_rows).transpose(1, 0, 2)
         return mean, slopes

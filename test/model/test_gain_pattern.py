@@ -1,0 +1,339 @@
+"""Gain patterns, and all of the model that depends on them."""
+
+import dataclasses
+import itertools
+import pickle
+
+import numpy as np
+import pytest
+import yaml
+from scipy.integrate import dblquad
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.bounds.fisher import factor
+from rhs_isac_ros.link import capacity, steer
+from rhs_isac_ros.model import (
+    SPEED_OF_LIGHT_MPS,
+    GainPattern,
+    Scenario,
+    ScenarioError,
+    mean_received,
+    plugins,
+    simulate_received,
+)
+from rhs_isac_ros.model.gain_pattern import PatternError
+from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
+from rhs_isac_ros.model.los import los_and_derivative, los_gain
+from rhs_isac_ros.model.multipath import mean_los_power, multipath_covariance
+from rhs_isac_ros.positioning import make_estimator, store
+from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+
+def patch(angles):
+    """A lobe towards the front, nothing behind, and no kink at its rim."""
+    return 2 * np.maximum(np.cos(angles), 0)**3
+
+
+def ripple(angles):
+    return 1.2 + 0.5 * np.cos(4 * angles)
+
+
+def ripple_slope(angles):
+    return -2 * np.sin(4 * angles)
+
+
+@pytest.fixture(scope='module')
+def scenario() -> Scenario:
+    """Near and wide, so that every element sees the user at an angle of its own."""
+    return Scenario(n_subbands=3, n_frames=2, elements_per_side=4, element_gain=patch,
+                    user_gain=GainPattern(ripple, ripple_slope), roi_center_m=(2, 0, 0),
+                    roi_size_m=(2, 3, 2))
+
+
+@pytest.fixture(scope='module')
+def codebook(scenario, random_beams):
+    return random_beams(scenario, np.random.default_rng(3))
+
+
+def test_a_number_is_that_very_number(case):
+    """And one that is written as a pattern is the same to rounding, with no slope."""
+    numbers = dataclasses.replace(case.scenario, element_gain=1.3, user_gain=0.7)
+    patterns = dataclasses.replace(
+        numbers, element_gain=lambda angles: np.full(angles.shape, 1.3),
+        user_gain=lambda angles: np.full(angles.shape, 0.7))
+    positions = case.vectors['positions']
+    for first, second in zip(los_and_derivative(numbers, positions, 0),
+                             los_and_derivative(patterns, positions, 0), strict=True):
+        np.testing.assert_allclose(second, first, rtol=0, atol=1e-12 * np.abs(first).max())
+    np.testing.assert_allclose(
+        multipath_covariance(patterns), multipath_covariance(numbers), rtol=1e-12, atol=0)
+    np.testing.assert_allclose(crlb(patterns, case.codebook, positions),
+                               crlb(numbers, case.codebook, positions), rtol=1e-9)
+
+
+def test_gains_are_those_of_the_plain_formula(scenario):
+    positions = scenario.sample_positions(3, np.random.default_rng(0))
+    elements = element_positions(scenario)
+    for band in range(scenario.n_bands):
+        gains = los_gain(scenario, positions, band)
+        for n, j, m in itertools.product(range(3), range(3), range(16)):
+            way = positions[n] - elements[m]
+            distance = np.sqrt(way @ way)
+            angle = np.arccos(way[0] / distance)
+            frequency = subband_frequencies_hz(scenario)[band, j]
+            wavelength = SPEED_OF_LIGHT_MPS / frequency
+            expected = (patch(angle) * ripple(angle) * wavelength / (4 * np.pi * distance)
+                        * np.exp(-2j * np.pi * distance / wavelength))
+            np.testing.assert_allclose(gains[n, j, m], expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize('user_gain', [1.0, GainPattern(ripple, ripple_slope), ripple])
+def test_derivatives_are_limits_of_differences(scenario, user_gain):
+    scenario = dataclasses.replace(scenario, user_gain=user_gain)
+    positions = scenario.sample_positions(20, np.random.default_rng(1))
+    step = 1e-5
+    for band in range(scenario.n_bands):
+        _, slopes = los_and_derivative(scenario, positions, band)
+        for u in range(3):
+            shift = step * np.eye(3)[u]
+            difference = (los_gain(scenario, positions + shift, band)
+                          - los_gain(scenario, positions - shift, band)) / (2 * step)
+            np.testing.assert_allclose(
+                slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
+
+
+def test_the_part_of_the_pattern_in_a_derivative_is_right(scenario):
+    """Along a sphere around an element, distance and phase stay: only the pattern changes."""
+    scenario = dataclasses.replace(scenario, elements_per_side=1, user_gain=1.0)
+    angle, radius = 0.6, 1.5
+    place = radius * np.array([[np.cos(angle), 0.0, np.sin(angle)]])
+    tangent = np.array([-np.sin(angle), 0.0, np.cos(angle)])
+    gain, slopes = los_and_derivative(scenario, place, 0)
+    along = np.tensordot(tangent, slopes[0], 1)
+    # d ln(cos^3) / d theta, for every sub-band.
+    np.testing.assert_allclose(along / gain[0], -3 * np.tan(angle) / radius, rtol=1e-9)
+
+
+def test_straight_ahead_a_smooth_pattern_adds_nothing(scenario):
+    scenario = dataclasses.replace(scenario, elements_per_side=1)
+    isotropic = dataclasses.replace(
+        scenario, element_gain=float(patch(0.0)), user_gain=float(ripple(0.0)))
+    ahead = np.array([[1.7, 0.0, 0.0]])
+    for first, second in zip(los_and_derivative(scenario, ahead, 0),
+                             los_and_derivative(isotropic, ahead, 0), strict=True):
+        np.testing.assert_allclose(first, second, rtol=1e-12, atol=1e-15)
+
+
+def test_numerical_slopes_are_good_to_ten_digits():
+    angles = np.linspace(0, np.pi, 1001)
+    np.testing.assert_allclose(
+        GainPattern(ripple).slope(angles), ripple_slope(angles), rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(
+        GainPattern(ripple, ripple_slope).slope(angles), ripple_slope(angles))
+
+
+def test_covariance_of_the_multipath_is_the_integral(scenario):
+    """Eq. (2) of two elements by adaptive quadrature, the pattern weighing the profile."""
+    band, first, second = 1, 0, 7
+    spread = np.deg2rad(scenario.angular_spread_deg)
+    wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
+    way = np.subtract(*element_positions(scenario)[[first, second]])
+
+    def weight(azimuth, elevation):
+        return np.exp(-np.sqrt(2) * (abs(azimuth) + abs(elevation)) / spread)
+
+    def integrand(azimuth, elevation):
+        toward = np.array([np.cos(elevation) * np.cos(azimuth),
+                           np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        return (weight(azimuth, elevation) * patch(np.arccos(toward[0]))**2
+                * np.cos(wavenumber * way @ toward))
+
+    def over_all(function):
+        # The profile has a cusp at 0.
+        ends = ((-np.pi / 2, 0), (0, np.pi / 2))
+        return sum(dblquad(function, *a, *b, epsabs=1e-11, epsrel=1e-9)[0]
+                   for a, b in itertools.product(ends, ends))
+    expected = over_all(integrand) / over_all(weight) * mean_los_power(scenario, band)
+    covariance = multipath_covariance(scenario)[band, first, second]
+    np.testing.assert_allclose(covariance, expected, rtol=1e-6)
+
+
+def test_mean_power_weighs_the_users_pattern(scenario):
+    positions = scenario.sample_positions(400_000, np.random.default_rng(5))
+    squares = np.sum(positions**2, axis=1)
+    gains = ripple(np.arccos(positions[:, 0] / np.sqrt(squares)))
+    wavelength = SPEED_OF_LIGHT_MPS / scenario.center_frequencies_hz[0]
+    expected = np.mean((wavelength * gains / (4 * np.pi))**2 / squares)
+    assert mean_los_power(scenario, 0) == pytest.approx(expected, rel=3e-3)
+
+
+def test_bounds_are_those_of_differences(scenario, codebook):
+    """Eq. (12) from the mean signals alone."""
+    positions = scenario.sample_positions(5, np.random.default_rng(2))
+    whiteners = factor(scenario, codebook).whiteners
+    step = 1e-5
+    slopes = []
+    for u in range(3):
+        shift = step * np.eye(3)[u]
+        difference = (mean_received(scenario, codebook, positions + shift)
+                      - mean_received(scenario, codebook, positions - shift)) / (2 * step)
+        slopes.append(np.einsum('irs,nis->nir', whiteners, difference).reshape(5, -1))
+    slopes = np.stack(slopes, axis=1)
+    information = 2 * np.einsum('nur,nvr->nuv', slopes.conj(), slopes).real
+    expected = np.trace(np.linalg.inv(information), axis1=1, axis2=2)
+    np.testing.assert_allclose(crlb(scenario, codebook, positions), expected, rtol=1e-5)
+    isotropic = dataclasses.replace(scenario, element_gain=1.0, user_gain=1.0)
+    assert not np.allclose(crlb(isotropic, codebook, positions), expected, rtol=0.1)
+
+
+def test_the_slopes_that_estimators_climb_are_those_of_their_means(scenario, codebook):
+    model = WhitenedModel(scenario, codebook)
+    positions = scenario.sample_positions(6, np.random.default_rng(6))
+    mean, slopes = model.mean_and_derivative(positions)
+    np.testing.assert_allclose(mean, model.mean(positions), rtol=1e-9)
+    step = 1e-5
+    for u in range(3):
+        shift = step * np.eye(3)[u]
+        difference = (model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
+        np.testing.assert_allclose(
+            slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
+
+
+def test_estimators_of_the_pattern_are_better_than_those_that_know_none(scenario, codebook):
+    rng = np.random.default_rng(7)
+    positions = scenario.sample_positions(40, rng)
+    received = simulate_received(scenario, codebook, positions, rng)
+    isotropic = dataclasses.replace(scenario, element_gain=1.0, user_gain=1.0)
+    errors = []
+    for assumed in (scenario, isotropic):
+        estimate = make_estimator('bayes', assumed, codebook).estimate(received)
+        squares = np.sum((estimate.mean - positions)**2, axis=1)
+        errors.append(np.where(estimate.fix, squares, np.inf))
+    assert np.isfinite(errors[0]).all()
+    assert np.median(errors[0]) < np.median(errors[1]) / 2
+
+
+def test_beams_are_steered_with_the_pattern(scenario):
+    """A beam for the true pattern carries more than the one for none, at a place off the side."""
+    scenario = dataclasses.replace(
+        scenario, user_gain=1.0, elements_per_side=8, roi_center_m=(2, 0, 0),
+        # Blind in a cone around 45 degrees: each element sees the user at another angle.
+        element_gain=lambda angles: 0.01 + np.abs(np.sin(8 * (angles - np.pi / 4))))
+    isotropic = dataclasses.replace(scenario, element_gain=1.0)
+    place = np.array([0.9, 0.8, 0.4])
+    rates = [capacity(scenario, steer(assumed, place), place[None])[0]
+             for assumed in (scenario, isotropic)]
+    assert rates[0] > 1.01 * rates[1]
+
+
+class TestIdentity:
+    """What tells patterns, and scenarios with them, apart."""
+
+    def test_patterns_with_the_same_gains_are_equal(self):
+        twin = GainPattern(lambda angles: patch(angles))
+        assert twin == GainPattern(patch)
+        assert hash(twin) == hash(GainPattern(patch))
+        assert Scenario(element_gain=patch) == Scenario(element_gain=twin)
+        assert hash(Scenario(element_gain=patch)) == hash(Scenario(element_gain=twin))
+        other = GainPattern(lambda angles: 1.0001 * patch(angles))
+        assert other != twin
+        assert Scenario(element_gain=other) != Scenario(element_gain=twin)
+        assert GainPattern(ripple) != GainPattern(ripple, ripple_slope)
+        assert twin != 1.0
+
+    def test_tables_are_keyed_by_the_gains(self, scenario, codebook):
+        def key(**fields):
+            changed = dataclasses.replace(scenario, **fields)
+            return store.table_key(WhitenedModel(changed, codebook))
+        assert key() == key(element_gain=lambda angles: patch(angles))
+        others = {key(), key(element_gain=1.0), key(element_gain=lambda a: 2 * patch(a)),
+                  key(user_gain=1.0)}
+        assert len(others) == 4
+
+    def test_repr_has_no_address(self):
+        assert repr(GainPattern(patch)) == repr(GainPattern(lambda angles: patch(angles)))
+        assert '0x' not in repr(Scenario(element_gain=patch))
+
+    def test_changes_tell_patterns_apart(self):
+        first, second = (Scenario(element_gain=gain).changes() for gain in (patch, ripple))
+        assert first != second
+        assert yaml.safe_load(yaml.safe_dump(first)) == first
+        with pytest.raises(ScenarioError, match='element_gain: .* no plug-in, expected a number'):
+            Scenario(**first)
+
+    def test_a_scenario_with_a_function_of_a_module_can_be_sent_to_a_process(self):
+        there = pickle.loads(pickle.dumps(GainPattern(np.cosh)))
+        assert there == GainPattern(np.cosh)
+        np.testing.assert_array_equal(there.amplitude(np.ones(2)), np.cosh(np.ones(2)))
+
+
+class TestPlugins:
+    """Patterns by name."""
+
+    CODE = '''
+import numpy as np
+from rhs_isac_ros.model import GainPattern
+
+def patch(angles):
+    return 2 * np.maximum(np.cos(angles), 0)**3
+
+sharp = GainPattern(lambda angles: np.exp(-angles**2), lambda a: -2 * a * np.exp(-a**2))
+number = 3.0
+
+def short(angles):
+    return angles[:1]
+
+def minus(angles):
+    return np.cos(angles)
+
+def complex_(angles):
+    return np.exp(1j * angles)
+
+def none(angles):
+    return np.maximum(np.cos(angles + np.pi), 0) - 0 * angles
+
+def broken(angles):
+    raise KeyError('table')
+'''
+
+    @pytest.fixture(autouse=True)
+    def installed(self, install):
+        names = ('patch', 'sharp', 'number', 'short', 'minus', 'complex_', 'none', 'broken')
+        install('antennas', self.CODE, {plugins.GAIN_PATTERNS: {name: name for name in names}})
+
+    def test_a_file_may_name_one(self, tmp_path):
+        (tmp_path / 'my.yaml').write_text('element_gain: patch\nuser_gain: sharp\n')
+        scenario = Scenario.from_yaml(tmp_path / 'my.yaml')
+        assert scenario.element_gain == GainPattern(patch)
+        np.testing.assert_allclose(scenario.user_gain.slope(np.array([0.5])), -np.exp(-0.25))
+        assert Scenario(**scenario.changes()) == scenario
+        assert scenario.changes()['element_gain'] == f'patch@{GainPattern(patch).digest}'
+
+    def test_one_that_has_changed_since_is_refused(self):
+        with pytest.raises(ScenarioError, match=(
+                r'element_gain: .*antennas:patch of antennas: digest \w+, expected 0123: the '
+                'pattern has changed')):
+            Scenario(element_gain='patch@0123')
+
+    @pytest.mark.parametrize(('name', 'words'), [
+        ('absent', r"'absent', expected a plug-in of .*; installed: broken, complex_, minus"),
+        ('number', r'antennas:number of antennas: 3.0: TypeError'),
+        ('short', r'antennas:short .* float64 \(1,\), expected real numbers of the shape'),
+        ('complex_', r'antennas:complex_ .* complex128 \(4097,\), expected real'),
+        ('minus', r'antennas:minus .* gain -0.000\d+ at 1.572 rad, expected 0 to 1e\+06'),
+        ('none', r'antennas:none .* gain 0 everywhere in front'),
+        ('broken', r"antennas:broken .* KeyError: 'table', expected a function of an array"),
+    ])
+    def test_what_is_no_pattern_is_named(self, name, words):
+        with pytest.raises(ScenarioError, match=f'user_gain: .*{words}'):
+            Scenario(user_gain=name)
+
+
+@pytest.mark.parametrize('gain', [np.nan, np.inf, -1.0, 2e6])
+def test_gains_out_of_range_are_refused(gain):
+    with pytest.raises(PatternError, match=f'gain {gain:g} at 0.000 rad'.replace('+', r'\+')):
+        GainPattern(lambda angles: np.full(angles.shape, gain))
+
+
+def test_numbers_in_quotes_are_still_numbers():
+    assert Scenario(element_gain='2e0').element_gain == 2.0

@@ -1,0 +1,59 @@
+"""What other packages add by entry points."""
+
+import re
+
+import pytest
+
+from rhs_isac_ros.model import plugins
+from rhs_isac_ros.model.plugins import PluginError
+
+GROUP = plugins.MOBILITIES
+
+
+def test_names_are_those_of_the_installed_packages(install):
+    assert plugins.names(GROUP) == ()
+    install('strolls', 'def stroll(): return 1', {GROUP: {'stroll': 'stroll', 'amble': 'stroll'}})
+    install('strides', '', {GROUP: {'march': 'march'}, 'another.group': {'x': 'y'}})
+    assert plugins.names(GROUP) == ('amble', 'march', 'stroll')
+
+
+def test_what_is_named_is_imported_and_called(install):
+    install('strolls', 'def stroll(a, *, b): return a, b', {GROUP: {'stroll': 'stroll'}})
+    assert plugins.load(GROUP, 'stroll').__name__ == 'stroll'
+    assert plugins.make(GROUP, 'stroll', 1, b=2) == (1, 2)
+
+
+def test_an_unknown_name_lists_what_is_there(install):
+    with pytest.raises(PluginError, match=f"'stroll', expected a plug-in of {GROUP}; .*: none"):
+        plugins.load(GROUP, 'stroll')
+    install('strolls', '', {GROUP: {'b': 'x', 'a': 'x'}})
+    with pytest.raises(PluginError, match="'stroll', expected .*; installed: a, b"):
+        plugins.load(GROUP, 'stroll')
+
+
+@pytest.mark.parametrize(('code', 'words'), [
+    ('import no_such_module', "ModuleNotFoundError: No module named 'no_such_module'"),
+    ('1 / 0', 'ZeroDivisionError: division by zero'),
+    ('', "AttributeError: module 'strolls' has no attribute 'stroll'"),
+    ('def', 'SyntaxError: '),
+])
+def test_what_cannot_be_imported_names_its_entry_point(install, code, words):
+    install('strolls', code, {GROUP: {'stroll': 'stroll'}})
+    culprit = f'entry point {GROUP}: stroll = strolls:stroll of strolls: cannot be loaded: '
+    with pytest.raises(PluginError, match=re.escape(culprit + words)):
+        plugins.load(GROUP, 'stroll')
+
+
+def test_a_call_that_fails_names_its_entry_point(install):
+    install('strolls', 'def stroll(): raise KeyError("speed")', {GROUP: {'stroll': 'stroll'}})
+    with pytest.raises(PluginError, match=r"strolls:stroll of strolls: failed: KeyError: 'speed'"):
+        plugins.make(GROUP, 'stroll')
+    with pytest.raises(PluginError, match='failed: TypeError: .* positional argument'):
+        plugins.make(GROUP, 'stroll', 1)
+
+
+def test_two_packages_with_one_name_are_both_named(install):
+    install('strolls', 'def stroll(): return 1', {GROUP: {'stroll': 'stroll'}})
+    install('ambles', 'def stroll(): return 2', {GROUP: {'stroll': 'stroll'}})
+    with pytest.raises(PluginError, match=r"'stroll': .*ambles.* and .*strolls.*, expected one"):
+        plugins.load(GROUP, 'stroll')
