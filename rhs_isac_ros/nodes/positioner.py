@@ -9,7 +9,9 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import plugins
 from rhs_isac_ros.positioning import (
+    ESTIMATORS,
     Estimator,
     ModelError,
     Network,
@@ -41,8 +43,11 @@ class PositionerNode(RoleNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', SENDS, **node_options)
-        if self.values.estimator == NeuralEstimator.name:
+        name = self.values.estimator
+        if name == NeuralEstimator.name:
             self._check_model(self.values.model_file)
+        elif name not in ESTIMATORS:
+            self._check_plugin(name)
         self._background = Background(self)
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
@@ -60,10 +65,20 @@ class PositionerNode(RoleNode):
         except ModelError as error:
             raise ParameterError(f'model_file: {error}') from None
 
+    @staticmethod
+    def _check_plugin(name: str) -> None:
+        """Refuse to start without the code; whether it works shows later."""
+        try:
+            plugins.load(plugins.ESTIMATORS, name)
+        except plugins.PluginError as error:
+            raise ParameterError(f'estimator: {error}') from None
+
     def _make(self, codebook: Codebook) -> Estimator:
         values = self.values
         if values.estimator == NeuralEstimator.name:
             options = {'model_file': values.model_file}
+        elif values.estimator not in ESTIMATORS:
+            options = {'model_file': values.model_file} if values.model_file else {}
         else:
             folder = Path(values.table_folder) if values.table_folder else default_folder()
             options = {'table_folder': folder}

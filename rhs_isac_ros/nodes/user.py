@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model import mobility, streams
+from rhs_isac_ros.model import mobility, plugins, streams
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import PeersChanged
 from rhs_isac_ros.protocol.user import User, timeouts
@@ -54,8 +54,14 @@ class UserNode(RoleNode):
         place = start[0] if len(start) else None
         if values.mobility == 'random_walk':
             return mobility.RandomWalk(self.scenario, values.speed_mps, rng, place)
-        return mobility.Static(
-            self.scenario.sample_positions(1, rng)[0] if place is None else place)
+        if values.mobility == 'static':
+            return mobility.Static(
+                self.scenario.sample_positions(1, rng)[0] if place is None else place)
+        try:
+            return mobility.make_plugin(
+                values.mobility, self.scenario, values.speed_mps, rng, place)
+        except plugins.PluginError as error:
+            raise ParameterError(f'mobility: {error}') from None
 
     def _points(self, name: str) -> np.ndarray:
         """Points of a parameter, [N, 3], all in the region of interest."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, plugins
 from rhs_isac_ros.positioning.bayes import BayesEstimator
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError
 from rhs_isac_ros.positioning.exhaustive import exhaustive_posterior
@@ -31,14 +31,14 @@ def make_estimator(
     Parameters
     ----------
     name
-        One of `ESTIMATORS`.
+        One of `ESTIMATORS`, or a plug-in: an entry point of the group `plugins.ESTIMATORS`.
     scenario
         The scenario.
     codebook
         The codebook with which the signals are taken.
     **options
         Options of that estimator: ``table_folder`` of `bayes` and `ml`, where tables are kept;
-        ``model_file`` of `neural`, what `train` returns or its file.
+        ``model_file`` of `neural`, what `train` returns or its file. A plug-in has its own.
 
     Returns
     -------
@@ -49,11 +49,22 @@ def make_estimator(
     ------
     ValueError
         If there is no estimator of that name.
+    PluginError
+        If a plug-in cannot be loaded, fails, or makes no estimator.
     ModelError
         If a model cannot be read or is one of another codebook or scenario.
     CodebookError
         If the codebook does not fit the scenario.
     """
-    if name not in ESTIMATORS:
-        raise ValueError(f'estimator: {name!r}, expected one of {sorted(ESTIMATORS)}')
-    return ESTIMATORS[name](scenario, codebook, **options)
+    if name in ESTIMATORS:
+        return ESTIMATORS[name](scenario, codebook, **options)
+    there = plugins.names(plugins.ESTIMATORS)
+    if name not in there:
+        raise ValueError(f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *there})}')
+    estimator = plugins.make(plugins.ESTIMATORS, name, scenario, codebook, **options)
+    if not (callable(getattr(estimator, 'estimate', None))
+            and isinstance(getattr(estimator, 'name', None), str)):
+        raise plugins.PluginError(
+            f'{plugins.describe(plugins.ESTIMATORS, name)}: made {estimator!r}, expected an '
+            'estimator, with a method estimate and a string name')
+    return estimator

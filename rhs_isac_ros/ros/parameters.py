@@ -9,7 +9,7 @@ import types
 from collections.abc import Mapping
 from typing import Any
 
-from rhs_isac_ros.model import mobility
+from rhs_isac_ros.model import mobility, plugins
 from rhs_isac_ros.positioning import ESTIMATORS
 from rhs_isac_ros.protocol.roster import POLICIES
 
@@ -36,6 +36,8 @@ class Parameter:
         Range of a number, inclusive.
     choices
         The values that a string may have; empty if any.
+    plugins
+        Group of entry points whose names are choices too; empty if there is none.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] = ()
+    plugins: str = ''
 
     @property
     def kind(self) -> str:
@@ -56,7 +59,7 @@ class Parameter:
     def range(self) -> str:
         """The values it may have within its type; empty if all."""
         if self.choices:
-            return ', '.join(self.choices)
+            return ', '.join(self.choices) + (' or a plug-in' if self.plugins else '')
         if self.low is None:
             return ''
         low, high = (format(limit, 'd' if type(self.default) is int else 'g')
@@ -67,7 +70,7 @@ class Parameter:
     def expected(self) -> str:
         """The values it may have, in words."""
         if self.choices:
-            return f'one of {self.range}'
+            return f'one of {self.range}' + (f' of {self.plugins}' if self.plugins else '')
         words = {'bool': 'true or false', 'integer': 'an integer', 'string': 'a string',
                  'double': 'a number with a decimal point',
                  'double_array': 'a list of numbers, each with a decimal point'}[self.kind]
@@ -105,7 +108,8 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'user': (
         SCENARIO, SEED,
         Parameter('user_id', 1, 'Number of the user.', low=1, high=2**31 - 1),
-        Parameter('mobility', 'static', 'How the user moves.', choices=mobility.KINDS),
+        Parameter('mobility', 'static', 'How the user moves.', choices=mobility.KINDS,
+                  plugins=plugins.MOBILITIES),
         Parameter('position_m', [], 'Where it starts: x, y, z; empty: at random in the region.',
                   'm', -1e6, 1e6),
         Parameter('waypoints_m', [], 'Its way: x, y, z of one point after the other.', 'm',
@@ -130,7 +134,8 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     ),
     'positioner': (
         SCENARIO,
-        Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS)),
+        Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS),
+                  plugins=plugins.ESTIMATORS),
         Parameter('table_folder', '',
                   "Where tables are kept between runs; empty: the user's folder for caches."),
         Parameter('model_file', '', 'Trained model; the estimator neural needs one.'),
@@ -205,10 +210,21 @@ def _declare_one(node: Any, parameter: Parameter) -> Any:
         raise ParameterError(
             f'{parameter.name}: {error}; expected {parameter.expected}') from None
     value = default if value is None else value
-    wrong_choice = parameter.choices and value not in parameter.choices
-    if wrong_choice or not _in_range(parameter, value):
+    if parameter.choices and value not in parameter.choices:
+        _check_plugin(parameter, value)
+    if not _in_range(parameter, value):
         raise ParameterError(f'{parameter.name}: {value!r}, expected {parameter.expected}')
     return list(value) if isinstance(default, list) else value
+
+
+def _check_plugin(parameter: Parameter, value: str) -> None:
+    """Refuse what is no plug-in either. Only here they are listed: that takes time."""
+    text = f'{parameter.name}: {value!r}, expected {parameter.expected}'
+    if not parameter.plugins:
+        raise ParameterError(text)
+    there = plugins.names(parameter.plugins)
+    if value not in there:
+        raise ParameterError(f'{text}; installed: {", ".join(there) or "none"}')
 
 
 def _in_range(parameter: Parameter, value: Any) -> bool:

@@ -8,7 +8,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, plugins
 from rhs_isac_ros.nodes.bs import BsNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
@@ -241,3 +241,42 @@ def test_a_band_that_the_scenario_does_not_have_is_refused(bench):
 def test_a_node_reads_the_scenario_of_its_file(bench, small, small_files):
     overrides = [Parameter('scenario_file', value=str(small_files / 'scenario.yaml'))]
     assert bench.add(BsNode, parameter_overrides=overrides).scenario == small.scenario
+
+
+MOBILITIES = '''
+import numpy as np
+
+class Climb:
+    def __init__(self, scenario, speed_mps, rng, start):
+        self._velocity = np.array([0.0, 0.0, speed_mps])
+        self._start = np.array(scenario.roi_center_m) if start is None else np.array(start)
+
+    def state(self, now_s):
+        return self._start, self._velocity
+
+def nothing(scenario, speed_mps, rng, start):
+    return None
+'''
+
+
+@pytest.mark.parametrize(('position', 'place'), [([], (10, 0, 0)), ([9.0, 1.0, -0.5],) * 2])
+def test_a_user_moves_as_a_plug_in_says(bench, install, position, place):
+    install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb'}})
+    values = {'mobility': 'climb', 'speed_mps': 0.5, 'position_m': position}
+    overrides = [Parameter(name, value=value) for name, value in values.items() if value]
+    bench.add(UserNode, parameter_overrides=overrides)
+    truths = bench.hear(bench.add(Node, 'probe'), m.GroundTruth)
+    bench.until(lambda: truths, 'the true position')
+    assert tuple(truths[0].position) == tuple(place)
+    assert tuple(truths[0].velocity) == (0.0, 0.0, 0.5)
+
+
+@pytest.mark.parametrize(('name', 'words'), [
+    ('fly', "mobility: 'fly', expected one of static, waypoints, random_walk or a plug-in of "
+            'rhs_isac_ros.mobilities; installed: climb, nothing'),
+    ('nothing', 'mobility: entry point .*: nothing = moves:nothing of moves: made None'),
+])
+def test_what_is_no_mobility_is_refused(bench, install, name, words):
+    install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb', 'nothing': 'nothing'}})
+    with pytest.raises(ParameterError, match=words):
+        bench.add(UserNode, parameter_overrides=[Parameter('mobility', value=name)])

@@ -9,13 +9,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import simulate_received
+from rhs_isac_ros.model import plugins, simulate_received
 from rhs_isac_ros.nodes import positioner
 from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.parameters import ParameterError
 
 PLACE = np.array([10.0, 0.5, 0.2])
 
@@ -157,3 +158,66 @@ class TestNeural:
         assert [(e.cycle_id, e.estimator) for e in estimates] == [(1, 'neural'), (3, 'neural')]
         np.testing.assert_array_equal(estimates[1].position, [9.0, 0.5, 0.25])
         np.testing.assert_array_equal(estimates[1].covariance_m2, 2 * np.eye(3))
+
+
+class TestPlugin:
+    """A node with an estimator of another package."""
+
+    CODE = '''
+import numpy as np
+from rhs_isac_ros.positioning import Estimate
+
+class Centre:
+    name = 'centre'
+
+    def __init__(self, scenario, codebook, model_file=''):
+        self._estimate = Estimate(
+            np.array(scenario.roi_center_m), (1 + len(model_file)) * np.eye(3))
+
+    def estimate(self, received):
+        return self._estimate
+
+def fails(scenario, codebook):
+    raise KeyError('no such file')
+'''
+
+    @pytest.fixture(params=['', 'abc'])
+    def values(self, install, request):
+        install('guesses', self.CODE, {plugins.ESTIMATORS: {'centre': 'Centre'}})
+        return {'estimator': 'centre', 'model_file': request.param}
+
+    def test_it_estimates_with_it(self, bench, node, send, codebooks, values):
+        estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+        node.tell(CodebookOffered(codebooks[0]))
+        send(1)
+        (estimate,) = bench.until(lambda: estimates)
+        assert estimate.estimator == 'centre'
+        np.testing.assert_array_equal(estimate.position, node.scenario.roi_center_m)
+        assert estimate.covariance_m2[0, 0] == 1 + len(values['model_file'])
+
+
+@pytest.mark.parametrize(('name', 'words'), [
+    ('best', r"estimator: 'best', expected one of bayes, ml, neural or a plug-in of "
+             r"rhs_isac_ros.estimators; installed: absent, fails"),
+    ('absent', 'estimator: entry point .*: absent = guesses:Absent of guesses: cannot be loaded'),
+])
+def test_a_plug_in_that_is_not_there_is_refused_at_the_start(bench, install, name, words):
+    install('guesses', TestPlugin.CODE, {
+        plugins.ESTIMATORS: {'fails': 'fails', 'absent': 'Absent'}})
+    with pytest.raises(ParameterError, match=words):
+        bench.add(PositionerNode, parameter_overrides=[Parameter('estimator', value=name)])
+
+
+def test_a_plug_in_that_fails_is_told_and_named(
+        bench, install, codebooks, small_files, monkeypatch):
+    install('guesses', TestPlugin.CODE, {plugins.ESTIMATORS: {'fails': 'fails'}})
+    node = bench.add(PositionerNode, parameter_overrides=[
+        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
+        Parameter('estimator', value='fails')])
+    said = []
+    monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
+        info=said.append, warning=said.append))
+    node.tell(CodebookOffered(codebooks[0]))
+    bench.until(lambda: said)
+    assert said[0].endswith(
+        "fails = guesses:fails of guesses: failed: KeyError: 'no such file'")

@@ -14,7 +14,7 @@ from rclpy.utilities import remove_ros_args
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model import Scenario, ScenarioError, plugins
 from rhs_isac_ros.nodes.cli.republish import RepublishError, republish, root_of
 from rhs_isac_ros.positioning import ESTIMATORS, Estimator, ModelError, make_estimator
 from rhs_isac_ros.positioning.store import default_folder
@@ -149,7 +149,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 name, recording.scenario, codebook, **_files(name, options))
                 for key, codebook in codebooks.items()}
             print(_row(name, errors_m(recording.cycles, made)))
-    except (RecordingError, ScenarioError, CodebookError, ModelError, OSError) as error:
+    except (RecordingError, ScenarioError, CodebookError, ModelError, plugins.PluginError,
+            OSError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
     except RepublishError as error:
@@ -197,7 +198,8 @@ def _parser() -> argparse.ArgumentParser:
         prog='replay', description='Feed the received signals of a recording to estimators, and '
         'compare their errors with those of the live network.')
     parser.add_argument('file', type=Path, help='recording')
-    parser.add_argument('--estimator', action='append', choices=tuple(ESTIMATORS),
+    parser.add_argument('--estimator', action='append',
+                        choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
                         help='may be given more than once (default: bayes)')
     parser.add_argument('--codebook', type=Path, metavar='FILE',
                         help="codebook to assume; the recording's if none")

@@ -1,0 +1,72 @@
+"""Estimators of other packages."""
+
+import re
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import plugins
+from rhs_isac_ros.model.plugins import PluginError
+from rhs_isac_ros.positioning import Estimate, make_estimator
+
+CODE = '''
+import numpy as np
+from rhs_isac_ros.positioning import Estimate
+
+class Centre:
+    name = 'centre'
+
+    def __init__(self, scenario, codebook, scale=1.0):
+        self._estimate = Estimate(scale * np.array(scenario.roi_center_m), np.eye(3))
+
+    def estimate(self, received):
+        return self._estimate
+
+def nothing(scenario, codebook):
+    return None
+
+class Nameless(Centre):
+    name = None
+
+bayes = Centre
+'''
+
+
+@pytest.fixture(autouse=True)
+def installed(install):
+    names = {'centre': 'Centre', 'nothing': 'nothing', 'nameless': 'Nameless', 'bayes': 'Centre',
+             'absent': 'Absent'}
+    install('guesses', CODE, {plugins.ESTIMATORS: names})
+
+
+def test_a_plug_in_is_made_by_its_name(small):
+    estimator = make_estimator('centre', small.scenario, small.codebook)
+    estimate = estimator.estimate(np.zeros((1, 6)))
+    assert isinstance(estimate, Estimate)
+    np.testing.assert_array_equal(estimate.mean, small.scenario.roi_center_m)
+    doubled = make_estimator('centre', small.scenario, small.codebook, scale=2.0)
+    np.testing.assert_array_equal(
+        doubled.estimate(np.zeros((1, 6))).mean, 2 * np.array(small.scenario.roi_center_m))
+
+
+def test_the_built_in_ones_cannot_be_replaced(small):
+    assert type(make_estimator('bayes', small.scenario, small.codebook)).__module__.startswith(
+        'rhs_isac_ros.')
+
+
+def test_an_unknown_name_lists_all_that_are_there(small):
+    with pytest.raises(ValueError, match=re.escape(
+            "estimator: 'best', expected one of ['absent', 'bayes', 'centre', 'ml', 'nameless', "
+            "'neural', 'nothing']")):
+        make_estimator('best', small.scenario, small.codebook)
+
+
+@pytest.mark.parametrize(('name', 'options', 'words'), [
+    ('absent', {}, 'absent = guesses:Absent of guesses: cannot be loaded: AttributeError'),
+    ('nothing', {}, 'nothing = guesses:nothing of guesses: made None, expected an estimator'),
+    ('nameless', {}, r'nameless = guesses:Nameless of guesses: made <.*>, expected an estimator'),
+    ('centre', {'table': 1}, 'centre = guesses:Centre of guesses: failed: TypeError: .*table'),
+])
+def test_what_is_no_estimator_is_named(small, name, options, words):
+    with pytest.raises(PluginError, match=f'entry point {plugins.ESTIMATORS}: {words}'):
+        make_estimator(name, small.scenario, small.codebook, **options)
