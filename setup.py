@@ -42,6 +42,7 @@ setup(
     # What it runs on is in package.xml: rosdep or requirements.txt install it.
     install_requires=['setuptools'],
     extras_require={
+        'docs': ['sphinx'],
         'experiments': ['dask', 'distributed', 'joblib'],
         'neural': ['scikit-learn'],
         'genetic': ['pymoo'],

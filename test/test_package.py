@@ -1,0 +1,84 @@
+"""package.xml names all that the package imports, so that rosdep can install it."""
+
+import ast
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TREE = ElementTree.parse(ROOT / 'package.xml').getroot()
+# Keys of libraries in rosdistro's rosdep/python.yaml, by what is imported; a ROS package is its
+# own key. threadpoolctl comes with scikit-learn.
+KEYS = {
+    'docutils': 'python3-sphinx', 'hypothesis': 'python3-hypothesis', 'joblib': 'python3-joblib',
+    'matplotlib': 'python3-matplotlib', 'numpy': 'python3-numpy', 'psutil': 'python3-psutil',
+    'pytest': 'python3-pytest', 'rich': 'python3-rich', 'scipy': 'python3-scipy',
+    'sklearn': 'python3-sklearn', 'sphinx': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn',
+    'tqdm': 'python3-tqdm', 'yaml': 'python3-yaml',
+}
+# What rosdep does not know, by what is imported; setup.py has an extra with it.
+PIP_ONLY = {
+    'distributed': 'distributed', 'jax': None, 'mcap': 'mcap', 'mcap_ros2': 'mcap-ros2-support',
+    'pymoo': 'pymoo', 'rosbags': 'rosbags',
+}
+# The repository's own.
+OWN = {'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest'}
+
+
+def imported(folder):
+    """Roots of the names that the modules of a folder import, and one module of each."""
+    found = {}
+    for path in sorted((ROOT / folder).rglob('*.py')):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names = [node.module]
+            found |= {name.partition('.')[0]: path for name in names}
+    return {name: path for name, path in found.items()
+            if name not in sys.stdlib_module_names and name not in OWN}
+
+
+def keys(*kinds):
+    return {node.text for kind in kinds for node in TREE.iter(kind)}
+
+
+def extras():
+    tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
+    (found,) = [ast.literal_eval(node.value) for node in ast.walk(tree)
+                if isinstance(node, ast.keyword) and node.arg == 'extras_require']
+    return {name for names in found.values() for name in names}
+
+
+RUN = ('depend', 'exec_depend')
+
+
+@pytest.mark.parametrize(('folder', 'kinds'), [
+    ('rhs_isac_ros', RUN), ('launch', RUN), ('scripts', RUN),
+    ('test', (*RUN, 'test_depend')), ('docs', (*RUN, 'doc_depend'))])
+def test_every_import_has_a_key_or_is_an_extra(folder, kinds):
+    there, missing = keys(*kinds), {}
+    for name, path in imported(folder).items():
+        if name in PIP_ONLY:
+            if PIP_ONLY[name] and PIP_ONLY[name] not in extras():
+                missing[name] = f'{path}: not among the extras of setup.py'
+        elif KEYS.get(name, name) not in there:
+            missing[name] = f'{path}: no {KEYS.get(name, name)} in package.xml'
+    assert not missing
+
+
+def test_no_key_is_there_for_nothing():
+    folders = ('rhs_isac_ros', 'launch', 'scripts', 'test', 'docs')
+    used = {KEYS.get(name, name) for folder in folders
+            for name in imported(folder)}
+    # launch reads .xml files through a plug-in.
+    assert keys(*RUN, 'test_depend', 'doc_depend') <= used | {'launch_xml'}
+
+
+def test_libraries_have_keys_that_rosdep_knows():
+    libraries = {key for key in keys(*RUN, 'test_depend', 'doc_depend')
+                 if key.startswith('python3-')}
+    assert libraries <= set(KEYS.values())
