@@ -12,8 +12,8 @@ class PairConfusion(Average):
 
     With q = sum_i dmu_i^H Lambda_i^-1 dmu_i, dmu being the difference of the mean signals, the
     likelier of two positions is the wrong one with probability Q(sqrt(q / 2)); the average of
-    |p - p'|^2 Q(sqrt(q / 2)) is in square metres, as the bound is. The quadratic form is that of
-    Eq. (13), with the difference h(p) - h(p') in the place of the derivative.
+    ``|p - p'|^2 Q(sqrt(q / 2))`` is in square metres, as the bound is. The quadratic form is that
+    of Eq. (13), with the difference h(p) - h(p') in the place of the derivative.
 
     Parameters
     ----------

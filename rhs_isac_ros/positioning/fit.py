@@ -1,9 +1,9 @@
 """Whether the model can explain received signals at all.
 
-Whitened signals y of a position with whitened mean t differ from it by unit noise: 2 |y - t|^2
-has a chi-square distribution with two degrees of freedom a measurement. What lies beyond the
-quantiles of `FALSE_ALARM` comes from no position of the region: from a user elsewhere, another
-codebook, a silent or a broken receiver. Then there is no fix.
+Whitened signals y of a position with whitened mean t differ from it by unit noise:
+``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom a measurement. What lies
+beyond the quantiles of `FALSE_ALARM` comes from no position of the region: from a user elsewhere,
+another codebook, a silent or a broken receiver. Then there is no fix.
 """
 
 

@@ -1,0 +1,43 @@
+"""Sphinx configuration; scripts/docs builds with it."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / 'extensions'))
+
+from rhs_isac_ros import __version__  # noqa: E402
+
+project = 'rhs_isac_ros'
+author = 'rhs_isac_ros authors'
+copyright = author
+version = release = __version__
+extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'generated', 'mathml']
+
+# Pages must display where there is no network: no fonts, no MathJax from elsewhere.
+html_theme = 'alabaster'
+html_theme_options = {
+    'description': 'Multi-band ISAC with a holographic surface, on ROS 2',
+    'fixed_sidebar': True, 'page_width': '1100px', 'body_max_width': 'none'}
+html_static_path = ['_static']
+html_sidebars = {'**': ['about.html', 'navigation.html', 'searchbox.html']}
+html_math_renderer = 'mathml'
+html_show_sourcelink = False
+html_copy_source = False
+
+default_role = 'py:obj'
+exclude_patterns = ['examples']
+autodoc_typehints_format = 'short'
+autodoc_member_order = 'bysource'
+autodoc_default_options = {'members': True, 'show-inheritance': True}
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+# What is ours must be there; what is another library's would need its inventory from the network.
+# What begins with an underscore is nobody's business.
+nitpicky = True
+nitpick_ignore_regex = [
+    ('py:.*', r'(?!rhs_isac_ros\.).*'),
+    ('py:.*', r'rhs_isac_ros\.(.*\.)?_.*'),
+    # Type variables.
+    ('py:.*', r'rhs_isac_ros\.(protocol\.shelf\.Item|ros\.background\.Result)'),
+]

@@ -1,0 +1,17 @@
+"""Mean squared errors of estimators on the same simulated signals."""
+
+import sys
+
+import numpy as np
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+
+scenario = Scenario.from_yaml(sys.argv[1])
+codebook = Codebook.load(sys.argv[2])
+positions, received = simulate_pairs(scenario, codebook, 1000, seed=1)
+for name in sys.argv[3:]:
+    estimate = make_estimator(name, scenario, codebook).estimate(received)
+    errors = np.sum((estimate.mean - positions)**2, axis=1)
+    print(f'{name} {np.nanmean(errors):.3f} m^2')

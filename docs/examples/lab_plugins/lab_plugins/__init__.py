@@ -1,0 +1,1 @@
+"""What a laboratory adds to rhs_isac_ros, without changing it."""

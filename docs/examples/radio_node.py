@@ -1,0 +1,80 @@
+"""A node in the place of ``channel`` that talks to hardware."""
+
+import collections
+import dataclasses
+import sys
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import Send
+from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.ros.role_node import RoleNode
+from rhs_isac_ros.ros.run import entry
+
+
+class Radio(PlainRole):
+    """Answers each pilot with what the receivers behind the feeds measure.
+
+    `measure` takes a band, a configuration [N_E] and the pilot; it sets the surface, has the user
+    transmit, and returns the signals at the feeds, complex [N_SB, K] [sqrt(W)], noise and all.
+    `carry` takes data and returns how many of their bits arrived at the other side.
+    """
+
+    def __init__(self, measure, carry):
+        super().__init__()
+        self._measure, self._carry = measure, carry
+        self._cycle_id = 0
+        self._applied = {}
+        self._waiting = collections.deque(maxlen=256)
+
+    def handle(self, event, now_s):
+        """Take a message; return what to send."""
+        match event:
+            case m.RhsConfiguration(mode=m.Mode.POSITIONING):
+                if event.cycle_id != self._cycle_id:
+                    self._cycle_id, self._applied = event.cycle_id, {}
+                self._applied[event.band] = event.analog
+            case m.Pilot():
+                self._waiting.append(event)
+            case m.Data(stage=m.Stage.OFFERED):
+                bits = self._carry(event)
+                return [Send(dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits))]
+        return self._answer()
+
+    def _answer(self):
+        """Answer the pilots whose configuration is known: topics may overtake each other."""
+        answers = []
+        for _ in range(len(self._waiting)):
+            pilot = self._waiting.popleft()
+            if pilot.cycle_id == self._cycle_id and pilot.band in self._applied:
+                configuration = self._applied[pilot.band][pilot.frame]
+                feeds = self._measure(pilot.band, configuration, pilot)
+                answers.append(Send(m.FeedSignals(
+                    pilot.cycle_id, pilot.user, pilot.band, pilot.frame, feeds)))
+            else:
+                # Of a cycle that nobody finished, these fall out at the other end.
+                self._waiting.append(pilot)
+        return answers
+
+
+class RadioNode(RoleNode):
+    """The node; it takes the parameters of ``channel``, of which it needs ``scenario_file``."""
+
+    def __init__(self, measure, carry, **node_options):
+        super().__init__('channel', (m.FeedSignals, m.Data), 'radio', **node_options)
+        self.start(Radio(measure, carry), (m.RhsConfiguration, m.Pilot, m.Data))
+
+
+def measure(band, configuration, pilot):
+    """Drive your hardware here."""
+    raise NotImplementedError('no radio yet')
+
+
+def carry(data):
+    """Send your data here."""
+    raise NotImplementedError('no radio yet')
+
+
+main = entry(lambda: [RadioNode(measure, carry)])
+
+if __name__ == '__main__':
+    sys.exit(main())

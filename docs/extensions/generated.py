@@ -1,0 +1,176 @@
+"""The directive ``generated``: parts of pages that the code itself writes.
+
+``.. generated:: parameters`` calls the function of that name below; what it returns is
+reStructuredText, or SVG.
+"""
+
+import ast
+import importlib
+import pkgutil
+import re
+from pathlib import Path
+
+import sequence
+from docutils import nodes
+from docutils.statemachine import StringList
+from sphinx.util.docutils import SphinxDirective
+from sphinx.util.nodes import nested_parse_with_titles
+from visualization_msgs.msg import MarkerArray
+
+from rhs_isac_ros.protocol import bs_table, diagram, health
+from rhs_isac_ros.ros import parameters, qos, recording, topics
+
+ROOT = Path(__file__).parents[2]
+MESSAGES = ROOT / 'msg_defs' / 'msg'
+
+
+def table(head, rows, widths):
+    """Write a table; cells are reStructuredText of one line."""
+    lines = ['.. list-table::', '   :header-rows: 1', f'   :widths: {widths}', '']
+    for row in (head, *rows):
+        for number, cell in enumerate(row):
+            lines.append(f'   {"* -" if number == 0 else "  -"} {cell}'.rstrip())
+    return '\n'.join(lines)
+
+
+def code(text):
+    """Write a name as code; nothing for nothing."""
+    return f'``{text}``' if text else ''
+
+
+def parameter_table():
+    """Every ROS parameter, from its one declaration."""
+    owners = {}
+    for executable, group in parameters.NODES.items():
+        for parameter in group:
+            owners.setdefault(parameter.name, (parameter, []))[1].append(executable)
+    rows = []
+    for name, (parameter, nodes_) in owners.items():
+        default = str(parameter.default).lower() if parameter.kind == 'bool' else (
+            parameter.default if parameter.default not in ('', []) else 'empty')
+        rows.append((code(name), parameter.kind, default, parameter.range,
+                     ', '.join(nodes_), parameter.text))
+    return table(('parameter', 'type', 'default', 'range', 'nodes', 'what it is'), rows,
+                 '18 8 9 15 20 30')
+
+
+def topic_table():
+    """Every topic with type and quality of service."""
+    # Markers are for the eye, and not recorded.
+    outlets = {topics.MARKERS: (MarkerArray, qos.EXCHANGE), **recording.outlets()}
+    rows = []
+    for name, (kind, profile) in sorted(outlets.items()):
+        kept = 'latched' if profile is qos.LATCHED else f'last {profile.depth}'
+        text = recording.type_name(kind).replace('/msg/', '/')
+        shown = f':ref:`{text} <message-{kind.__name__.lower()}>`' if text.startswith(
+            'rhs_isac_msgs') else code(text)
+        rows.append((code(name), shown, f'reliable, {kept}'))
+    return table(('topic', 'type', 'quality of service'), rows, '25 45 30')
+
+
+def message_list():
+    """Every message of the protocol, as its file says it."""
+    parts = []
+    for path in sorted(MESSAGES.glob('*.msg')):
+        text = path.read_text(encoding='utf-8').rstrip()
+        head = re.match(r'((?:#.*\n)*)', text)[1]
+        told = ' '.join(line.lstrip('# ').strip() for line in head.splitlines())
+        title = path.stem
+        body = '\n'.join(f'   {line}'.rstrip() for line in text[len(head):].splitlines())
+        parts.append(f'.. _message-{title.lower()}:\n\n{title}\n{"^" * len(title)}\n\n'
+                     f'{told.replace("`", "``")}\n\n.. code-block:: none\n\n{body}\n')
+    return '\n'.join(parts)
+
+
+def state_picture(role):
+    """The state diagram of a role."""
+    return diagram.svg(role)
+
+
+def state_table(role):
+    """All rows of the table of a role."""
+    rows = [tuple(code(cell) if number not in (0, 2) or cell not in ('any', 'the same') else cell
+                  for number, cell in enumerate(row)) for row in diagram.rows(role)]
+    return table(('state', 'input', 'next state', 'actions', 'counts'), rows, '18 22 18 27 15')
+
+
+def cycle_sequence():
+    """The messages of one cycle, as the roles exchange them."""
+    return sequence.svg()
+
+
+def outcome_table():
+    """What can end a cycle without service, and what is counted besides."""
+    rows = [(code(name), 'ends the cycle') for name in sorted(health.CYCLE_ENDS)]
+    rows.append((code(bs_table.TABLE[bs_table.State.BEACONING, bs_table.Input.TIMEOUT].counts),
+                 'a beacon that nobody answered'))
+    others = {row[4] for role in diagram.ROLES for row in diagram.rows(role)} - {
+        '', *health.CYCLE_ENDS, health.UNANSWERED}
+    rows += [(code(name), 'a message that was dropped') for name in sorted(others)]
+    return table(('counter', 'what it counts'), rows, '40 60')
+
+
+def dependency_table():
+    """What pip must install, by what it is for: the extras of the package without a rosdep key."""
+    tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
+    (extras,) = [ast.literal_eval(node.value) for node in ast.walk(tree)
+                 if isinstance(node, ast.keyword) and node.arg == 'extras_require']
+    keys = (ROOT / 'package.xml').read_text(encoding='utf-8')
+    rows = []
+    for purpose, names in extras.items():
+        left = [name for name in names
+                if f'>python3-{name.replace("scikit-learn", "sklearn")}<' not in keys]
+        if left:
+            rows.append((purpose, code(' '.join(left)),
+                         code(f'python3 -m pip install {" ".join(left)}')))
+    return table(('for', 'packages', 'command'), rows, '20 30 50')
+
+
+def module_list(package):
+    """What a package offers, then each of its modules in full."""
+    home = importlib.import_module(package)
+    parts = []
+    offered = [getattr(home, name) for name in getattr(home, '__all__', ())]
+    own = [f'* :py:obj:`~{item.__module__}.{item.__qualname__}`' for item in offered
+           if getattr(item, '__module__', '').startswith('rhs_isac_ros')
+           and hasattr(item, '__qualname__')]
+    if own:
+        parts.append(f'``from {package} import`` one of:\n\n' + '\n'.join(own) + '\n')
+    parts += [f'.. autofunction:: {package}.{item.__name__}\n' for item in offered
+              if getattr(item, '__module__', '') == package]
+    for info in pkgutil.iter_modules(home.__path__):
+        if info.ispkg or info.name.startswith('_'):
+            continue
+        name = f'{package}.{info.name}'
+        parts.append(f'``{info.name}``\n{"-" * (len(info.name) + 4)}\n\n'
+                     f'.. automodule:: {name}\n')
+    return '\n'.join(parts)
+
+
+FUNCTIONS = {function.__name__: function for function in (
+    parameter_table, topic_table, message_list, state_picture, state_table, cycle_sequence,
+    outcome_table, module_list, dependency_table)}
+
+
+class Generated(SphinxDirective):
+    """Calls a function, and puts in its place what it returns."""
+
+    required_arguments = 1
+    optional_arguments = 1
+
+    def run(self):
+        """Return the nodes."""
+        text = FUNCTIONS[self.arguments[0]](*self.arguments[1:])
+        if text.startswith('<svg'):
+            return [nodes.raw('', f'<div class="picture">{text}</div>', format='html')]
+        node = nodes.section()
+        node.document = self.state.document
+        source = f'<{self.arguments[0]}>'
+        nested_parse_with_titles(self.state, StringList(text.splitlines(), source), node)
+        return node.children
+
+
+def setup(app):
+    """Register the directive."""
+    app.add_directive('generated', Generated)
+    return {'parallel_read_safe': True}

@@ -1,0 +1,142 @@
+"""A picture of one cycle: the roles themselves exchange the messages that it shows."""
+
+import collections
+import html
+import itertools
+
+import numpy as np
+
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.model import Scenario, mobility
+from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.positioning import Estimate
+from rhs_isac_ros.protocol import bs_table, user
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.bs import BaseStation
+from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    MakeEstimator,
+    PeersChanged,
+    Send,
+    Tick,
+)
+from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
+from rhs_isac_ros.protocol.rhs_controller import RhsController
+from rhs_isac_ros.protocol.roster import Roster
+from rhs_isac_ros.protocol.transmission import Transmission
+from rhs_isac_ros.ros.topics import NAMES
+
+# What each role takes, in the order of the picture.
+HEARS = {
+    'user': (m.Beacon, m.Grant, m.PilotRequest, m.Data),
+    'channel': (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
+    'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.NoFix, m.Beam,
+           m.Data),
+    'rhs_controller': (m.Grant, m.RhsCommand, m.Beam),
+    'positioner': (m.ReceivedSignals,),
+    'transmission': (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth),
+}
+_COLUMN, _ROW, _TOP, _LEFT = 165, 24, 50, 70
+_STYLE = ('text{font:11px monospace;fill:#222}.role{font-weight:bold;font-size:13px}'
+          '.life{stroke:#aab;stroke-dasharray:4 4}path,circle{stroke:#567;fill:#567}')
+
+
+class _Centre:
+    """An estimator that needs no time: the picture shows messages, not positions."""
+
+    name = 'centre'
+
+    def __init__(self, scenario):
+        self._estimate = Estimate(np.array(scenario.roi_center_m), np.eye(3))
+
+    def estimate(self, received):
+        return self._estimate
+
+
+def cycle():
+    """Run the roles until a user is served; return (sender, message) in order."""
+    scenario = Scenario(n_subbands=2, n_frames=2, n_feeds=2, elements_per_side=4)
+    codebook = random_codebook(scenario, np.random.default_rng(0))
+    roles = {
+        'user': user.User(
+            1, mobility.Static(scenario.roi_center_m), user.timeouts(1.0)),
+        'channel': Channel(scenario, 0),
+        'rhs_controller': RhsController(), 'transmission': Transmission(scenario),
+        'positioner': Positioner(scenario, lambda: 0.0),
+        'bs': BaseStation(
+            scenario, Roster('first', np.random.default_rng(0)),
+            lambda codebook, feeds, user, cycle_id: receive_feeds(scenario, codebook, feeds, None),
+            bs_table.timeouts(0.1, 1.0, 0.1), 1e-3),
+    }
+    sent, queue, now_s = [], collections.deque(), 0.0
+
+    def tell(name, event):
+        for action in roles[name].handle(event, now_s):
+            if isinstance(action, MakeEstimator):
+                tell(name, make_estimator_for(
+                    action.codebook, lambda codebook: _Centre(scenario), lambda: 0.0))
+            elif isinstance(action, Send):
+                sent.append((name, action.message))
+                queue.extend((other, action.message) for other, kinds in HEARS.items()
+                             if other != name and type(action.message) in kinds)
+    for name in ('rhs_controller', 'transmission', 'positioner', 'bs'):
+        tell(name, CodebookOffered(codebook))
+    for name in ('user', 'bs'):
+        tell(name, PeersChanged(()))
+    while not any(getattr(message, 'outcome', '') for _, message in sent):
+        if queue:
+            tell(*queue.popleft())
+        else:
+            now_s = roles['bs'].next_deadline()
+            tell('bs', Tick())
+    assert sent[-1][1].outcome == 'served', sent[-1]
+    return sent
+
+
+def svg():
+    """Draw the cycle: a column for each role, a row for each message; runs of equals are one."""
+    rows = [(sender, kind, list(run)) for (sender, kind), run in itertools.groupby(
+        cycle(), key=lambda item: (item[0], type(item[1])))]
+    place = {name: _LEFT + _COLUMN * number for number, name in enumerate(HEARS)}
+    width = _LEFT * 2 + _COLUMN * (len(HEARS) - 1)
+    height = _TOP + _ROW * (len(rows) + 1)
+    parts = []
+    for name, x in place.items():
+        parts.append(f'<text class="role" x="{x}" y="25" text-anchor="middle">{name}</text>')
+        parts.append(f'<line class="life" x1="{x}" x2="{x}" y1="35" y2="{height - 10}"/>')
+    for number, (sender, kind, run) in enumerate(rows):
+        y = _TOP + _ROW * (number + 1)
+        label = NAMES[kind] + _detail([message for _, message in run])
+        takers = [name for name, kinds in HEARS.items() if kind in kinds and name != sender]
+        if kind is m.Data:
+            takers = (['channel'] if run[0][1].stage is m.Stage.OFFERED else
+                      ['user' if run[0][1].direction is m.Direction.DOWNLINK else 'bs'])
+        last = sender == list(HEARS)[-1]
+        parts += _arrows(place[sender], [place[name] for name in takers], y, label, last)
+    return (f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+            f'viewBox="0 0 {width} {height}" role="img"><title>One cycle</title>'
+            f'<style>{_STYLE}</style>{"".join(parts)}</svg>')
+
+
+def _detail(messages):
+    first = messages[0]
+    if isinstance(first, m.Data):
+        return f' {first.direction.name.lower()}, {first.stage.name.lower()}'
+    if isinstance(first, m.ProtocolState):
+        return f' {first.outcome or first.phase.name.lower()}'
+    band = f' band {first.band}' if hasattr(first, 'band') else ''
+    return band + (f', {len(messages)} times' if len(messages) > 1 else '')
+
+
+def _arrows(begin, ends, y, label, last):
+    """From a sender to all that take it; the label stands at the sender, left of the last one."""
+    parts = [f'<circle cx="{begin}" cy="{y}" r="3"/>']
+    for end in ends:
+        tip = 7 if end < begin else -7
+        parts.append(f'<path d="M{begin} {y} L{end} {y} l{tip} -4 l0 8 L{end} {y}"/>')
+    right = not last and (not ends or max(ends) > begin)
+    anchor, x = ('start', begin + 8) if right else ('end', begin - 8)
+    parts.append(f'<text x="{x}" y="{y - 5}" text-anchor="{anchor}" paint-order="stroke" '
+                 f'stroke="white" stroke-width="4">{html.escape(label)}</text>')
+    return parts

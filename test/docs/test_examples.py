@@ -1,0 +1,123 @@
+"""The examples of the documentation, as a reader has them."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.model import Scenario, mobility, plugins, simulate_received
+from rhs_isac_ros.model.los import los_and_derivative
+from rhs_isac_ros.positioning import make_estimator
+
+EXAMPLES = Path(__file__).parents[2] / 'docs' / 'examples'
+
+
+@pytest.fixture(scope='module')
+def site(tmp_path_factory):
+    """Folder with the example package, installed by pip."""
+    folder = tmp_path_factory.mktemp('site')
+    source = folder / 'source'
+    # pip builds inside of the source.
+    source.mkdir()
+    for path in EXAMPLES.joinpath('lab_plugins').rglob('*'):
+        if path.suffix in ('.py', '.toml'):
+            copy = source / path.relative_to(EXAMPLES / 'lab_plugins')
+            copy.parent.mkdir(exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    done = subprocess.run(
+        [sys.executable, '-m', 'pip', 'install', '--quiet', '--no-deps', '--no-build-isolation',
+         '--no-index', '--disable-pip-version-check', '--target', folder / 'site', source],
+        capture_output=True, text=True, timeout=240, check=False)
+    if 'No module named pip' in done.stderr:
+        pytest.skip('there is no pip here')
+    assert done.returncode == 0, done.stderr
+    return folder / 'site'
+
+
+@pytest.fixture(autouse=True)
+def installed(site, monkeypatch):
+    monkeypatch.syspath_prepend(site)
+    for name in [name for name in sys.modules if name.startswith('lab_plugins')]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+def test_all_are_found():
+    assert 'grid' in plugins.names(plugins.ESTIMATORS)
+    assert 'circle' in plugins.names(plugins.MOBILITIES)
+    assert 'patch' in plugins.names(plugins.GAIN_PATTERNS)
+
+
+def test_the_estimator_locates_users():
+    scenario = Scenario(elements_per_side=6, roi_center_m=(2, 0, 0), roi_size_m=(1, 1, 1))
+    rng = np.random.default_rng(1)
+    codebook = random_codebook(scenario, rng)
+    positions = scenario.sample_positions(50, rng)
+    received = simulate_received(scenario, codebook, positions, rng)
+    errors = {}
+    for name in ('grid', 'bayes'):
+        estimator = make_estimator(name, scenario, codebook)
+        assert estimator.name == name
+        estimate = estimator.estimate(received)
+        assert estimate.mean.shape == (50, 3)
+        assert np.linalg.eigvalsh(estimate.covariance).min() > 0
+        errors[name] = np.mean(np.sum((estimate.mean - positions)**2, axis=1))
+        np.testing.assert_array_equal(estimator.estimate(received[0]).mean, estimate.mean[0])
+    # A guess of the centre would be off by 0.25 m^2 on average.
+    assert errors['grid'] < 0.1
+    assert errors['grid'] < 2 * errors['bayes']
+
+
+def test_the_mobility_goes_round_at_its_speed():
+    scenario = Scenario()
+    for start in (None, (10.0, 1.0, 0.0)):
+        user = mobility.make_plugin('circle', scenario, 1.5, np.random.default_rng(0), start)
+        begin, velocity = user.state(100.0)
+        if start:
+            np.testing.assert_allclose(begin, [10.0, 2.0, 0.0], atol=1e-12)
+        assert np.linalg.norm(begin - scenario.roi_center_m) == pytest.approx(2.0)
+        assert np.linalg.norm(velocity) == pytest.approx(1.5)
+        soon, _ = user.state(100.0 + 1e-5)
+        np.testing.assert_allclose((soon - begin) / 1e-5, velocity, atol=1e-4)
+        np.testing.assert_allclose(user.state(100.0 + 4 * np.pi / 1.5)[0], begin, atol=1e-9)
+
+
+def test_the_pattern_is_that_of_a_patch(tmp_path, small):
+    (tmp_path / 'my.yaml').write_text('element_gain: patch\nuser_gain: 1.0\n')
+    scenario = dataclasses.replace(
+        small.scenario, element_gain=Scenario.from_yaml(tmp_path / 'my.yaml').element_gain)
+    ahead, aside = np.array([[8.0, 0, 0]]), 8 * np.array([[0.5, np.sqrt(0.75), 0]])
+    for place, gain in ((ahead, 2.0), (aside, 1.0)):
+        shape = los_and_derivative(scenario, place, 0)[0] / los_and_derivative(
+            small.scenario, place, 0)[0]
+        np.testing.assert_allclose(shape, gain, rtol=0.03)
+    # The slope that the example brings is the one that differences find.
+    bare = dataclasses.replace(scenario, element_gain=scenario.element_gain.amplitude)
+    np.testing.assert_allclose(crlb(bare, small.codebook, aside),
+                               crlb(scenario, small.codebook, aside), rtol=1e-8)
+
+
+def test_the_scenario_of_the_tutorial_is_one():
+    scenario = Scenario.from_yaml(EXAMPLES / 'office.yaml')
+    assert scenario.n_elements == 64
+    assert scenario.center_frequencies_hz == (5.2e9, 5.8e9)
+
+
+def test_estimators_are_compared(tmp_path):
+    (tmp_path / 'my.yaml').write_text(
+        'n_subbands: 2\nn_frames: 2\nelements_per_side: 4\n'
+        'roi_center_m: [2.0, 0.0, 0.0]\nroi_size_m: [1.0, 1.0, 1.0]\n')
+    scenario = Scenario.from_yaml(tmp_path / 'my.yaml')
+    random_codebook(scenario, np.random.default_rng(0)).save(tmp_path / 'codebook.yaml')
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / 'compare_estimators.py', tmp_path / 'my.yaml',
+         tmp_path / 'codebook.yaml', 'ml'], capture_output=True, text=True, timeout=240,
+        check=False)
+    assert done.returncode == 0, done.stderr
+    name, error, unit = done.stdout.split()
+    assert (name, unit) == ('ml', 'm^2')
+    assert 0 < float(error) < 0.5

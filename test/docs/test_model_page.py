@@ -1,0 +1,48 @@
+"""The page of the model links every formula to the one function that implements it."""
+
+import ast
+import re
+from pathlib import Path
+
+import rhs_isac_ros
+
+ROOT = Path(rhs_isac_ros.__file__).parent
+PAGE = (Path(__file__).parents[2] / 'docs' / 'model.rst').read_text(encoding='utf-8')
+CLAIM = re.compile(r'(?:Implements )?(Eq\. \(\d+\)|Proposition \d+|Algorithm \d+)[.:]')
+
+
+def claims() -> dict[str, str]:
+    """Full names of what says that it implements something, by what that is."""
+    found = {}
+    for path in sorted(ROOT.rglob('*.py')):
+        module = '.'.join(('rhs_isac_ros', *path.relative_to(ROOT).with_suffix('').parts))
+        for node in ast.parse(path.read_text(encoding='utf-8')).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                first = (ast.get_docstring(node) or '').partition('\n')[0]
+                if first.startswith('Implements '):
+                    found[CLAIM.match(first)[1]] = f'{module}.{node.name}'
+    return found
+
+
+def links() -> dict[str, list[str]]:
+    """What the sections of the page link to after `Implemented by`, by their titles."""
+    found = {}
+    parts = re.split(r'^(\S.*)\n[-^=]{3,}$', PAGE, flags=re.MULTILINE)
+    for title, text in zip(parts[1::2], parts[2::2], strict=True):
+        named = re.findall(r'Implemented\s+by\s+:(?:func|class):`~([\w.]+)`', text)
+        claim = CLAIM.match(title)
+        if claim or named:
+            found[claim[1] if claim else title] = named
+    return found
+
+
+def test_each_formula_is_linked_to_its_function_and_to_no_other():
+    assert links() == {claim: [place] for claim, place in claims().items()}
+    assert len(claims()) == 21
+
+
+def test_each_formula_is_written_out():
+    parts = re.split(r'^(\S.*)\n[-^=]{3,}$', PAGE, flags=re.MULTILINE)
+    for title, text in zip(parts[1::2], parts[2::2], strict=True):
+        if CLAIM.match(title) and not title.startswith('Algorithm'):
+            assert '.. math::' in text, title

@@ -1,0 +1,139 @@
+"""The example of a radio in the place of the channel, in a network that serves a user with it."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.multipath import complex_normal
+from rhs_isac_ros.model.surface import combine, element_signals, feed_signals
+from rhs_isac_ros.nodes.bs import BsNode
+from rhs_isac_ros.nodes.optimizer import OptimizerNode
+from rhs_isac_ros.nodes.positioner import PositionerNode
+from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
+from rhs_isac_ros.nodes.transmission import TransmissionNode
+from rhs_isac_ros.nodes.user import UserNode
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import Send
+
+EXAMPLE = Path(__file__).parents[2] / 'docs' / 'examples' / 'radio_node.py'
+PLACE = [9.0, 1.0, 0.2]
+
+
+@pytest.fixture(scope='module')
+def example():
+    """The example as a module."""
+    spec = importlib.util.spec_from_file_location('radio_node', EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Hardware:
+    """Surface, user and receivers with noise of their own, in a room without scattering."""
+
+    def __init__(self, scenario):
+        self._scenario, self._rng = scenario, np.random.default_rng(8)
+        self.measured, self.carried = {}, []
+
+    def measure(self, band, configuration, pilot):
+        direct = los_gain(self._scenario, np.array([PLACE]), band)[0]
+        symbol = complex(pilot.symbol_re, pilot.symbol_im)
+        elements = element_signals(direct, np.zeros(1), symbol)
+        feeds = feed_signals(self._scenario, band, configuration, elements)
+        feeds += 1e-9 * complex_normal(feeds.shape, self._rng)
+        self.measured[pilot.cycle_id, band, pilot.frame] = feeds
+        return feeds
+
+    def carry(self, data):
+        self.carried.append(data.direction)
+        return data.bits // 2
+
+
+def test_a_network_serves_a_user_with_it(bench, example, small_files):
+    file = small_files / 'scenario.yaml'
+    scenario, codebook = Scenario.from_yaml(file), Codebook.load(small_files / 'first.yaml')
+    hardware = Hardware(scenario)
+
+    def add(kind, *arguments, **values):
+        values = {'scenario_file': str(file), **values}
+        return bench.add(kind, *arguments, parameter_overrides=[
+            Parameter(name, value=value) for name, value in values.items()])
+    add(OptimizerNode, codebook_file=str(small_files / 'first.yaml'))
+    add(RhsControllerNode)
+    add(PositionerNode, table_folder='')
+    add(TransmissionNode)
+    add(UserNode, position_m=PLACE)
+    add(BsNode, receiver_noise=False, rest_s=0.0)
+    add(lambda **options: example.RadioNode(hardware.measure, hardware.carry, **options))
+    ear = bench.add(Node, 'ear')
+    states = bench.hear(ear, m.ProtocolState)
+    received = bench.hear(ear, m.ReceivedSignals)
+    bench.until(lambda: any(state.outcome == 'served' for state in states), 'a served cycle')
+    cycle_id = next(state.cycle_id for state in states if state.outcome == 'served')
+    signals = next(r.signals for r in received if r.cycle_id == cycle_id)
+    # What the base station made of them is what was measured, combined, with nothing added.
+    feeds = np.array([[hardware.measured[cycle_id, band, frame]
+                       for frame in range(scenario.n_frames)]
+                      for band in range(scenario.n_bands)])
+    np.testing.assert_array_equal(
+        signals, combine(codebook.digital, np.swapaxes(feeds, 1, 2), 0.0))
+    assert hardware.carried[:2] == [m.Direction.DOWNLINK, m.Direction.UPLINK]
+
+
+@pytest.fixture
+def radio(example, small):
+    return example.Radio(lambda band, configuration, pilot: configuration[:2] * (1 + 0j),
+                         lambda data: 3.0)
+
+
+def configuration(cycle_id, band=0):
+    return m.RhsConfiguration(
+        cycle_id, m.Mode.POSITIONING, band, 'c', np.array([[0.1, 0.2], [0.3, 0.4]]))
+
+
+def pilot(cycle_id, frame=0, band=0):
+    return m.Pilot(cycle_id, 1, band, frame, 1.0, 0.0)
+
+
+def answers(radio, event):
+    actions = radio.handle(event, 0.0)
+    assert all(isinstance(action, Send) for action in actions)
+    return [action.message for action in actions]
+
+
+def test_pilots_that_overtake_their_configuration_wait_for_it(radio):
+    assert answers(radio, pilot(5, 0)) == []
+    assert answers(radio, pilot(5, 1)) == []
+    sent = answers(radio, configuration(5))
+    assert [(s.cycle_id, s.band, s.frame) for s in sent] == [(5, 0, 0), (5, 0, 1)]
+    np.testing.assert_array_equal(sent[1].signals, [0.3, 0.4])
+    assert answers(radio, pilot(5, 0, band=1)) == []
+    assert len(answers(radio, configuration(5, 1))) == 1
+
+
+def test_an_old_configuration_does_not_answer_a_new_cycle(radio):
+    answers(radio, configuration(5))
+    assert answers(radio, pilot(6)) == []
+    assert [s.cycle_id for s in answers(radio, configuration(6))] == [6]
+
+
+def test_what_nobody_can_answer_is_forgotten(radio):
+    for number in range(1000):
+        answers(radio, pilot(7, number))
+    assert len(radio._waiting) == 256
+
+
+def test_data_arrive_as_far_as_they_are_carried(radio):
+    offered = m.Data(5, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1e-3, 100.0)
+    (delivered,) = answers(radio, offered)
+    assert (delivered.stage, delivered.bits) == (m.Stage.DELIVERED, 3.0)
+    assert (delivered.cycle_id, delivered.user, delivered.direction) == (
+        5, 1, m.Direction.DOWNLINK)
+    assert answers(radio, delivered) == []
