@@ -24,7 +24,12 @@ def water_filling(gains: np.ndarray, power: float) -> np.ndarray:
         return np.full(len(gains), power / len(gains))
     floors = np.sort(1 / gains[useful])
     levels = (power + np.cumsum(floors)) / np.arange(1, len(floors) + 1)
-    level = levels[np.nonzero(levels > floors)[0][-1]]
+    (filled,) = np.nonzero(levels > floors)
     shares = np.zeros(len(gains))
+    if not len(filled):
+        # Gains so small that the power is lost in the rounding of the level.
+        shares[np.argmax(gains)] = power
+        return shares
+    level = levels[filled[-1]]
     shares[useful] = np.maximum(level - 1 / gains[useful], 0.0)
     return shares

@@ -90,3 +90,11 @@ def test_many_without_gain_get_nothing():
 @pytest.mark.parametrize('gains', [[0.0], [0.0] * 8, [-1e-20, 0.0]])
 def test_without_any_gain_the_power_is_still_used(gains):
     np.testing.assert_allclose(water_filling(np.array(gains), 3.0), 3.0 / len(gains))
+
+
+@pytest.mark.parametrize('gains', [[1e-15], [1e-15, 3e-15], [1e-200, 0.0, 1e-15]])
+def test_gains_of_rounding_alone_still_get_the_power(gains):
+    """A configuration that lets nothing through has such gains."""
+    shares = water_filling(np.array(gains), 1e-3)
+    assert shares.sum() == 1e-3
+    assert shares[np.argmax(gains)] == 1e-3
