@@ -44,9 +44,9 @@ def describe(group: str, name: str) -> str:
     str
         Group, name, object and package of every entry point of that name.
     """
-    return ' and '.join(
+    return ' and '.join(sorted(
         f'entry point {group}: {name} = {point.value} of {point.dist.name if point.dist else "?"}'
-        for point in metadata.entry_points(group=group, name=name))
+        for point in metadata.entry_points(group=group, name=name)))
 
 
 def load(group: str, name: str) -> Any:
