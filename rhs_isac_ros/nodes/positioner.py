@@ -16,6 +16,7 @@ from rhs_isac_ros.positioning import (
     ModelError,
     Network,
     NeuralEstimator,
+    file_options,
     make_estimator,
 )
 from rhs_isac_ros.positioning.store import default_folder
@@ -75,13 +76,8 @@ class PositionerNode(RoleNode):
 
     def _make(self, codebook: Codebook) -> Estimator:
         values = self.values
-        if values.estimator == NeuralEstimator.name:
-            options = {'model_file': values.model_file}
-        elif values.estimator not in ESTIMATORS:
-            options = {'model_file': values.model_file} if values.model_file else {}
-        else:
-            folder = Path(values.table_folder) if values.table_folder else default_folder()
-            options = {'table_folder': folder}
+        folder = Path(values.table_folder) if values.table_folder else default_folder()
+        options = file_options(values.estimator, folder, values.model_file)
         return make_estimator(values.estimator, self.scenario, codebook, **options)
 
     def perform(self, action: Action) -> None:

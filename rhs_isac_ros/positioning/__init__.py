@@ -1,6 +1,7 @@
 """Estimators of the user's position from the received signals."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
@@ -19,8 +20,8 @@ ESTIMATORS: Mapping[str, type] = {
 
 __all__ = [
     'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator', 'ModelError',
-    'Network', 'NeuralEstimator', 'SignalError', 'exhaustive_posterior', 'make_estimator',
-    'simulate_pairs', 'train',
+    'Network', 'NeuralEstimator', 'SignalError', 'exhaustive_posterior', 'file_options',
+    'make_estimator', 'simulate_pairs', 'train',
 ]
 
 
@@ -68,3 +69,25 @@ def make_estimator(
             f'{plugins.describe(plugins.ESTIMATORS, name)}: made {estimator!r}, expected an '
             'estimator, with a method estimate and a string name')
     return estimator
+
+
+def file_options(name: str, table_folder: Path, model_file: str | Path) -> dict[str, Any]:
+    """Choose the options of an estimator from the files that there are.
+
+    Parameters
+    ----------
+    name
+        Name of the estimator.
+    table_folder
+        Where tables are kept.
+    model_file
+        Trained model; empty if there is none.
+
+    Returns
+    -------
+    dict
+        Options for `make_estimator`: a plug-in gets the model if there is one, and nothing else.
+    """
+    if name == NeuralEstimator.name or (name not in ESTIMATORS and model_file):
+        return {'model_file': model_file}
+    return {'table_folder': table_folder} if name in ESTIMATORS else {}

@@ -1,13 +1,14 @@
 """Estimators of other packages."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.model import plugins
 from rhs_isac_ros.model.plugins import PluginError
-from rhs_isac_ros.positioning import Estimate, make_estimator
+from rhs_isac_ros.positioning import Estimate, file_options, make_estimator
 
 CODE = '''
 import numpy as np
@@ -70,3 +71,12 @@ def test_an_unknown_name_lists_all_that_are_there(small):
 def test_what_is_no_estimator_is_named(small, name, options, words):
     with pytest.raises(PluginError, match=f'entry point {plugins.ESTIMATORS}: {words}'):
         make_estimator(name, small.scenario, small.codebook, **options)
+
+
+@pytest.mark.parametrize(('name', 'model', 'options'), [
+    ('bayes', '', {'table_folder': Path('t')}), ('bayes', 'm', {'table_folder': Path('t')}),
+    ('ml', '', {'table_folder': Path('t')}), ('neural', '', {'model_file': ''}),
+    ('neural', 'm', {'model_file': 'm'}), ('centre', '', {}),
+    ('centre', 'm', {'model_file': 'm'})])
+def test_each_gets_the_files_that_it_can_use(name, model, options):
+    assert file_options(name, Path('t'), model) == options

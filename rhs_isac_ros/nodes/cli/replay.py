@@ -16,7 +16,13 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError, plugins
 from rhs_isac_ros.nodes.cli.republish import RepublishError, republish, root_of
-from rhs_isac_ros.positioning import ESTIMATORS, Estimator, ModelError, make_estimator
+from rhs_isac_ros.positioning import (
+    ESTIMATORS,
+    Estimator,
+    ModelError,
+    file_options,
+    make_estimator,
+)
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.cycle_log import RECEIVES, CycleLog, CycleRecord
@@ -146,7 +152,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(_row(f'live {", ".join(names)}', live))
         for name in options.estimator or ['bayes']:
             made = {key: make_estimator(
-                name, recording.scenario, codebook, **_files(name, options))
+                name, recording.scenario, codebook,
+                **file_options(name, default_folder(), options.model or ''))
                 for key, codebook in codebooks.items()}
             print(_row(name, errors_m(recording.cycles, made)))
     except (RecordingError, ScenarioError, CodebookError, ModelError, plugins.PluginError,
@@ -185,12 +192,6 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
     for codebook in chosen.values():
         codebook.check(recording.scenario)
     return chosen
-
-
-def _files(name: str, options: argparse.Namespace) -> dict[str, object]:
-    if name == 'neural':
-        return {'model_file': options.model or ''}
-    return {'table_folder': default_folder()}
 
 
 def _parser() -> argparse.ArgumentParser:

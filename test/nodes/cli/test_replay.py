@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, plugins
 from rhs_isac_ros.nodes.cli import record
 from rhs_isac_ros.nodes.cli.replay import errors_m, load, main
 from rhs_isac_ros.positioning import make_estimator
@@ -85,6 +85,14 @@ def test_errors_against_the_estimator_itself(run):
         fix = made[cycle.signals.codebook_id].estimate(cycle.signals.signals.reshape(2, -1))
         expected.append(np.sqrt(np.sum((fix.mean - cycle.truth.position)**2)))
     np.testing.assert_allclose(errors_m(recording.cycles, made), expected, rtol=1e-9)
+
+
+def test_an_estimator_of_another_package_is_asked_too(run, install, capsys):
+    install('guesses', 'from rhs_isac_ros.positioning import BayesEstimator as Mine',
+            {plugins.ESTIMATORS: {'mine': 'Mine'}})
+    assert main([str(run.path), '--estimator', 'mine']) == 0
+    found = rows(capsys.readouterr().out)
+    assert found['mine'] == found['live bayes']
 
 
 def test_another_codebook_is_assumed_with_a_word(run, random_beams, tmp_path, capsys):
