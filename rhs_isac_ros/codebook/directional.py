@@ -30,6 +30,11 @@ def directional_codebook(
     -------
     Codebook
         The codebook.
+
+    Raises
+    ------
+    ValueError
+        If a gain pattern of the scenario is blind where a beam is to focus.
     """
     sizes = scenario.sizes
     analog = np.empty([sizes[s] for s in ('N_B', 'F', 'N_E')])
@@ -39,6 +44,10 @@ def directional_codebook(
         for frame, los in enumerate(los_gain(scenario, points[:, band], band)):
             analog[band, frame] = matched_configuration(los, onboard)
             feeds = np.einsum('jkm,jm->jk', onboard, analog[band, frame] * los)
+            if not los.any():
+                raise ValueError(
+                    f'element_gain, user_gain: no gain at {points[frame, band].tolist()} m, '
+                    f'expected some where frame {frame} of band {band} is to focus')
             digital[band, :, frame] = np.conj(feeds) / np.linalg.norm(
                 feeds, axis=1, keepdims=True)
     return Codebook(analog, digital * np.sqrt(scenario.max_power_w / sizes['N_SB']),

@@ -179,7 +179,7 @@ def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        Float64 [N_E], from 0 to 1.
+        Float64 [N_E], from 0 to 1; the middle where there is no line of sight.
     """
     interference = np.einsum('jm,jkm->m', los, onboard).real
-    return (interference / np.abs(interference).max() + 1) / 2
+    return (interference / (np.abs(interference).max() or 1.0) + 1) / 2

@@ -11,6 +11,7 @@ from scipy.integrate import dblquad
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.bounds.fisher import factor
+from rhs_isac_ros.codebook import directional_codebook
 from rhs_isac_ros.link import capacity, steer
 from rhs_isac_ros.model import (
     SPEED_OF_LIGHT_MPS,
@@ -224,6 +225,20 @@ def test_beams_are_steered_with_the_pattern(scenario):
     rates = [capacity(scenario, steer(assumed, place), place[None])[0]
              for assumed in (scenario, isotropic)]
     assert rates[0] > 1.01 * rates[1]
+
+
+def test_where_a_pattern_is_blind_only_the_multipath_is_left(scenario, codebook):
+    """No position is told there, and a beam is still steered to what is scattered."""
+    blind = dataclasses.replace(scenario, user_gain=1.0, element_gain=lambda angles: np.where(
+        angles < 0.4, 1 + np.cos(angles * np.pi / 0.4), 0.0))
+    places = np.array([[1.1, 1.4, 0.9], [2.0, 0.1, 0.0]])
+    bounds = crlb(blind, codebook, places)
+    assert np.isinf(bounds[0])
+    assert np.isfinite(bounds[1])
+    rates = capacity(blind, steer(blind, places[0]), places)
+    assert (rates > 0).all()
+    with pytest.raises(ValueError, match=r'element_gain, user_gain: no gain at \[2.0, .*\] m'):
+        directional_codebook(blind)
 
 
 class TestIdentity:
