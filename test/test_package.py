@@ -1,6 +1,7 @@
 """package.xml names all that the package imports, so that rosdep can install it."""
 
 import ast
+import functools
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -27,6 +28,7 @@ PIP_ONLY = {
 OWN = {'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest'}
 
 
+@functools.cache
 def imported(folder):
     """Roots of the names that the modules of a folder import, and one module of each."""
     found = {}
