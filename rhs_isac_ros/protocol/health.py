@@ -173,8 +173,7 @@ class Health:
         if lacking:
             return Report(True, f'cannot work: {phase}', values)
         if new:
-            return Report(
-                True, f'{new} messages dropped, steps repeated or cycles given up', values)
+            return Report(True, f'{new} faults just now', values)
         return Report(False, 'no fault', values)
 
 

@@ -85,13 +85,14 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
     del allowed[f'{space}/operator']
 
     def used(path):
-        ask = watch.node
-        names = path.rpartition('/')[2], space
+        ask, name = watch.node, path.rpartition('/')[2]
+        if (name, space) not in ask.get_node_names_and_namespaces():
+            return {right: set() for right in RIGHTS}
         found = {
-            'publish': ask.get_publisher_names_and_types_by_node(*names),
-            'subscribe': ask.get_subscriber_names_and_types_by_node(*names),
-            'reply': ask.get_service_names_and_types_by_node(*names),
-            'request': ask.get_client_names_and_types_by_node(*names)}
+            'publish': ask.get_publisher_names_and_types_by_node(name, space),
+            'subscribe': ask.get_subscriber_names_and_types_by_node(name, space),
+            'reply': ask.get_service_names_and_types_by_node(name, space),
+            'request': ask.get_client_names_and_types_by_node(name, space)}
         return {right: {name for name, _ in pairs} for right, pairs in found.items()}
 
     # The last to listen does so for the first cycle; who does too much has done it by then.

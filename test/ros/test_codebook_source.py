@@ -1,5 +1,7 @@
 """How nodes get the codebook from the parameters of the optimizer."""
 
+import types
+
 import numpy as np
 import pytest
 from rclpy.node import Node
@@ -188,3 +190,14 @@ def test_an_optimizer_that_is_restarted_is_followed(bench, follow, optimizer_of,
     optimizer_of('second')
     bench.until(lambda: len(got) == 2, 'the codebook of the new optimizer')
     assert ids(got) == [stored['first'].id, stored['second'].id]
+
+
+def test_an_optimizer_in_the_same_process_is_never_taken_for_dead(bench, shipped):
+    """Fast DDS says that it is, once its lease is over."""
+    bench.add(OptimizerNode)
+    got, held = [], []
+    node = bench.add(Node, 'client')
+    source = CodebookSource(node, Scenario(), got.append, held.append)
+    bench.until(lambda: got, 'the codebook')
+    source._on_liveliness(types.SimpleNamespace(alive_count=0))
+    assert held == []
