@@ -1,6 +1,7 @@
 """Declaring what the fields of a message hold, and checking it."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -113,9 +114,10 @@ def check(message: Any, sizes: Mapping[str, int]) -> None:
         If a shape differs, an index is too high, or a number is not finite or out of its range;
         the text names message, field, value and what was expected.
     """
-    sizes = {**sizes, **message.own_sizes(sizes)}
-    for field in dataclasses.fields(message):
-        value, meta = getattr(message, field.name), field.metadata
+    own = message.own_sizes(sizes)
+    sizes = {**sizes, **own} if own else sizes
+    for name, meta in _fields(type(message)):
+        value = getattr(message, name)
         problem = ''
         if 'dims' in meta:
             problem = _array_problem(value, meta, sizes)
@@ -129,7 +131,13 @@ def check(message: Any, sizes: Mapping[str, int]) -> None:
         elif 'least' in meta and not meta['least'] <= value <= meta['most']:
             problem = f'{value}, expected {meta["least"]:g} to {meta["most"]:g}'
         if problem:
-            raise MessageError(f'{type(message).__name__}.{field.name}: {problem}')
+            raise MessageError(f'{type(message).__name__}.{name}: {problem}')
+
+
+@functools.cache
+def _fields(kind: type) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+    """Name and declaration of every field."""
+    return tuple((field.name, field.metadata) for field in dataclasses.fields(kind))
 
 
 def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[str, int]) -> str:

@@ -116,7 +116,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
                   -1e6, 1e6),
         Parameter('speed_mps', 1.0, 'Its speed, at most max_user_speed_mps of the scenario.',
                   'm/s', 0.0, 1e4),
-        Parameter('ground_truth_period_s', 0.1, 'How often it tells its true position.', 's',
+        Parameter('ground_truth_period_s', 0.5, 'How often it tells its true position.', 's',
                   0.01, 60.0),
         STEP_TIMEOUT,
         Parameter('beacon_timeout_s', 1.5, 'Without a beacon for so long, it says so.', 's', 0.1,

@@ -8,7 +8,9 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.timers import steady_timer
 
-_POLL_S = 0.1
+# How often it looks while somebody is missing, and while nobody is: a look takes half a
+# millisecond, which a crowd of users would spend all the time.
+_POLL_S, _CALM_POLL_S = 0.1, 1.0
 # Looks before the first complaint: at the start, everyone is still being discovered.
 _GRACE = 10
 
@@ -50,7 +52,7 @@ class PeerWatch:
         self._before: frozenset[str] = frozenset(needs)
         self._reported: tuple[str, ...] | None = None
         self._looks = 0
-        steady_timer(node, _POLL_S, self._look)
+        self._timer = steady_timer(node, _POLL_S, self._look)
 
     def _look(self) -> None:
         absent = frozenset(role for role, signs in self._needs.items() if not self._seen(signs))
@@ -61,6 +63,7 @@ class PeerWatch:
             return
         if missing != self._reported:
             self._reported = missing
+            self._timer.timer_period_ns = int(1e9 * (_POLL_S if missing else _CALM_POLL_S))
             self._on_change(missing)
 
     def _seen(self, signs: Signs) -> bool:

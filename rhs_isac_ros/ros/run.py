@@ -18,7 +18,7 @@ from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.resources import discovery_profile_file
 
 # The executor looks at least this often whether a signal has come.
-_POLL_S = 0.1
+_POLL_S = 0.5
 
 
 def find_each_other_quickly() -> None:
