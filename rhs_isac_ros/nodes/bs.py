@@ -2,6 +2,7 @@
 
 import sys
 import time
+import types
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,10 @@ from rhs_isac_ros.model import streams
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.bs import BaseStation
-from rhs_isac_ros.protocol.bs_table import timeouts
 from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged
-from rhs_isac_ros.protocol.gate import Gate, users_of
-from rhs_isac_ros.protocol.roster import Roster
+from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.ros import peers
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -32,29 +31,39 @@ class BsNode(RoleNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('bs', SENDS, **node_options)
         values = self.values
-        timeouts_s = timeouts(
-            values.ack_timeout_s, values.step_timeout_s, values.rest_s, values.retries)
-        roster = Roster(
-            values.policy, streams.generator(values.seed, streams.BASE_STATION))
+        rng = streams.generator(values.seed, streams.BASE_STATION)
         self.start(BaseStation(
-            self.scenario, roster, self._receive, timeouts_s, values.data_duration_s,
-            values.first_cycle or _number_from_the_clock(), self._gate(), values.retries),
-            RECEIVES)
+            self.scenario, self.settings(values), rng, self._receive,
+            values.first_cycle or _number_from_the_clock()), RECEIVES)
         self.follow_codebook(lambda codebook: self.tell(CodebookOffered(codebook)))
         self._peers = peers.PeerWatch(
             self, peers.OF_BASE_STATION, lambda missing: self.tell(PeersChanged(missing)))
 
-    def _gate(self) -> Gate:
-        try:
-            allowed = users_of(self.values.allowed_users)
-        except ValueError as error:
-            raise ParameterError(f'allowed_users: {error}') from None
-        return Gate(allowed, self.values.ack_rate_hz)
+    def settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
+        """Return how the base station is to work.
+
+        Parameters
+        ----------
+        values
+            The parameters, by name.
+
+        Returns
+        -------
+        BaseStationSettings
+            The settings.
+
+        Raises
+        ------
+        ParameterError
+            If ``allowed_users`` is no list of users.
+        """
+        return settings_of(BaseStationSettings, values)
 
     def _receive(
-            self, codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int) -> np.ndarray:
+            self, codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int,
+            noise: bool) -> np.ndarray:
         rng = None
-        if self.values.receiver_noise:
+        if noise:
             rng = streams.generator(self.values.seed, streams.RECEIVER, user, cycle_id)
         return receive_feeds(self.scenario, codebook, feeds, rng)
 

@@ -1,12 +1,14 @@
 """The executable ``channel``: the emulated world."""
 
 import sys
+import types
 from typing import Any
 
 from rhs_isac_ros.model import streams
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.impairments import Impaired, Impairments
+from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -20,13 +22,24 @@ class ChannelNode(RoleNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('channel', SENDS, **node_options)
         values = self.values
-        ideal = Channel(self.scenario, values.seed)
-        impairments = Impairments(
-            values.loss_probability, values.double_probability, values.delay_s, values.jitter_s)
         rng = streams.generator(values.seed, streams.AIR)
-        self.start(
-            ideal if impairments == Impairments() else Impaired(ideal, impairments, rng),
-            RECEIVES)
+        self.start(Impaired(
+            Channel(self.scenario, values.seed), self.settings(values), rng), RECEIVES)
+
+    def settings(self, values: types.SimpleNamespace) -> Impairments:
+        """Return what the air is to do to messages.
+
+        Parameters
+        ----------
+        values
+            The parameters, by name.
+
+        Returns
+        -------
+        Impairments
+            The settings.
+        """
+        return settings_of(Impairments, values)
 
 
 main = entry(lambda: [ChannelNode()])

@@ -1,8 +1,10 @@
 """The executable ``positioner``: estimates the user's position."""
 
+import dataclasses
 import functools
 import sys
 import time
+import types
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +31,10 @@ from rhs_isac_ros.protocol.events import (
     MakeEstimator,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
+from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import Background
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.parameters import ParameterError, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -44,41 +47,61 @@ class PositionerNode(RoleNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', SENDS, **node_options)
-        name = self.values.estimator
-        if name == NeuralEstimator.name:
-            self._check_model(self.values.model_file)
-        elif name not in ESTIMATORS:
-            self._check_plugin(name)
+        settings = self.settings(self.values)
         self._background = Background(self)
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
-        self.start(Positioner(self.scenario, time.perf_counter), ())
+        self.start(Positioner(self.scenario, time.perf_counter, settings), ())
         self.follow_codebook(lambda codebook: self.tell(CodebookOffered(codebook)))
 
-    @staticmethod
-    def _check_model(file: str) -> None:
-        """Refuse to start without a model; whether it fits a codebook shows later."""
-        if not file:
+    def settings(self, values: types.SimpleNamespace) -> PositionerSettings:
+        """Return which estimator to use; whether its model fits a codebook shows later.
+
+        Parameters
+        ----------
+        values
+            The parameters, by name.
+
+        Returns
+        -------
+        PositionerSettings
+            The settings.
+
+        Raises
+        ------
+        ParameterError
+            If the estimator needs a model and there is none, or it cannot be read.
+        """
+        settings = settings_of(PositionerSettings, values)
+        if settings.estimator not in ESTIMATORS:
+            self._check_plugin(settings.estimator)
+            return settings
+        if settings.estimator != NeuralEstimator.name:
+            # The file is kept as a parameter, and changes nothing.
+            return dataclasses.replace(settings, model_file='')
+        if not settings.model_file:
             raise ParameterError(
                 "model_file: '', expected a trained model for the estimator neural")
         try:
-            Network.load(file)
+            Network.load(settings.model_file)
         except ModelError as error:
             raise ParameterError(f'model_file: {error}') from None
+        return settings
 
     @staticmethod
     def _check_plugin(name: str) -> None:
-        """Refuse to start without the code; whether it works shows later."""
+        """Refuse a plug-in without its code; whether it works shows later."""
         try:
             plugins.load(plugins.ESTIMATORS, name)
         except plugins.PluginError as error:
             raise ParameterError(f'estimator: {error}') from None
 
-    def _make(self, codebook: Codebook) -> Estimator:
-        values = self.values
-        folder = Path(values.table_folder) if values.table_folder else default_folder()
-        options = file_options(values.estimator, folder, values.model_file)
-        return make_estimator(values.estimator, self.scenario, codebook, **options)
+    def _make(self, settings: PositionerSettings, codebook: Codebook) -> Estimator:
+        folder = self.values.table_folder
+        options = file_options(
+            settings.estimator, Path(folder) if folder else default_folder(),
+            settings.model_file)
+        return make_estimator(settings.estimator, self.scenario, codebook, **options)
 
     def perform(self, action: Action) -> None:
         """Make an estimator, in the background.
@@ -97,7 +120,8 @@ class PositionerNode(RoleNode):
             super().perform(action)
         self._background.run(
             functools.partial(
-                make_estimator_for, action.codebook, self._make, time.perf_counter),
+                make_estimator_for, action.codebook,
+                functools.partial(self._make, action.settings), time.perf_counter),
             self._on_estimator)
 
     def _on_estimator(self, event: EstimatorMade | EstimatorFailed) -> None:

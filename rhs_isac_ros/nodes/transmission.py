@@ -1,13 +1,15 @@
 """The executable ``transmission``: steers the beam and reports the capacity."""
 
 import sys
+import types
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
+from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.parameters import ParameterError, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -20,12 +22,32 @@ class TransmissionNode(RoleNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('transmission', (), **node_options)
-        band, n_bands = self.values.band, self.scenario.n_bands
-        if band >= n_bands:
-            raise ParameterError(
-                f'band: {band}, expected 0 to {n_bands - 1} of the scenario, or -1')
-        self.start(Transmission(self.scenario, None if band < 0 else band), ())
+        self.start(Transmission(self.scenario, self.settings(self.values)), ())
         self.follow_codebook(self._on_codebook)
+
+    def settings(self, values: types.SimpleNamespace) -> TransmissionSettings:
+        """Return which band to use.
+
+        Parameters
+        ----------
+        values
+            The parameters, by name.
+
+        Returns
+        -------
+        TransmissionSettings
+            The settings.
+
+        Raises
+        ------
+        ParameterError
+            If the scenario has no such band.
+        """
+        n_bands = self.scenario.n_bands
+        if values.band >= n_bands:
+            raise ParameterError(
+                f'band: {values.band}, expected 0 to {n_bands - 1} of the scenario, or -1')
+        return settings_of(TransmissionSettings, values)
 
     def _on_codebook(self, codebook: Codebook) -> None:
         self.tell(CodebookOffered(codebook))

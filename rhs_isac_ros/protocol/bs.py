@@ -7,7 +7,7 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.bs_table import STEPS, TABLE, Input, State
+from rhs_isac_ros.protocol.bs_table import STEPS, TABLE, Input, State, timeouts
 from rhs_isac_ros.protocol.complaints import Complaints
 from rhs_isac_ros.protocol.events import (
     Action,
@@ -16,12 +16,16 @@ from rhs_isac_ros.protocol.events import (
     Note,
     PeersChanged,
     Send,
+    SettingsOffered,
     Tick,
 )
-from rhs_isac_ros.protocol.gate import Gate
+from rhs_isac_ros.protocol.frames import Frames
+from rhs_isac_ros.protocol.gate import Gate, users_of
 from rhs_isac_ros.protocol.machine import Machine
 from rhs_isac_ros.protocol.phase_times import PhaseTimes
 from rhs_isac_ros.protocol.roster import Roster
+from rhs_isac_ros.protocol.settings import BaseStationSettings
+from rhs_isac_ros.protocol.standing import Standing
 
 
 class BaseStation(Machine):
@@ -31,47 +35,39 @@ class BaseStation(Machine):
     ----------
     scenario
         The scenario.
-    roster
-        Whom it knows and selects.
+    settings
+        How it works, until others are offered.
+    rng
+        Source of randomness, to select users with.
     receiver
-        Function of (codebook, feeds [N_B, F, N_SB, K], user, cycle_id) that returns the received
-        signals, complex128 [N_B, N_SB, F].
-    timeouts_s
-        Time-outs by state; at least RESTING, the pause between cycles.
-    data_duration_s
-        How long each direction transmits data [s].
+        Function of (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether with noise) that
+        returns the received signals, complex128 [N_B, N_SB, F].
     first_cycle_id
         Number of the first cycle. One that starts anew must repeat no number of its former life:
         what is still on its way would be taken for its own.
-    gate
-        Whose acks it takes; by default all.
-    retries
-        How often a step of a cycle is asked for again, before the cycle is given up.
     """
 
     TABLE = TABLE
     LACKING = frozenset({State.WAITING})
 
     def __init__(
-            self, scenario: Scenario, roster: Roster,
-            receiver: Callable[[Codebook, np.ndarray, int, int], np.ndarray],
-            timeouts_s: Mapping[State, float], data_duration_s: float,
-            first_cycle_id: int = 1, gate: Gate | None = None, retries: int = 0) -> None:
-        super().__init__(State.WAITING, timeouts_s)
-        self._scenario, self._roster, self._receiver = scenario, roster, receiver
-        self._data_duration_s = data_duration_s
-        self._gate, self._retries = gate or Gate(), retries
+            self, scenario: Scenario, settings: BaseStationSettings, rng: np.random.Generator,
+            receiver: Callable[[Codebook, np.ndarray, int, int, bool], np.ndarray],
+            first_cycle_id: int = 1) -> None:
+        super().__init__(State.WAITING, {})
+        self._scenario, self._receiver = scenario, receiver
+        self._roster = Roster(settings.policy, rng)
+        self._settings = Standing(settings)
+        self._use(settings)
         self._refusal = ''
         self._codebook: Codebook | None = None
         self._offered: Codebook | None = None
         self._missing: tuple[str, ...] | None = None
-        self._complaint = ''
         self._complaints, self._times = Complaints(), PhaseTimes()
         self._cycle_id = first_cycle_id - 1
         self._attempt = 0
-        self._user = 0
-        self._band = 0
-        self._frames: dict[tuple[int, int], np.ndarray] = {}
+        self._user, self._band = 0, 0
+        self._frames = Frames(scenario.sizes)
         self._received: m.ReceivedSignals | None = None
         self._beam: m.Beam | None = None
         self._applied = False
@@ -95,6 +91,16 @@ class BaseStation(Machine):
             self._refusal = self._gate.refusal(event.user, now_s)
         return super().handle(event, now_s)
 
+    def standing(self) -> Mapping[str, str]:
+        """Return the settings and the codebook in use, and the settings that wait.
+
+        Returns
+        -------
+        Mapping
+            Values by name.
+        """
+        return self._settings.tell() | {'codebook_id': self._codebook_id}
+
     def _classify(self, event: Event) -> Input:
         match event:
             case Tick():
@@ -103,6 +109,8 @@ class BaseStation(Machine):
                 waiting = self.state is State.WAITING
                 ready = Input.READY if self._missing == () else Input.NOT_READY
                 return ready if waiting else Input.CODEBOOK
+            case SettingsOffered():
+                return Input.SETTINGS
             case PeersChanged(missing):
                 waiting = self.state is State.WAITING
                 ready = Input.NOT_READY if missing or not self._offered else Input.READY
@@ -138,7 +146,7 @@ class BaseStation(Machine):
         idle = self.state in (State.RESTING, State.BEACONING)
         if idle and (self._missing or not self._offered):
             return Input.NOT_READY
-        again = self.state in STEPS and self.repeats < self._retries
+        again = self.state in STEPS and self.repeats < self._settings.in_use.retries
         return Input.RETRY if again else Input.TIMEOUT
 
     def _classify_ack(self, ack: m.Ack) -> Input:
@@ -164,13 +172,11 @@ class BaseStation(Machine):
     def _classify_frame(self, feeds: m.FeedSignals) -> Input:
         if feeds.band != self._band:
             return Input.WRONG_BAND
-        if (feeds.band, feeds.frame) in self._frames:
+        if feeds in self._frames:
             return Input.DUPLICATE
-        sizes = self._scenario.sizes
-        missing = (self._band + 1) * sizes['F'] - len(self._frames) - 1
-        if missing:
+        if self._frames.missing(self._band) > 1:
             return Input.FRAME
-        return Input.LAST_FRAME if self._band + 1 == sizes['N_B'] else Input.LAST_FRAME_OF_BAND
+        return Input.LAST_FRAME_OF_BAND if self._frames.missing() > 1 else Input.LAST_FRAME
 
     @property
     def _codebook_id(self) -> str:
@@ -182,23 +188,34 @@ class BaseStation(Machine):
         else:
             self._offered = event.codebook
 
+    def _keep_settings(self, event: SettingsOffered, now_s: float) -> None:
+        self._settings.newest = event.settings
+
+    def _settle(self, event: Event, now_s: float) -> list[Action]:
+        # Between two cycles, or before anybody was granted one.
+        notes = self._settings.settle()
+        if notes:
+            self._use(self._settings.in_use)
+        return notes
+
+    def _use(self, settings: BaseStationSettings) -> None:
+        self._roster.follow(settings.policy)
+        self._gate = Gate(users_of(settings.allowed_users), settings.ack_rate_hz)
+        self._timeouts_s = timeouts(settings)
+
     def _complain(self, event: Event, now_s: float) -> list[Action]:
         if self._missing is None:
             return []
-        needs = [*self._missing, *([] if self._offered else ['codebook'])]
-        complaint = f'waiting for {", ".join(needs)}'
-        if complaint == self._complaint:
-            return []
-        self._complaint = complaint
-        return [Note(complaint, warning=True)]
+        return self._complaints.waiting(
+            [*self._missing, *([] if self._offered else ['codebook'])])
 
     def _begin_cycle(self, event: Event, now_s: float) -> list[Action]:
         self._codebook = self._offered
-        self._complaint = ''
+        self._complaints.begun()
         self._cycle_id += 1
         self._attempt = 0
         self._user, self._band = 0, 0
-        self._frames, self._beam, self._applied = {}, None, False
+        self._frames, self._beam, self._applied = Frames(self._scenario.sizes), None, False
         self._roster.open()
         return self._beacon(now_s)
 
@@ -241,13 +258,11 @@ class BaseStation(Machine):
             self._cycle_id, self._user, self._band, self._scenario.n_frames))]
 
     def _keep_frame(self, event: m.FeedSignals, now_s: float) -> None:
-        self._frames[event.band, event.frame] = event.signals
+        self._frames.keep(event)
 
     def _deliver(self, event: Event, now_s: float) -> list[Action]:
-        sizes = self._scenario.sizes
-        feeds = np.stack([[self._frames[band, frame] for frame in range(sizes['F'])]
-                          for band in range(sizes['N_B'])])
-        signals = self._receiver(self._codebook, feeds, self._user, self._cycle_id)
+        signals = self._receiver(self._codebook, self._frames.stack(), self._user,
+                                 self._cycle_id, self._settings.in_use.receiver_noise)
         self._received = m.ReceivedSignals(
             self._cycle_id, self._user, self._codebook_id, signals)
         return [Send(self._received), *self._announce(m.Phase.ESTIMATING, now_s)]
@@ -266,9 +281,10 @@ class BaseStation(Machine):
         return [*self._offer_again(event, now_s), *self._announce(m.Phase.TRANSMITTING, now_s)]
 
     def _offer_again(self, event: Event, now_s: float) -> list[Action]:
-        bits = self._beam.expected_bps * self._data_duration_s // 1
+        duration_s = self._settings.in_use.data_duration_s
+        bits = self._beam.expected_bps * duration_s // 1
         return [Send(m.Data(self._cycle_id, self._user, m.Direction.DOWNLINK, m.Stage.OFFERED,
-                            self._data_duration_s, bits))]
+                            duration_s, bits))]
 
     def _forget_user(self, event: Event, now_s: float) -> None:
         self._roster.forget(self._user)
@@ -276,11 +292,13 @@ class BaseStation(Machine):
     def _abandon(self, event: Event, now_s: float) -> list[Action]:
         reason = TABLE[self.state, self._classify(event)].counts
         return [Send(self._times.end(reason, self._cycle_id, self._user, now_s)),
-                *self._complaints.given_up(self._cycle_id, self._user, reason)]
+                *self._complaints.given_up(self._cycle_id, self._user, reason),
+                *self._settle(event, now_s)]
 
     def _finish(self, event: Event, now_s: float) -> list[Action]:
         return [Send(self._times.end('served', self._cycle_id, self._user, now_s)),
-                *self._complaints.served(self._cycle_id, self._user)]
+                *self._complaints.served(self._cycle_id, self._user),
+                *self._settle(event, now_s)]
 
     def _announce(self, phase: m.Phase, now_s: float) -> list[Action]:
         return [Send(self._times.begin(phase, self._cycle_id, self._user, now_s))]

@@ -4,6 +4,7 @@ import enum
 from collections.abc import Mapping
 
 from rhs_isac_ros.protocol.machine import ANY, SAME, Step
+from rhs_isac_ros.protocol.settings import BaseStationSettings
 
 
 class State(enum.Enum):
@@ -25,6 +26,7 @@ class Input(enum.Enum):
     READY = 'ready'
     NOT_READY = 'not_ready'
     CODEBOOK = 'codebook'
+    SETTINGS = 'settings'
     PEERS = 'peers'
     RETRY = 'retry'
     TIMEOUT = 'timeout'
@@ -57,28 +59,22 @@ class Input(enum.Enum):
 STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
 
 
-def timeouts(
-        ack_s: float, step_s: float, rest_s: float, retries: int = 0) -> dict[State, float]:
+def timeouts(settings: BaseStationSettings) -> dict[State, float]:
     """Return the time-outs of the base station.
 
     Parameters
     ----------
-    ack_s
-        How long to wait for acks [s].
-    step_s
-        How long to wait for the next message of a cycle [s].
-    rest_s
-        Pause between cycles [s].
-    retries
-        How often a step is asked for again within its time.
+    settings
+        How it works.
 
     Returns
     -------
     dict
         Time-outs by state [s].
     """
-    return {State.RESTING: rest_s, State.BEACONING: ack_s,
-            **dict.fromkeys(STEPS, step_s / (retries + 1))}
+    patience_s = settings.step_timeout_s / (settings.retries + 1)
+    return {State.RESTING: settings.rest_s, State.BEACONING: settings.ack_timeout_s,
+            **dict.fromkeys(STEPS, patience_s)}
 
 
 S, I = State, Input  # noqa: E741
@@ -90,6 +86,10 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (S.RESTING, I.TIMEOUT): Step(S.BEACONING, ('begin_cycle',)),
     (S.RESTING, I.NOT_READY): Step(S.WAITING, ('complain',)),
     (ANY, I.CODEBOOK): Step(SAME, ('keep',)),
+    # Settings hold from the end of the present cycle on.
+    (S.WAITING, I.SETTINGS): Step(SAME, ('keep_settings', 'settle')),
+    (S.RESTING, I.SETTINGS): Step(SAME, ('keep_settings', 'settle'), rearm=True),
+    (ANY, I.SETTINGS): Step(SAME, ('keep_settings',)),
     (ANY, I.PEERS): Step(SAME, ('keep',)),
     # Beaconing.
     (S.BEACONING, I.ACK): Step(SAME, ('note_ack',)),
@@ -98,7 +98,8 @@ TABLE: Mapping[tuple[State | None, Input], Step] = {
     (S.BEACONING, I.WINDOW_OVER): Step(
         S.CONFIGURING, ('grant', 'command_band', 'announce_positioning')),
     (S.BEACONING, I.NOT_READY): Step(S.WAITING, ('complain',)),
-    (S.BEACONING, I.TIMEOUT): Step(SAME, ('beacon_again',), counts='unanswered', rearm=True),
+    (S.BEACONING, I.TIMEOUT): Step(
+        SAME, ('settle', 'beacon_again'), counts='unanswered', rearm=True),
     (ANY, I.LATE_ACK): Step(SAME, ('welcome',), counts='late_ack'),
     # Positioning.
     (S.CONFIGURING, I.CONFIGURED): Step(S.SOUNDING, ('request_pilots',)),

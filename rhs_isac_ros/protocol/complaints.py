@@ -1,5 +1,7 @@
 """Saying once what is amiss, and once that it is mended."""
 
+from collections.abc import Iterable
+
 from rhs_isac_ros.protocol.events import Note
 
 # The reason that concerns one user; all others concern the network.
@@ -7,13 +9,37 @@ _OF_A_USER = 'user_gone'
 
 
 class Complaints:
-    """Why cycles are given up, each reason told once until a cycle is served.
+    """Why no cycle begins, and why cycles are given up, each reason told once.
 
-    That a user is gone is mended by serving that user, all else by serving anybody.
+    What is waited for is told again after a cycle has begun, why one was given up after one was
+    served. That a user is gone is mended by serving that user, all else by serving anybody.
     """
 
     def __init__(self) -> None:
         self._open: set[tuple[str, int]] = set()
+        self._needs: tuple[str, ...] = ()
+
+    def waiting(self, needs: Iterable[str]) -> list[Note]:
+        """Enter that no cycle can begin.
+
+        Parameters
+        ----------
+        needs
+            What it takes.
+
+        Returns
+        -------
+        list of Note
+            A warning, unless the same was said already.
+        """
+        said, self._needs = self._needs, tuple(needs)
+        if self._needs == said:
+            return []
+        return [Note(f'waiting for {", ".join(self._needs)}', warning=True)]
+
+    def begun(self) -> None:
+        """Enter that a cycle has begun."""
+        self._needs = ()
 
     def given_up(self, cycle_id: int, user: int, reason: str) -> list[Note]:
         """Enter a cycle that was given up.

@@ -1,10 +1,12 @@
 """What a role is told, besides messages, and what it asks for."""
 
 import dataclasses
+from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import Estimator
 from rhs_isac_ros.protocol.messages import Message
+from rhs_isac_ros.protocol.settings import PositionerSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,6 +19,13 @@ class CodebookOffered:
     """A codebook is to be used from the next cycle on."""
 
     codebook: Codebook
+
+
+@dataclasses.dataclass(frozen=True)
+class SettingsOffered:
+    """Other settings, of the class that the role has, are to be used from the next cycle on."""
+
+    settings: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +52,8 @@ class EstimatorFailed:
     reason: str
 
 
-Event = Message | Tick | CodebookOffered | PeersChanged | EstimatorMade | EstimatorFailed
+Event = (Message | Tick | CodebookOffered | SettingsOffered | PeersChanged | EstimatorMade
+         | EstimatorFailed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +76,14 @@ class MakeEstimator:
     """Make an estimator for a codebook, meanwhile, and answer with one of two events."""
 
     codebook: Codebook
+    settings: PositionerSettings
 
 
-Action = Send | Note | MakeEstimator
+@dataclasses.dataclass(frozen=True)
+class SettingsKept:
+    """What was offered last cannot be used: parameters are to tell these settings again."""
+
+    settings: Any
+
+
+Action = Send | Note | MakeEstimator | SettingsKept

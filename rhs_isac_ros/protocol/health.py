@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import types
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -44,9 +45,10 @@ class Report:
     summary
         The same in words.
     values
-        Everything by name: ``phase``, ``codebook_id``, ``cycles.<outcome>``,
-        ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``, ``received.<message>``,
-        ``sent.<message>`` and percentiles such as ``handling_ms.p95``.
+        Everything by name: ``phase``, ``codebook_id``, ``parameter.<name>`` in use,
+        ``pending.<name>`` that waits, ``failed.<name>`` that came to nothing,
+        ``cycles.<outcome>``, ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``,
+        ``received.<message>``, ``sent.<message>`` and percentiles such as ``handling_ms.p95``.
     """
 
     fault: bool
@@ -128,11 +130,20 @@ class Health:
                 if self._began_s is not None:
                     self._add('cycle_ms', now_s - self._began_s)
 
+    def _codebooks(self, in_use: str) -> dict[str, str]:
+        """Tell the codebook in use, or the one to begin with, and the one that waits."""
+        if not self._codebook_id:
+            return {}
+        if in_use in ('', self._codebook_id):
+            return {'codebook_id': self._codebook_id}
+        return {'codebook_id': in_use, 'pending.codebook_id': self._codebook_id}
+
     def _add(self, name: str, duration_s: float) -> None:
         self._durations_s.setdefault(name, collections.deque(maxlen=_NEWEST)).append(duration_s)
 
     def report(
-            self, phase: str, counters: Mapping[str, int], lacking: bool = False) -> Report:
+            self, phase: str, counters: Mapping[str, int], lacking: bool = False,
+            standing: Mapping[str, str] = types.MappingProxyType({})) -> Report:
         """Tell how the role fares; what is new is what came after the last call.
 
         Parameters
@@ -143,6 +154,8 @@ class Health:
             What it has counted, by reason.
         lacking
             Whether it misses something in this state.
+        standing
+            What it has in use and what waits, by name.
 
         Returns
         -------
@@ -152,8 +165,8 @@ class Health:
         values: dict[str, str] = {}
         if phase:
             values['phase'] = phase
-        if self._codebook_id:
-            values['codebook_id'] = self._codebook_id
+        values |= self._codebooks(standing.get('codebook_id', ''))
+        values |= {name: value for name, value in standing.items() if name != 'codebook_id'}
         if self._served:
             values['cycles.served'] = str(self._served)
         for reason, n in sorted(counters.items()):

@@ -3,11 +3,14 @@
 import dataclasses
 import heapq
 import itertools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.protocol.events import Action, Event, Send, Tick
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Tick
+from rhs_isac_ros.protocol.standing import Standing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,14 +36,16 @@ class Impairments:
 
 
 class Impaired:
-    """A role whose messages go through an air that is not ideal.
+    """A channel whose messages go through an air that need not be ideal.
+
+    Other impairments hold from the true position on with which the next cycle begins.
 
     Parameters
     ----------
     role
         The role, one without deadlines of its own.
     impairments
-        What happens to its messages.
+        What happens to its messages, until others are offered.
     rng
         Source of randomness.
 
@@ -51,7 +56,8 @@ class Impaired:
     """
 
     def __init__(self, role: Any, impairments: Impairments, rng: np.random.Generator) -> None:
-        self._role, self._impairments, self._rng = role, impairments, rng
+        self._role, self._settings, self._rng = role, Standing(impairments), rng
+        self._cycle_id = 0
         self.counters = role.counters
         self._serial = itertools.count()
         self._on_the_way: list[tuple[float, int, Send]] = []
@@ -71,8 +77,16 @@ class Impaired:
         list of Action
             What arrives.
         """
-        actions = [] if isinstance(event, Tick) else self._role.handle(event, now_s)
         arriving: list[Action] = []
+        actions: list[Action] = []
+        match event:
+            case Tick():
+                pass
+            case SettingsOffered(impairments):
+                self._settings.newest = impairments
+            case _:
+                arriving += self._begin(event)
+                actions = self._role.handle(event, now_s)
         for action in actions:
             if isinstance(action, Send):
                 self._send(action, now_s)
@@ -81,6 +95,16 @@ class Impaired:
         while self._on_the_way and self._on_the_way[0][0] <= now_s:
             arriving.append(heapq.heappop(self._on_the_way)[2])
         return arriving
+
+    def standing(self) -> Mapping[str, str]:
+        """Return the impairments in use, and those that wait.
+
+        Returns
+        -------
+        Mapping
+            Values by name.
+        """
+        return self._settings.tell()
 
     def next_deadline(self) -> float | None:
         """Return when the next message arrives.
@@ -92,8 +116,14 @@ class Impaired:
         """
         return self._on_the_way[0][0] if self._on_the_way else None
 
+    def _begin(self, event: Event) -> list[Action]:
+        if not isinstance(event, m.GroundTruth) or event.cycle_id in (0, self._cycle_id):
+            return []
+        self._cycle_id = event.cycle_id
+        return self._settings.settle()
+
     def _send(self, action: Send, now_s: float) -> None:
-        what = self._impairments
+        what = self._settings.in_use
         # All draws for every message: none depends on the fate of another one.
         lost, doubled, *late = self._rng.random(4)
         if lost < what.loss_probability:

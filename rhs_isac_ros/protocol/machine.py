@@ -114,5 +114,16 @@ class Machine:
         """
         return self._deadline_s
 
+    def standing(self) -> Mapping[str, str]:
+        """Return what is in use and what waits, for the diagnostics.
+
+        Returns
+        -------
+        Mapping
+            Values by name, such as ``parameter.policy`` and ``pending.policy``, and the
+            ``codebook_id`` in use; empty if all of that is fixed.
+        """
+        return {}
+
     def _classify(self, event: Event) -> enum.Enum:
         raise NotImplementedError

@@ -1,6 +1,7 @@
 """The positioner: turns received signals into a position."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +19,32 @@ from rhs_isac_ros.protocol.events import (
     MakeEstimator,
     Note,
     Send,
+    SettingsKept,
+    SettingsOffered,
 )
 from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.protocol.shelf import Shelf
+from rhs_isac_ros.protocol.standing import Standing
+
+
+class _Job(NamedTuple):
+    """An estimator to make."""
+
+    codebook: Codebook
+    settings: PositionerSettings
+
+    def is_as(self, other: '_Job | None') -> bool:
+        return other is not None and (self.codebook.id, self.settings) == (
+            other.codebook.id, other.settings)
+
+
+class _Made(NamedTuple):
+    """An estimator, what it was made of, and what tells its bound."""
+
+    job: _Job
+    factors: Factors
+    estimator: Estimator
 
 
 class Positioner(PlainRole):
@@ -28,7 +52,9 @@ class Positioner(PlainRole):
 
     The received signals tell with which of the codebooks that it knows they were taken. An
     estimator takes its time to make: one is made at a time, those for other codebooks serve
-    meanwhile, and the newest signals of its own codebook wait for it.
+    meanwhile, and the newest signals of its own codebook wait for it. Where there is one for the
+    same codebook, with other settings, that one serves until the new one is ready, and stays
+    where none can be made.
 
     Parameters
     ----------
@@ -36,15 +62,23 @@ class Positioner(PlainRole):
         The scenario.
     stopwatch
         Function that returns a time [s], to measure the estimators with.
+    settings
+        Which estimator to use, until others are offered; by default the usual one.
     """
 
-    def __init__(self, scenario: Scenario, stopwatch: Callable[[], float]) -> None:
+    def __init__(
+            self, scenario: Scenario, stopwatch: Callable[[], float],
+            settings: PositionerSettings | None = None) -> None:
         super().__init__()
         self._scenario, self._stopwatch = scenario, stopwatch
-        self._estimators: Shelf[tuple[Codebook, Factors, Estimator]] = Shelf()
-        # The codebook whose estimator is being made, and the newest one offered since.
-        self._making: Codebook | None = None
-        self._next: Codebook | None = None
+        self._settings = Standing(settings or PositionerSettings())
+        # Why the last change of settings came to nothing, if it did.
+        self._failure = ''
+        self._estimators: Shelf[_Made] = Shelf()
+        self._codebook: Codebook | None = None
+        # The estimator that is being made, and the newest one wanted since.
+        self._making: _Job | None = None
+        self._next: _Job | None = None
         self._waiting: m.ReceivedSignals | None = None
         # Whether the last signals told no position: said once in a row.
         self._is_lost = False
@@ -52,7 +86,7 @@ class Positioner(PlainRole):
         self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Take a codebook, an estimator for one, or received signals.
+        """Take a codebook, settings, an estimator, or received signals.
 
         Parameters
         ----------
@@ -68,29 +102,74 @@ class Positioner(PlainRole):
         """
         match event:
             case CodebookOffered(codebook):
-                return self._want(codebook)
+                self._codebook = codebook
+                return self._want(_Job(codebook, self._settings.newest))
+            case SettingsOffered(settings):
+                return self._take_settings(settings)
             case EstimatorMade(codebook, estimator, elapsed_s):
-                factors = factor(self._scenario, codebook)
-                self._estimators.put(codebook.id, (codebook, factors, estimator))
-                note = Note(f'{estimator.name} is ready for codebook {codebook.id} after '
-                            f'{elapsed_s:.1f} s')
-                return [note, *self._go_on()]
+                return [*self._keep(self._job_of(codebook), estimator, elapsed_s),
+                        *self._go_on()]
             case EstimatorFailed(codebook, reason):
-                note = Note(f'no estimator for codebook {codebook.id}: {reason}', warning=True)
-                return [note, *self._go_on()]
+                return [*self._do_without(self._job_of(codebook), reason), *self._go_on()]
             case m.ReceivedSignals():
                 return self._receive(event)
         return []
 
-    def _want(self, codebook: Codebook) -> list[Action]:
-        if codebook.id in self._estimators:
+    def standing(self) -> Mapping[str, str]:
+        """Return the settings and the codebook in use, those that wait, and what failed.
+
+        Returns
+        -------
+        Mapping
+            Values by name.
+        """
+        failed = {'failed.estimator': self._failure} if self._failure else {}
+        return self._settings.tell() | failed | {'codebook_id': self._estimators.in_use}
+
+    def _take_settings(self, settings: PositionerSettings) -> list[Action]:
+        self._settings.newest, self._failure = settings, ''
+        if self._codebook is None:
+            return self._settings.settle()
+        return self._want(_Job(self._codebook, settings))
+
+    def _want(self, job: _Job) -> list[Action]:
+        made = self._estimators.peek(job.codebook.id)
+        if made and job.is_as(made.job):
             self._next = None
             return []
         if self._making is not None:
-            self._next = codebook if codebook.id != self._making.id else None
+            self._next = None if job.is_as(self._making) else job
             return []
-        self._making = codebook
-        return [MakeEstimator(codebook)]
+        self._making = job
+        return [MakeEstimator(job.codebook, job.settings)]
+
+    def _job_of(self, codebook: Codebook) -> _Job:
+        return self._making or _Job(codebook, self._settings.newest)
+
+    def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> list[Action]:
+        """Use an estimator from the next signals on, unless another one is wanted by now."""
+        codebook = job.codebook
+        is_wanted = job.settings == self._settings.newest
+        if not is_wanted and codebook.id in self._estimators:
+            return []
+        self._estimators.put(codebook.id, _Made(job, factor(self._scenario, codebook), estimator))
+        self._settings.in_use = job.settings
+        return [Note(f'{estimator.name} is ready for codebook {codebook.id} after '
+                     f'{elapsed_s:.1f} s')]
+
+    def _do_without(self, job: _Job, reason: str) -> list[Action]:
+        """Stay with the settings in use if others were the reason that nothing was made."""
+        kept = self._settings.in_use
+        if job.settings == kept:
+            return [Note(f'no estimator for codebook {job.codebook.id}: {reason}', warning=True)]
+        if job.settings != self._settings.newest:
+            return []
+        self._settings.newest = kept
+        self._failure = f'{job.settings.estimator}: {reason}'
+        # Whichever codebook is wanted by now, it is wanted with the settings in use.
+        self._next = _Job((self._next or job).codebook, kept)
+        return [Note(f'estimator {job.settings.estimator} not used, {kept.estimator} stays: '
+                     f'{reason}', warning=True), SettingsKept(kept)]
 
     def _go_on(self) -> list[Action]:
         """After an estimator was made: the signals that waited for it, and the next one."""
@@ -106,7 +185,7 @@ class Positioner(PlainRole):
         if received.codebook_id in self._estimators:
             self._answered = received, self._locate(received)
             return self._answered[1]
-        coming = {codebook.id for codebook in (self._making, self._next) if codebook}
+        coming = {job.codebook.id for job in (self._making, self._next) if job}
         if received.codebook_id in coming:
             self._waiting = received
         else:
@@ -114,7 +193,7 @@ class Positioner(PlainRole):
         return []
 
     def _locate(self, received: m.ReceivedSignals) -> list[Action]:
-        codebook, factors, estimator = self._estimators.take(received.codebook_id)
+        job, factors, estimator = self._estimators.take(received.codebook_id)
         begin = self._stopwatch()
         signals = received.signals.reshape(len(received.signals), -1)
         try:
@@ -125,7 +204,7 @@ class Positioner(PlainRole):
         if not estimate.fix:
             return self._no_fix(received, estimate.reason)
         self._is_lost = False
-        bound = float(crlb(self._scenario, codebook, estimate.mean[None], factors)[0])
+        bound = float(crlb(self._scenario, job.codebook, estimate.mean[None], factors)[0])
         return [Send(m.PositionEstimate(
             received.cycle_id, received.user, received.codebook_id,
             np.array(estimate.mean), np.array(estimate.covariance), bound, estimator.name,

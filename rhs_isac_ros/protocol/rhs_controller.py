@@ -71,6 +71,16 @@ class RhsController(Machine):
         # Said once until a command is obeyed.
         self._has_complained = False
 
+    def standing(self) -> Mapping[str, str]:
+        """Return the codebook in use.
+
+        Returns
+        -------
+        Mapping
+            Values by name.
+        """
+        return {'codebook_id': self._codebooks.in_use}
+
     def _classify(self, event: Event) -> Input:
         match event:
             case CodebookOffered():

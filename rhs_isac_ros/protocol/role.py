@@ -1,6 +1,7 @@
 """What the roles without a state machine have in common."""
 
 import collections
+from collections.abc import Mapping
 
 
 class PlainRole:
@@ -14,6 +15,17 @@ class PlainRole:
 
     def __init__(self) -> None:
         self.counters: collections.Counter[str] = collections.Counter()
+
+    def standing(self) -> Mapping[str, str]:
+        """Return what is in use and what waits, for the diagnostics.
+
+        Returns
+        -------
+        Mapping
+            Values by name, such as ``parameter.estimator`` and ``pending.estimator``, and the
+            ``codebook_id`` in use; empty if all of that is fixed.
+        """
+        return {}
 
     def next_deadline(self) -> float | None:
         """Return when the role wants a `Tick`: never.

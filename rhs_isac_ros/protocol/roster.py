@@ -26,14 +26,30 @@ class Roster:
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
-        if policy not in POLICIES:
-            raise ValueError(f'policy: {policy!r}, expected one of {list(POLICIES)}')
-        self._policy, self._rng = policy, rng
+        self._rng = rng
+        self.follow(policy)
         # The turn in which a user was served last, 1, or after which it came, 0.
         self._served: dict[int, tuple[int, int]] = {}
         self._missed: dict[int, int] = {}
         self._turn = 0
         self.answered: list[int] = []
+
+    def follow(self, policy: str) -> None:
+        """Select by a policy from now on; who was served when stays known.
+
+        Parameters
+        ----------
+        policy
+            The policy.
+
+        Raises
+        ------
+        ValueError
+            If there is no such policy.
+        """
+        if policy not in POLICIES:
+            raise ValueError(f'policy: {policy!r}, expected one of {list(POLICIES)}')
+        self._policy = policy
 
     def open(self) -> None:
         """Begin a cycle: nobody has answered yet."""

@@ -58,6 +58,21 @@ class Shelf(Generic[Item]):
         self.in_use = codebook_id
         return item
 
+    def peek(self, codebook_id: str) -> Item | None:
+        """Return what was put for a codebook, and leave the one in use.
+
+        Parameters
+        ----------
+        codebook_id
+            The id.
+
+        Returns
+        -------
+        Item or None
+            The thing, if it is there.
+        """
+        return self._items.get(codebook_id)
+
     def __contains__(self, codebook_id: str) -> bool:
         """Tell whether something is there for a codebook."""
         return codebook_id in self._items

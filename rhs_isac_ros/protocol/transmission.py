@@ -1,19 +1,30 @@
 """The transmission: steers a beam to the estimated position and reports what it carries."""
 
 import math
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from rhs_isac_ros.link import Beam, Outcome, RunningQuartiles, capacity, choose_beam, outcome
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send
+from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send, SettingsOffered
 from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.shelf import Shelf
+from rhs_isac_ros.protocol.standing import Standing
 
 # Figures of a report that statistics are kept of; `CapacityStatistics` has the same names.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
 # Cycles whose reports may still come.
 _MOST_OPEN = 8
+
+
+class _Steered(NamedTuple):
+    """The beam of a cycle, its capacity at the estimate, and the bands to choose from."""
+
+    beam: m.Beam
+    at_estimate_bps: float
+    bands: Sequence[int]
 
 
 class Transmission(PlainRole):
@@ -25,26 +36,25 @@ class Transmission(PlainRole):
     ----------
     scenario
         The scenario.
-    band
-        Band of the transmission, from 0; none: in each cycle the one of the best expected
-        capacity.
+    settings
+        The band, until another one is offered; by default in each cycle the best.
     """
 
-    def __init__(self, scenario: Scenario, band: int | None = None) -> None:
+    def __init__(self, scenario: Scenario, settings: TransmissionSettings | None = None) -> None:
         super().__init__()
         self._scenario = scenario
-        self._bands = range(scenario.n_bands) if band is None else (band,)
+        self._settings = Standing(settings or TransmissionSettings())
         self._codebooks: Shelf[None] = Shelf()
-        # By cycle: the estimate, the beam with the capacity at the estimate, the true position,
-        # and whether its report is in the statistics already.
+        # By cycle: the estimate, the beam, the true position, and whether its report is in the
+        # statistics already.
         self._estimates: dict[int, m.PositionEstimate] = {}
-        self._beams: dict[int, tuple[m.Beam, float]] = {}
+        self._beams: dict[int, _Steered] = {}
         self._truths: dict[int, m.GroundTruth] = {}
         self._counted: dict[int, bool] = {}
         self._quartiles = RunningQuartiles(len(_FIGURES))
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Take a codebook, a position estimate, a reported configuration or a true position.
+        """Take a codebook, settings, an estimate, a reported configuration or a true position.
 
         Parameters
         ----------
@@ -61,6 +71,10 @@ class Transmission(PlainRole):
         match event:
             case CodebookOffered(codebook):
                 self._codebooks.put(codebook.id, None)
+            case SettingsOffered(settings):
+                # What belongs to a cycle that has a beam stays with its bands.
+                self._settings.newest = settings
+                return self._settings.settle()
             case m.GroundTruth() if event.cycle_id:
                 _put(self._truths, event.cycle_id, event)
             case m.PositionEstimate() if event.codebook_id not in self._codebooks:
@@ -71,25 +85,42 @@ class Transmission(PlainRole):
                 return self._report(event)
         return []
 
+    def standing(self) -> Mapping[str, str]:
+        """Return the settings and the codebook in use.
+
+        Returns
+        -------
+        Mapping
+            Values by name.
+        """
+        return self._settings.tell() | {'codebook_id': self._codebooks.in_use}
+
+    def _bands(self, cycle_id: int) -> Sequence[int]:
+        """Bands that a cycle may use: the same for all that is asked of it."""
+        if cycle_id in self._beams:
+            return self._beams[cycle_id].bands
+        band = self._settings.in_use.band
+        return range(self._scenario.n_bands) if band < 0 else (band,)
+
     def _steer(self, estimate: m.PositionEstimate) -> list[Action]:
         known = self._estimates.get(estimate.cycle_id)
         if known and m.same(known, estimate):
             self.counters['duplicate'] += 1
-            return [Send(self._beams[estimate.cycle_id][0])]
+            return [Send(self._beams[estimate.cycle_id].beam)]
         self._codebooks.take(estimate.codebook_id)
-        choice = choose_beam(
-            self._scenario, estimate.position, estimate.covariance_m2, self._bands)
+        bands = self._bands(estimate.cycle_id)
+        choice = choose_beam(self._scenario, estimate.position, estimate.covariance_m2, bands)
         beam = choice.beam
         sent = m.Beam(
             estimate.cycle_id, estimate.user, estimate.codebook_id, beam.band, beam.analog,
             beam.digital, choice.expected_bps)
         at_estimate_bps = float(capacity(self._scenario, beam, estimate.position[None])[0])
         _put(self._estimates, estimate.cycle_id, estimate)
-        _put(self._beams, estimate.cycle_id, (sent, at_estimate_bps))
+        _put(self._beams, estimate.cycle_id, _Steered(sent, at_estimate_bps, bands))
         return [Send(sent)]
 
     def _report(self, applied: m.RhsConfiguration) -> list[Action]:
-        beam, at_estimate_bps = self._beams.get(applied.cycle_id, (None, math.nan))
+        beam, at_estimate_bps, bands = self._beams.get(applied.cycle_id, (None, math.nan, ()))
         truth = self._truths.get(applied.cycle_id)
         for wrong, found in (('wrong_cycle', beam is None),
                              ('wrong_codebook', beam and applied.codebook_id != beam.codebook_id),
@@ -100,7 +131,7 @@ class Transmission(PlainRole):
         result = Outcome(math.nan, math.nan)
         if truth and truth.user == beam.user:
             used = Beam(applied.analog[0], beam.digital, beam.band)
-            result = outcome(self._scenario, used, truth.position, self._bands)
+            result = outcome(self._scenario, used, truth.position, bands)
         report = m.Capacity(
             beam.cycle_id, beam.user, beam.codebook_id, beam.band, beam.expected_bps,
             result.actual_bps, result.perfect_bps, result.loss_bps, result.loss_percent,

@@ -6,12 +6,14 @@
 import dataclasses
 import math
 import types
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 from rhs_isac_ros.model import mobility, plugins
 from rhs_isac_ros.positioning import ESTIMATORS
 from rhs_isac_ros.protocol.roster import POLICIES
+
+Settings = TypeVar('Settings')
 
 
 class ParameterError(ValueError):
@@ -38,6 +40,8 @@ class Parameter:
         The values that a string may have; empty if any.
     plugins
         Group of entry points whose names are choices too; empty if there is none.
+    hot
+        Whether it may change while the node runs; all others are read at the start.
     """
 
     name: str
@@ -48,6 +52,7 @@ class Parameter:
     high: float | None = None
     choices: tuple[str, ...] = ()
     plugins: str = ''
+    hot: bool = False
 
     @property
     def kind(self) -> str:
@@ -76,6 +81,41 @@ class Parameter:
                  'double_array': 'a list of numbers, each with a decimal point'}[self.kind]
         return f'{words}, {self.range}' if self.range else words
 
+    def check(self, value: Any) -> None:
+        """Refuse a value that it may not have.
+
+        Parameters
+        ----------
+        value
+            The value.
+
+        Raises
+        ------
+        ParameterError
+            If the value has the wrong type, is out of range or none of the choices.
+        """
+        is_list = isinstance(self.default, list)
+        right = isinstance(value, Sequence) and not isinstance(value, str) if is_list else (
+            type(value) is type(self.default))
+        if right and (is_list or isinstance(self.default, float)):
+            # ROS checks no list, and is generous about the ends of a range.
+            right = all(isinstance(n, float) and math.isfinite(n) and self.low <= n <= self.high
+                        for n in (value if is_list else [value]))
+        elif right and self.low is not None:
+            right = self.low <= value <= self.high
+        if not right or self.choices and not self.plugins and value not in self.choices:
+            raise ParameterError(f'{self.name}: {value!r}, expected {self.expected}')
+        if self.plugins and value not in self.choices:
+            self._check_plugin(value)
+
+    def _check_plugin(self, value: str) -> None:
+        """Refuse what is no plug-in either. Only here they are listed: that takes time."""
+        there = plugins.names(self.plugins)
+        if value not in there:
+            raise ParameterError(
+                f'{self.name}: {value!r}, expected {self.expected}; '
+                f'installed: {", ".join(there) or "none"}')
+
 
 SCENARIO = Parameter(
     'scenario_file', '', "YAML file of the scenario; empty: the paper's Table I.")
@@ -87,20 +127,21 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
         SCENARIO, SEED,
         Parameter('policy', 'round_robin', 'How to select among the users that answer.',
-                  choices=POLICIES),
+                  choices=POLICIES, hot=True),
         Parameter('receiver_noise', True,
-                  'Add thermal noise; false where the radio has its own.'),
-        Parameter('ack_timeout_s', 0.1, 'How long to wait for acks.', 's', 0.001, 60.0),
+                  'Add thermal noise; false where the radio has its own.', hot=True),
+        Parameter('ack_timeout_s', 0.1, 'How long to wait for acks.', 's', 0.001, 60.0,
+                  hot=True),
         STEP_TIMEOUT,
         Parameter('retries', 3, 'How often a step is asked for again within step_timeout_s.',
-                  low=0, high=100),
-        Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0),
+                  low=0, high=100, hot=True),
+        Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0, hot=True),
         Parameter('data_duration_s', 1e-3, 'Time that each direction transmits data.', 's',
-                  1e-6, 10.0),
+                  1e-6, 10.0, hot=True),
         Parameter('allowed_users', '',
-                  'Users whose acks it takes, such as 1, 4, 10-20; empty: all.'),
+                  'Users whose acks it takes, such as 1, 4, 10-20; empty: all.', hot=True),
         Parameter('ack_rate_hz', 200.0, 'Acks that it takes of each user in a second.', 'Hz',
-                  1.0, 1e6),
+                  1.0, 1e6, hot=True),
         Parameter('first_cycle', 0,
                   'Number of the first cycle; 0: from the clock, so that none is repeated after '
                   'a restart.', low=0, high=2**53),
@@ -126,24 +167,25 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'channel': (
         SCENARIO, SEED,
         Parameter('loss_probability', 0.0, 'That the air loses a signal or a packet.',
-                  low=0.0, high=1.0),
-        Parameter('double_probability', 0.0, 'That one arrives twice.', low=0.0, high=1.0),
-        Parameter('delay_s', 0.0, 'How long each takes at least.', 's', 0.0, 10.0),
+                  low=0.0, high=1.0, hot=True),
+        Parameter('double_probability', 0.0, 'That one arrives twice.', low=0.0, high=1.0,
+                  hot=True),
+        Parameter('delay_s', 0.0, 'How long each takes at least.', 's', 0.0, 10.0, hot=True),
         Parameter('jitter_s', 0.0, 'How much longer at most, each at random: they overtake.', 's',
-                  0.0, 10.0),
+                  0.0, 10.0, hot=True),
     ),
     'positioner': (
         SCENARIO,
         Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS),
-                  plugins=plugins.ESTIMATORS),
+                  plugins=plugins.ESTIMATORS, hot=True),
         Parameter('table_folder', '',
                   "Where tables are kept between runs; empty: the user's folder for caches."),
-        Parameter('model_file', '', 'Trained model; the estimator neural needs one.'),
+        Parameter('model_file', '', 'Trained model; the estimator neural needs one.', hot=True),
     ),
     'transmission': (
         SCENARIO,
         Parameter('band', -1, 'Band of the transmission, from 0; -1: in each cycle the best.',
-                  low=-1, high=4095),
+                  low=-1, high=4095, hot=True),
     ),
     'optimizer': (
         SCENARIO,
@@ -195,7 +237,7 @@ def _declare_one(node: Any, parameter: Parameter) -> Any:
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.text + unit, additional_constraints=parameter.expected,
-        read_only=True)
+        read_only=not parameter.hot)
     if parameter.low is not None and type(default) is int:
         descriptor.integer_range = [
             IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high))]
@@ -210,29 +252,36 @@ def _declare_one(node: Any, parameter: Parameter) -> Any:
         raise ParameterError(
             f'{parameter.name}: {error}; expected {parameter.expected}') from None
     value = default if value is None else value
-    if parameter.choices and value not in parameter.choices:
-        _check_plugin(parameter, value)
-    if not _in_range(parameter, value):
-        raise ParameterError(f'{parameter.name}: {value!r}, expected {parameter.expected}')
-    return list(value) if isinstance(default, list) else value
+    value = list(value) if isinstance(default, list) else value
+    parameter.check(value)
+    return value
 
 
-def _check_plugin(parameter: Parameter, value: str) -> None:
-    """Refuse what is no plug-in either. Only here they are listed: that takes time."""
-    text = f'{parameter.name}: {value!r}, expected {parameter.expected}'
-    if not parameter.plugins:
-        raise ParameterError(text)
-    there = plugins.names(parameter.plugins)
-    if value not in there:
-        raise ParameterError(f'{text}; installed: {", ".join(there) or "none"}')
+def settings_of(kind: type[Settings], values: types.SimpleNamespace) -> Settings:
+    """Take the settings of a role from a node's parameters.
 
+    Parameters
+    ----------
+    kind
+        A dataclass whose fields have names of parameters.
+    values
+        Values by name.
 
-def _in_range(parameter: Parameter, value: Any) -> bool:
-    """Tell whether all numbers of a value are finite and in range; ROS checks no list."""
-    if not isinstance(parameter.default, list | float):
-        return True
-    numbers = value if isinstance(parameter.default, list) else [value]
-    return all(math.isfinite(n) and parameter.low <= n <= parameter.high for n in numbers)
+    Returns
+    -------
+    Settings
+        The settings.
+
+    Raises
+    ------
+    ParameterError
+        If the class refuses them.
+    """
+    try:
+        return kind(**{field.name: getattr(values, field.name)
+                       for field in dataclasses.fields(kind)})
+    except ValueError as error:
+        raise ParameterError(str(error)) from None
 
 
 def table() -> str:
@@ -247,14 +296,15 @@ def table() -> str:
     for executable, parameters in NODES.items():
         for parameter in parameters:
             rows.setdefault(parameter.name, (parameter, []))[1].append(executable)
-    lines = ['| parameter | type | default | range | nodes | what it is |',
-             '|---|---|---|---|---|---|']
+    lines = ['| parameter | type | default | range | hot | nodes | what it is |',
+             '|---|---|---|---|---|---|---|']
     for name, (parameter, owners) in rows.items():
         default = parameter.default
         shown = str(default).lower() if isinstance(default, bool) else default or 'empty'
         shown = default if type(default) in (int, float) else shown
         lines.append(f'| `{name}` | {parameter.kind} | {shown} | {parameter.range} | '
-                     f'{", ".join(owners)} | {parameter.text} |')
+                     f'{"yes" if parameter.hot else ""} | {", ".join(owners)} | '
+                     f'{parameter.text} |')
     return '\n'.join(lines)
 
 

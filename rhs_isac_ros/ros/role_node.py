@@ -1,21 +1,29 @@
 """The adapter between a role of the protocol and ROS 2."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, Event, Note, Send, Tick
+from rhs_isac_ros.protocol.events import (
+    Action,
+    Event,
+    Note,
+    Send,
+    SettingsKept,
+    SettingsOffered,
+    Tick,
+)
 from rhs_isac_ros.protocol.health import Health, Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.settable_node import SettableNode
 from rhs_isac_ros.ros.timers import steady_timer
 
 
@@ -32,8 +40,12 @@ class Role(Protocol):
         """Return when the role wants a `Tick`."""
         ...
 
+    def standing(self) -> Mapping[str, str]:
+        """Return what is in use and what waits, by name."""
+        ...
 
-class RoleNode(Node):
+
+class RoleNode(SettableNode):
     """A node that hands messages to a role and publishes what it answers.
 
     Parameters
@@ -48,7 +60,7 @@ class RoleNode(Node):
     Attributes
     ----------
     values
-        The parameters, by name.
+        The parameters at the start, by name.
     scenario
         The scenario of the parameter ``scenario_file``.
 
@@ -63,8 +75,7 @@ class RoleNode(Node):
     def __init__(
             self, executable: str, sends: Iterable[type[m.Message]], name: str = '',
             **node_options: Any) -> None:
-        super().__init__(name or executable, **node_options)
-        self.values = parameters.declare(self, executable)
+        super().__init__(executable, name, **node_options)
         file = self.values.scenario_file
         self.scenario = Scenario.from_yaml(file) if file else Scenario()
         self._sizes = self.scenario.sizes
@@ -107,9 +118,21 @@ class RoleNode(Node):
         """
         state = getattr(self._role, 'state', None)
         if state is None:
-            return self._health.report('', self._role.counters)
+            return self._health.report(
+                '', self._role.counters, standing=self._role.standing())
         return self._health.report(
-            state.value, self._role.counters, state in self._role.LACKING)
+            state.value, self._role.counters, state in self._role.LACKING,
+            self._role.standing())
+
+    def offer(self, settings: Any) -> None:
+        """Offer the role other settings.
+
+        Parameters
+        ----------
+        settings
+            The settings.
+        """
+        self.tell(SettingsOffered(settings))
 
     def follow_codebook(self, on_codebook: Callable[[Codebook], None]) -> None:
         """Fetch the codebook from the optimizer, and every change of it.
@@ -243,6 +266,8 @@ class RoleNode(Node):
                     self.get_logger().warning(text)
                 case Note(text):
                     self.get_logger().info(text)
+                case SettingsKept(settings):
+                    self.restore(settings)
                 case _:
                     self.perform(action)
 

@@ -17,8 +17,7 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.receive import receive_feeds, received_signal
 from rhs_isac_ros.model.surface import radiation_matrix
-from rhs_isac_ros.positioning import Estimate
-from rhs_isac_ros.protocol import bs_table
+from rhs_isac_ros.positioning import Estimate, ModelError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.bs import BaseStation
@@ -29,11 +28,13 @@ from rhs_isac_ros.protocol.events import (
     Note,
     PeersChanged,
     Send,
+    SettingsKept,
+    SettingsOffered,
     Tick,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
 from rhs_isac_ros.protocol.rhs_controller import RhsController
-from rhs_isac_ros.protocol.roster import Roster
+from rhs_isac_ros.protocol.settings import BaseStationSettings, PositionerSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 
 # What the nodes subscribe to.
@@ -53,15 +54,15 @@ PEERS = {
 TAKE_CODEBOOKS = ('bs', 'rhs_controller', 'positioner', 'transmission')
 LATENCY_S = 1e-3
 DATA_DURATION_S = 1e-3
+# A model file that fits no codebook.
+UNFIT = 'unfit'
 
 
 class Centre:
     """An estimator that always finds the middle of the region."""
 
-    name = 'centre'
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._position = np.array(scenario.roi_center_m)
+    def __init__(self, scenario: Scenario, name: str = 'centre') -> None:
+        self._position, self.name = np.array(scenario.roi_center_m), name
 
     def estimate(self, received: np.ndarray) -> Estimate:
         return Estimate(self._position, np.eye(3))
@@ -119,14 +120,21 @@ class Network:
             seed: int = 0, step_timeout_s: float = 1.0, ack_timeout_s: float = 0.1,
             rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
             make_s: float = 0.0, absent: Iterable[str] = (),
-            begin_s: float = 0.0, gate=None, retries: int = 0,
-            beacon_timeout_s: float = 3.0) -> None:
+            begin_s: float = 0.0, retries: int = 0, beacon_timeout_s: float = 3.0,
+            allowed_users: str = '', ack_rate_hz: float = np.inf) -> None:
         self.scenario, self.seed = scenario, seed
         self.transport, self.ordered = transport, ordered
         self.now_s = begin_s
-        self._gate, self._retries, self._beacon_timeout_s = gate, retries, beacon_timeout_s
+        self.settings = BaseStationSettings(
+            policy=policy, ack_timeout_s=ack_timeout_s, step_timeout_s=step_timeout_s,
+            retries=retries, rest_s=rest_s, data_duration_s=DATA_DURATION_S,
+            allowed_users=allowed_users, ack_rate_hz=ack_rate_hz)
+        self._beacon_timeout_s = beacon_timeout_s
+        # Whether the base station was to add noise, by cycle.
+        self._noise: dict[int, bool] = {}
         self.log: list[Sent] = []
         self.notes: list[Said] = []
+        self.kept: list[Any] = []
         self._ends: list[tuple[int, int, str]] = []
         self.codebooks = {} if codebook is None else {codebook.id: codebook}
         self._roles: dict[str, Any] = {}
@@ -136,9 +144,7 @@ class Network:
         self._codebook = codebook
         self._reported: dict[Any, tuple[str, ...]] = {}
         self._mobilities = {}
-        self._policy, self._step_timeout_s = policy, step_timeout_s
-        self._ack_timeout_s, self._rest_s = ack_timeout_s, rest_s
-        self._make = make or (lambda codebook: Centre(scenario))
+        self._make = make
         self._make_s = make_s
         self._lives = 0
         self._awake = False
@@ -187,18 +193,32 @@ class Network:
             if name in self._roles:
                 self.tell(name, CodebookOffered(codebook))
 
+    def change(self, name: str, **values) -> None:
+        """Offer a role other settings: those offered last, but for these values."""
+        role = self._roles[name]
+        self.tell(name, SettingsOffered(dataclasses.replace(role._settings.newest, **values)))
+
     def tell(self, name: str, event) -> None:
         for action in self._roles[name].handle(event, self.now_s):
             if isinstance(action, Send):
                 self.publish(action.message, name)
             elif isinstance(action, MakeEstimator):
-                self._make_estimator(name, action.codebook)
+                self._make_estimator(name, action)
+            elif isinstance(action, SettingsKept):
+                self.kept.append(action.settings)
             else:
                 self.notes.append(Said(self.now_s, name, action))
 
-    def _make_estimator(self, name: str, codebook) -> None:
+    def _make_estimator(self, name: str, action: MakeEstimator) -> None:
         """At once, or as something that arrives when it is done."""
-        event = make_estimator_for(codebook, self._make, lambda: self.now_s)
+        def centre(codebook):
+            if action.settings.model_file == UNFIT:
+                raise ModelError('model_file: unfit')
+            # The usual one has a name of its own.
+            usual = action.settings == PositionerSettings()
+            return Centre(self.scenario, 'centre' if usual else action.settings.estimator)
+        event = make_estimator_for(
+            action.codebook, self._make or centre, lambda: self.now_s)
         if not self._make_s:
             self.tell(name, event)
             return
@@ -208,6 +228,8 @@ class Network:
     def publish(self, message: m.Message, sender: str = 'stranger') -> None:
         m.check(message, self.scenario.sizes)
         self.log.append(Sent(self.now_s, sender, message))
+        if isinstance(message, m.Grant) and sender == 'bs':
+            self._noise[message.cycle_id] = self._roles['bs']._settings.in_use.receiver_noise
         if isinstance(message, m.ProtocolState) and message.outcome:
             self._ends.append((message.cycle_id, message.user, message.outcome))
         for name, role in self._roles.items():
@@ -307,7 +329,7 @@ class Network:
         shape = (scenario.n_bands, scenario.n_subbands, scenario.n_frames)
         noise = complex_normal(
             shape, streams.generator(self.seed, streams.RECEIVER, user, cycle_id))
-        noise *= np.sqrt(scenario.noise_power_w)
+        noise *= np.sqrt(scenario.noise_power_w) * self._noise[cycle_id]
         signals = np.empty(shape, complex)
         patterns = radiation_matrix(scenario, self.codebooks[codebook_id])
         for band, pattern in enumerate(patterns):
@@ -322,19 +344,14 @@ class Network:
         return name.rstrip('0123456789')
 
     def _build(self, name: str):
-        scenario, step_s = self.scenario, self._step_timeout_s
+        scenario, step_s = self.scenario, self.settings.step_timeout_s
         match self._kind(name):
             case 'bs':
-                timeouts_s = bs_table.timeouts(
-                    self._ack_timeout_s, step_s, self._rest_s, self._retries)
-                roster = Roster(
-                    self._policy, streams.generator(self.seed, streams.BASE_STATION))
+                rng = streams.generator(self.seed, streams.BASE_STATION)
                 # No number comes twice, as with the clock of the node.
                 first = 1_000_000 * self._lives + 1
                 self._lives += 1
-                return BaseStation(
-                    scenario, roster, self._receive, timeouts_s, DATA_DURATION_S, first,
-                    self._gate, self._retries)
+                return BaseStation(scenario, self.settings, rng, self._receive, first)
             case 'user':
                 return user_role.User(
                     int(name.removeprefix('user')), self._mobilities[name],
@@ -349,9 +366,9 @@ class Network:
                 return Transmission(scenario)
         raise ValueError(name)
 
-    def _receive(self, codebook, feeds, user: int, cycle_id: int) -> np.ndarray:
+    def _receive(self, codebook, feeds, user: int, cycle_id: int, noise: bool) -> np.ndarray:
         rng = streams.generator(self.seed, streams.RECEIVER, user, cycle_id)
-        return receive_feeds(self.scenario, codebook, feeds, rng)
+        return receive_feeds(self.scenario, codebook, feeds, rng if noise else None)
 
     def _look_around(self) -> None:
         """Tell those that watch their peers who is missing, where that has changed."""

@@ -36,3 +36,13 @@ def test_a_network_without_a_positioner_says_so_once(network):
     net.add('positioner')
     net.run_cycles(2)
     assert net.said('bs')[1:] == ['cycle 7: user 1 served again after: positioner_silent']
+
+
+def test_what_is_waited_for_is_told_once_until_a_cycle_begins():
+    complaints = Complaints()
+    assert complaints.waiting(['channel', 'codebook']) == [
+        Note('waiting for channel, codebook', warning=True)]
+    assert complaints.waiting(['channel', 'codebook']) == []
+    assert complaints.waiting(['codebook']) == [Note('waiting for codebook', warning=True)]
+    complaints.begun()
+    assert len(complaints.waiting(['codebook'])) == 1

@@ -52,7 +52,7 @@ def test_strangers_fill_no_memory():
 
 
 def test_the_base_station_neither_serves_nor_awaits_who_is_not_allowed(network):
-    net = network(2, gate=Gate(users_of('2')))
+    net = network(2, allowed_users='2')
     net.run_cycles(4)
     assert net.served() == [2] * 4
     assert net['bs'].counters == {'not_allowed': 4}
@@ -60,7 +60,7 @@ def test_the_base_station_neither_serves_nor_awaits_who_is_not_allowed(network):
 
 
 def test_a_user_that_floods_is_counted_and_costs_the_others_nothing(network):
-    net = network(2, gate=Gate(rate_hz=20.0))
+    net = network(2, ack_rate_hz=20.0)
     net.run_cycles(2)
     for _ in range(100):
         net.publish(m.Ack(net.sent(m.Beacon)[-1].cycle_id, 1))
@@ -73,7 +73,7 @@ def test_a_user_that_floods_is_counted_and_costs_the_others_nothing(network):
 
 
 def test_an_ack_beyond_the_rate_does_not_end_the_beaconing(network):
-    net = network(gate=Gate(rate_hz=0.5))
+    net = network(ack_rate_hz=0.5)
     net.run(limit_s=0.5)
     assert net.served() == []
     assert net['bs'].counters['too_often'] == net['bs'].counters['unanswered'] > 0

@@ -31,6 +31,23 @@ def test_counters_are_told_by_what_they_are_about():
                       'beacons.no_beacon': '6'}
 
 
+def test_what_is_in_use_and_what_waits_is_told(codebooks):
+    books = Health()
+    told = {'parameter.policy': 'first', 'pending.policy': 'random'}
+
+    def report(in_use):
+        new = books.report('', {}, standing={'codebook_id': in_use, **told})
+        assert not new.fault
+        return {name: value for name, value in new.values.items() if 'handling' not in name}
+    first, second, _ = (codebook.id for codebook in codebooks)
+    assert report('') == told
+    books.note(CodebookOffered(codebooks[0]), [], 0.0, 0.0)
+    assert report('') == report(first) == {'codebook_id': first, **told}
+    books.note(CodebookOffered(codebooks[1]), [], 0.0, 0.0)
+    assert report(first) == {'codebook_id': first, 'pending.codebook_id': second, **told}
+    assert report(second) == {'codebook_id': second, **told}
+
+
 def test_the_ends_of_cycles_are_those_of_the_tables():
     abandoned = {step.counts for step in bs_table.TABLE.values() if 'abandon' in step.do}
     assert abandoned < health.CYCLE_ENDS

@@ -55,6 +55,14 @@ class Offer(NamedTuple):
     number: int
 
 
+class Change(NamedTuple):
+    """Other settings are offered to a role, if it is there."""
+
+    at_s: float
+    role: str
+    values: dict
+
+
 class Faulty:
     """A transport with a list of faults; all else is on time."""
 
@@ -80,6 +88,11 @@ CRASHES = st.lists(st.builds(
     st.booleans()), max_size=4)
 RETRIES = st.sampled_from([0, 3])
 OFFERS = st.lists(st.builds(Offer, TIMES_S, st.integers(0, 2)), max_size=2)
+CHANGES = st.lists(st.builds(Change, TIMES_S, st.just('bs'), st.sampled_from([
+    {'policy': 'first'}, {'policy': 'random'}, {'receiver_noise': False}, {'retries': 2},
+    {'rest_s': 0.0}])) | st.builds(Change, TIMES_S, st.just('positioner'), st.sampled_from([
+        {'estimator': 'ml'}, {'estimator': 'bayes'},
+        {'estimator': 'neural', 'model_file': 'unfit'}])), max_size=4)
 NOISE = st.fixed_dictionaries({
     'seed': st.integers(0, 2**32 - 1), 'loss': st.sampled_from([0.0, 0.02, 0.1]),
     'doubles': st.sampled_from([0.0, 0.1, 0.5]),
@@ -115,18 +128,22 @@ def make_network(network_class, scenario, codebooks):
 
 @pytest.fixture(scope='module')
 def survive(codebooks):
-    """Function that lets a network live through crashes and offers, and heals it."""
-    def run(net, crashes, offers):
+    """Function that lets a network live through crashes, offers and changes, and heals it."""
+    def run(net, crashes, offers, changes):
         happens = [(crash.at_s, lambda crash=crash: stop(net, crash)) for crash in crashes]
         happens += [(crash.at_s + crash.down_s, lambda crash=crash: start(net, crash.role))
                     for crash in crashes]
         happens += [(offer.at_s, lambda offer=offer: net.offer(codebooks[offer.number]))
                     for offer in offers]
+        happens += [(change.at_s, lambda change=change: alter(net, change))
+                    for change in changes]
         for at_s, act in sorted(happens, key=lambda pair: pair[0]):
             net.run(limit_s=at_s - net.now_s)
             act()
         net.run(limit_s=max(TROUBLE_S - net.now_s, 0.0))
         net.transport = lambda message, recipient: [(1e-3, message)]
+        # Under other policies a user may wait for ever.
+        net.change('bs', policy='round_robin')
         check_end(net)
         net.verify()
         check_results(net)
@@ -141,6 +158,11 @@ def stop(net, crash):
 def start(net, role):
     if role not in net:
         net.add(role)
+
+
+def alter(net, change):
+    if change.role in net:
+        net.change(change.role, **change.values)
 
 
 def check_end(net):
@@ -163,6 +185,9 @@ def check_results(net):
         assert len({message.user for message in messages}) == 1
         ids = {message.codebook_id for message in messages if hasattr(message, 'codebook_id')}
         assert len(ids) <= 1
+        estimators = {message.estimator for message in messages
+                      if isinstance(message, m.PositionEstimate)}
+        assert 'neural' not in estimators
         places = {tuple(message.position) for message in messages
                   if isinstance(message, m.GroundTruth)}
         assert len(places) <= 1
@@ -172,18 +197,20 @@ def check_results(net):
             assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
 
 
-@given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, ordered=st.booleans(), retries=RETRIES)
-@explicit(faults=[], crashes=[], offers=[], ordered=True, retries=3)
+@given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
+       retries=RETRIES)
+@explicit(faults=[], crashes=[], offers=[], changes=[], ordered=True, retries=3)
 def test_single_faults_and_crashes_break_no_promise(
-        make_network, survive, faults, crashes, offers, ordered, retries):
-    survive(make_network(Faulty(faults), ordered, retries), crashes, offers)
+        make_network, survive, faults, crashes, offers, changes, ordered, retries):
+    survive(make_network(Faulty(faults), ordered, retries), crashes, offers, changes)
 
 
-@given(noise=NOISE, crashes=CRASHES, offers=OFFERS, ordered=st.booleans(), retries=RETRIES)
+@given(noise=NOISE, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
+       retries=RETRIES)
 # A late beacon and a late grant of a cycle that is over.
 @explicit(noise={'seed': 1038635, 'loss': 0.02, 'doubles': 0.5, 'jitter_s': 0.5},
           crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
-          offers=[], ordered=False, retries=0)
+          offers=[], changes=[], ordered=False, retries=0)
 def test_storms_and_crashes_break_no_promise(
-        make_network, survive, noisy, noise, crashes, offers, ordered, retries):
-    survive(make_network(noisy(**noise), ordered, retries), crashes, offers)
+        make_network, survive, noisy, noise, crashes, offers, changes, ordered, retries):
+    survive(make_network(noisy(**noise), ordered, retries), crashes, offers, changes)

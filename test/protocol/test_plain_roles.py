@@ -21,8 +21,10 @@ from rhs_isac_ros.protocol.events import (
     MakeEstimator,
     Note,
     Send,
+    SettingsOffered,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
+from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 
 PLACE = np.array([8.0, -2.0, 0.5])
@@ -72,7 +74,7 @@ def downlink():
 
 
 def test_they_wait_for_messages_only(scenario):
-    for role in (Channel(scenario, 0), Transmission(scenario, 0),
+    for role in (Channel(scenario, 0), Transmission(scenario),
                  Positioner(scenario, None)):
         assert role.next_deadline() is None
 
@@ -500,23 +502,40 @@ def test_the_transmission_chooses_the_band_by_the_posterior(scenario, codebooks,
 
 def test_the_perfect_position_has_the_choice_of_the_same_bands(
         scenario, codebooks, truth, estimate):
-    for band in (None, 0, 1):
-        role = Transmission(scenario, band)
+    for band in (-1, 0, 1):
+        role = Transmission(scenario, TransmissionSettings(band))
         (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
         applied = configured(beam)
         (_, (report, _)) = feed(role, [truth, applied])
-        bands = range(2) if band is None else [band]
+        bands = range(2) if band < 0 else [band]
         assert report.perfect_bps == pytest.approx(max(
             capacity(scenario, steer(scenario, PLACE, b), PLACE[None])[0] for b in bands))
 
 
 def test_the_transmission_takes_its_band(scenario, codebooks, estimate):
-    role = Transmission(scenario, 1)
+    role = Transmission(scenario, TransmissionSettings(1))
     (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
     expected = steer(scenario, estimate.position, 1)
     assert beam.band == 1
     np.testing.assert_array_equal(beam.analog, expected.analog)
     assert beam.expected_bps == capacity(scenario, expected, estimate.position[None])[0]
+
+
+def test_a_cycle_stays_in_its_bands_when_others_are_to_be_used(
+        scenario, codebooks, truth, estimate):
+    role = Transmission(scenario, TransmissionSettings(1))
+    (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
+    assert role.handle(SettingsOffered(TransmissionSettings(0)), 0.0) == [
+        Note("from now on: band '0'")]
+    assert role.standing()['parameter.band'] == '0'
+    moved = dataclasses.replace(estimate, position=estimate.position + 0.1)
+    (again,), (other,), _, (report, _) = feed(role, [estimate, moved, truth, configured(beam)])
+    assert again is beam
+    assert other.band == 1
+    assert report.perfect_bps == pytest.approx(
+        capacity(scenario, steer(scenario, PLACE, 1), PLACE[None])[0])
+    ((new,),) = feed(role, [dataclasses.replace(estimate, cycle_id=4)])
+    assert (new.cycle_id, new.band) == (4, 0)
 
 
 @pytest.mark.parametrize('seed', range(2))

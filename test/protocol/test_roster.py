@@ -208,3 +208,16 @@ def test_more_users_than_it_can_remember_are_refused(roster):
     assert not roster.is_full_for(17)
     roster.forget(17)
     assert not roster.is_full_for(5000)
+
+
+def test_another_policy_goes_on_from_the_turns_so_far(roster):
+    r = roster()
+    cycle(r, 1, 2, 3)
+    cycle(r, 1, 2, 3)
+    r.follow('first')
+    assert cycle(r, 2, 1, 3) == 2
+    r.follow('round_robin')
+    assert cycle(r, 1, 2, 3) == 3
+    with pytest.raises(ValueError, match="policy: 'best', expected one of"):
+        r.follow('best')
+    assert cycle(r, 3, 2, 1) == 1

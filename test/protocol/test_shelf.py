@@ -71,3 +71,10 @@ def test_the_memory_does_not_grow(shelf):
         shelf.put(str(n), n)
         shelf.take(str(n - n % 7))
     assert len(shelf.ids()) == 4
+
+
+def test_who_only_looks_changes_nothing(shelf):
+    shelf.take('b')
+    assert shelf.peek('a') == 'A'
+    assert shelf.peek('z') is None
+    assert shelf.in_use == 'b'

@@ -10,9 +10,17 @@ import pytest
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import bs, bs_table, rhs_controller, user
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import CodebookOffered, Note, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    Note,
+    PeersChanged,
+    Send,
+    SettingsOffered,
+    Tick,
+)
 from rhs_isac_ros.protocol.machine import ANY, SAME
-from rhs_isac_ros.protocol.roster import Roster
+from rhs_isac_ros.protocol.roster import POLICIES, Roster
+from rhs_isac_ros.protocol.settings import BaseStationSettings
 
 ROLES = {
     'bs': types.SimpleNamespace(
@@ -47,14 +55,19 @@ def machine(scenario):
         role = ROLES[name]
         timeouts_s = {state: 1.0 for state in role.states if state not in role.endless}
         if name == 'bs':
-            def receive(codebook, feeds, user, cycle_id):
+            def receive(codebook, feeds, user, cycle_id, noise):
                 return np.zeros((2, 3, 2), complex)
-            roster = Roster('round_robin', np.random.default_rng(0))
-            return bs.BaseStation(scenario, roster, receive, timeouts_s, 1e-3)
+            return bs.BaseStation(scenario, settings(), np.random.default_rng(0), receive)
         if name == 'user':
             return user.User(1, mobility.Static((10, 0, 0)), timeouts_s)
         return rhs_controller.RhsController()
     return make
+
+
+def settings(**values):
+    """Settings of a base station that has a time-out of 1 s everywhere."""
+    return BaseStationSettings(
+        ack_timeout_s=1.0, step_timeout_s=1.0, rest_s=1.0, retries=0, **values)
 
 
 def effective(role, state, event):
@@ -202,15 +215,17 @@ def test_a_message_that_no_node_hands_over_is_an_error(machine, name, kind, exam
 
 
 def random_event(rng, kinds, example, codebooks):
-    draw = rng.integers(len(kinds) + 3)
+    draw = rng.integers(len(kinds) + 4)
     if draw == 0:
         return Tick()
     if draw == 1:
         return CodebookOffered(codebooks[rng.integers(3)])
     if draw == 2:
         return PeersChanged(('channel',) if rng.random() < 0.3 else ())
+    if draw == 3:
+        return SettingsOffered(settings(policy=rng.choice(POLICIES)))
     given = {'cycle_id': int(rng.integers(0, 5))}
-    kind = kinds[draw - 3]
+    kind = kinds[draw - 4]
     fields = kind.__dataclass_fields__
     if 'codebook_id' in fields:
         given['codebook_id'] = codebooks[rng.integers(2)].id
@@ -229,7 +244,7 @@ def test_no_sequence_of_events_breaks_a_role(
     for _ in range(1500):
         event = random_event(rng, subscriptions[name], example, codebooks)
         takes = {Tick: name != 'rhs_controller', CodebookOffered: name != 'user',
-                 PeersChanged: name != 'rhs_controller'}
+                 PeersChanged: name != 'rhs_controller', SettingsOffered: name == 'bs'}
         if not takes.get(type(event), True):
             continue
         now_s += rng.exponential(0.05)

@@ -1,5 +1,6 @@
 """Declaration, checks and documentation of the parameters."""
 
+import dataclasses
 import itertools
 import math
 
@@ -13,6 +14,12 @@ from rhs_isac_ros.nodes.bs import BsNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.protocol.settings import (
+    BaseStationSettings,
+    PositionerSettings,
+    TransmissionSettings,
+)
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.parameters import NODES, ParameterError, declare
 
@@ -75,7 +82,7 @@ def test_descriptors(make, executable):
     declare(node, executable)
     for p in NODES[executable]:
         descriptor = node.describe_parameter(p.name)
-        assert descriptor.read_only
+        assert descriptor.read_only == (not p.hot)
         assert descriptor.type == TYPES[type(p.default)]
         assert descriptor.description.startswith(p.text)
         assert f'[{p.unit}]' in descriptor.description or not p.unit
@@ -147,8 +154,8 @@ def test_choices(make, executable, parameter):
     assert refusal(make, executable, parameter.name, '').startswith(f"{parameter.name}: ''")
 
 
-@each_parameter
-def test_nothing_changes_at_run_time(make, executable, parameter):
+@only(lambda p: not p.hot)
+def test_what_is_not_hot_does_not_change_at_run_time(make, executable, parameter):
     node = make()
     declare(node, executable)
     # A value that would be right at the start.
@@ -160,6 +167,24 @@ def test_nothing_changes_at_run_time(make, executable, parameter):
     assert 'read-only' in result.reason
     unset = Parameter(parameter.name, value=[])
     assert node.get_parameter_or(parameter.name, unset).value == parameter.default
+
+
+@pytest.mark.parametrize(('executable', 'settings'), [
+    ('bs', BaseStationSettings), ('channel', Impairments), ('positioner', PositionerSettings),
+    ('transmission', TransmissionSettings)])
+def test_what_is_hot_is_in_the_settings_of_the_role(executable, settings):
+    fields = {field.name: field.default for field in dataclasses.fields(settings)}
+    declared = {p.name: p for p in NODES[executable]}
+    hot = {name for name, p in declared.items() if p.hot}
+    # A base station shares its patience with users, who know of no change.
+    assert fields.keys() - hot == ({'step_timeout_s'} if executable == 'bs' else set())
+    assert hot <= fields.keys()
+    assert fields == {name: declared[name].default for name in fields}
+
+
+def test_other_nodes_have_nothing_hot():
+    hot = {executable for executable, p in PAIRS if p.hot}
+    assert hot == {'bs', 'channel', 'positioner', 'transmission'}
 
 
 def test_table_lists_every_parameter_once_with_all_that_is_to_know():
@@ -180,6 +205,7 @@ def test_table_lists_every_parameter_once_with_all_that_is_to_know():
         assert {p.text, ', '.join(nodes)} <= set(cells)
         assert all(choice in row for choice in p.choices)
         assert p.unit in row
+        assert ('yes' in cells) == p.hot
 
 
 def test_a_parameter_that_nodes_share_is_the_same_in_all():

@@ -30,6 +30,9 @@ class Scripted:
     def next_deadline(self):
         return self.deadline_s
 
+    def standing(self):
+        return {}
+
     @property
     def ticks_s(self):
         return [now_s for event, now_s in self.told if isinstance(event, Tick)]

@@ -39,9 +39,17 @@ def test_set_asks_the_node(hear, say):
     out, err, code = say(main, 'set', 'optimizer', 'codebook.provenance', 'by hand')
     assert (out, err, code) == ('Set parameter successful\n', '', 0)
     assert hear(main, 'get', 'optimizer', 'codebook.provenance') == 'String value is: by hand\n'
-    out, err, code = say(main, 'set', 'bs', 'policy', 'first')
+    out, err, code = say(main, 'set', 'bs', 'seed', '1')
     assert (out, code) == ('', 1)
     assert err.startswith('Setting parameter failed: ')
+    assert 'read-only' in err
+    assert hear(main, 'set', '/bs', 'policy', 'random') == 'Set parameter successful\n'
+    assert hear(main, 'get', '/bs', 'policy') == 'String value is: random\n'
+    out, err, code = say(main, 'set', '/bs', 'policy', 'nonsense')
+    assert (out, code) == ('', 1)
+    assert err == ("Setting parameter failed: policy: 'nonsense', expected one of round_robin, "
+                   'first, random\n')
+    assert hear(main, 'get', '/bs', 'policy') == 'String value is: random\n'
 
 
 def test_what_is_not_there(say):

@@ -1,0 +1,53 @@
+"""Settings of roles, and how they are told."""
+
+import dataclasses
+
+import pytest
+
+from rhs_isac_ros.protocol.events import Note
+from rhs_isac_ros.protocol.settings import (
+    BaseStationSettings,
+    PositionerSettings,
+    changes,
+    shown,
+    tell,
+)
+from rhs_isac_ros.protocol.standing import Standing
+
+
+def test_changes_are_the_new_values_of_what_is_another():
+    old = BaseStationSettings()
+    assert changes(old, dataclasses.replace(old, policy='first', retries=0)) == {
+        'policy': 'first', 'retries': 0}
+    assert changes(old, BaseStationSettings()) == {}
+
+
+def test_what_is_in_use_is_told_and_what_waits():
+    told = tell(PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
+    assert told == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
+                    'pending.estimator': 'neural'}
+
+
+def test_values_are_written_as_ros_does():
+    assert [shown(value) for value in (True, False, 3, 0.5, '')] == [
+        'true', 'false', '3', '0.5', '']
+
+
+@pytest.mark.parametrize('users', ['0', '3-1', 'all'])
+def test_what_is_no_list_of_users_is_refused(users):
+    with pytest.raises(ValueError, match=f"allowed_users: '{users}', expected numbers"):
+        BaseStationSettings(allowed_users=users)
+
+
+def test_the_newest_settings_wait_until_they_are_settled():
+    old, new = PositionerSettings(), PositionerSettings('ml')
+    standing = Standing(old)
+    assert standing.settle() == []
+    standing.newest = PositionerSettings('neural')
+    standing.newest = new
+    assert standing.in_use == old
+    assert standing.tell()['pending.estimator'] == 'ml'
+    assert standing.settle() == [Note("from now on: estimator 'ml'")]
+    assert standing.in_use == new
+    assert 'pending.estimator' not in standing.tell()
+    assert standing.settle() == []

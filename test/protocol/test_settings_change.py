@@ -1,0 +1,259 @@
+"""Other settings hold from the next cycle on, and no cycle mixes two."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.bs_table import State
+from rhs_isac_ros.protocol.impairments import Impaired, Impairments
+from rhs_isac_ros.protocol.settings import PositionerSettings
+
+IN_A_CYCLE = [State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
+              State.TRANSMITTING]
+UNFIT = {'estimator': 'neural', 'model_file': 'unfit'}
+
+
+def told(net, role, beginning):
+    """What a role tells under names with a beginning."""
+    return {name: value for name, value in net[role].standing().items()
+            if name.startswith(beginning)}
+
+
+def estimators(net):
+    """Estimators by cycle; each cycle has one."""
+    found = {}
+    for estimate in net.sent(m.PositionEstimate):
+        assert found.setdefault(estimate.cycle_id, estimate.estimator) == estimate.estimator
+    return found
+
+
+@pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING, State.BEACONING],
+                         ids=lambda state: state.value)
+def test_noise_holds_for_whole_cycles(network, state):
+    net = network()
+    net.run_cycles(2)
+    net.run_to(state)
+    net.change('bs', receiver_noise=False)
+    waits = state is not State.RESTING
+    assert told(net, 'bs', 'pending') == ({'pending.receiver_noise': 'false'} if waits else {})
+    assert told(net, 'bs', 'parameter.receiver') == {
+        'parameter.receiver_noise': str(waits).lower()}
+    net.run_cycles(3)
+    assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
+    assert told(net, 'bs', 'pending') == {}
+    assert net.said('bs') == ["from now on: receiver_noise 'false'"]
+    # The reference signals are with the noise that held at the grant.
+    net.verify()
+    first = 4 if waits else 3
+    assert [net._noise[cycle_id] for cycle_id in range(1, 6)] == [
+        cycle_id < first for cycle_id in range(1, 6)]
+
+
+def test_a_policy_holds_from_the_next_cycle_on_and_the_turns_stay_known(network):
+    net = network(3)
+    net.run_cycles(2)
+    net.run_to(State.SOUNDING)
+    net.change('bs', policy='first')
+    net.run_cycles(3)
+    # The rest of the present cycle, then whoever answers first; all answer at once.
+    first = net.sent(m.Ack, cycle_id=4)[0].user
+    assert net.served() == [1, 2, 3, first, first]
+    net.change('bs', policy='round_robin')
+    net.run_cycles(2)
+    assert set(net.served()[-2:]) == {1, 2, 3} - {first}
+
+
+def test_a_list_of_users_that_lets_nobody_in_can_be_put_right(network):
+    net = network(2, allowed_users='99')
+    net.run(limit_s=2.0)
+    assert net.outcomes() == []
+    net.change('bs', allowed_users='2')
+    net.run_cycles(2)
+    assert net.served() == [2, 2]
+
+
+def test_a_long_rest_ends_when_it_is_to_be_short(network):
+    net = network(rest_s=3000.0)
+    net.run_cycles(1)
+    net.run(limit_s=1.0)
+    net.change('bs', rest_s=0.1)
+    net.run_cycles(2, limit_s=3.0)
+
+
+def test_a_rest_set_in_a_cycle_is_the_one_after_it(network):
+    net = network(rest_s=0.1)
+    net.run_to(State.STEERING)
+    net.change('bs', rest_s=30.0)
+    net.run_cycles(1)
+    end_s = net.now_s
+    net.run_to(State.BEACONING)
+    assert net.now_s == pytest.approx(end_s + 30.0, abs=0.01)
+
+
+def test_retries_change_after_the_cycle(network):
+    net = network(retries=0, step_timeout_s=1.0)
+    net.run_to(State.SOUNDING)
+    net.transport = lambda message, recipient: []
+    net.change('bs', retries=3)
+    net.run_cycles(1)
+    assert net.outcomes() == [(1, 1, 'user_gone')]
+    assert not net.sent(m.PilotRequest)[1:]
+    net.transport = lambda message, recipient: [(1e-3, message)]
+    net.run_to(State.SOUNDING)
+    net.transport = lambda message, recipient: []
+    before = len(net.sent(m.PilotRequest))
+    net.run_cycles(1)
+    assert len(net.sent(m.PilotRequest)) == before + 3
+
+
+def test_before_a_cycle_settings_hold_at_once(network):
+    net = network(codebook=None)
+    net.change('bs', policy='random', data_duration_s=2e-3)
+    assert told(net, 'bs', 'pending') == {}
+    assert told(net, 'bs', 'parameter.policy') == {'parameter.policy': 'random'}
+
+
+@pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING, State.BEACONING],
+                         ids=lambda state: state.value)
+@pytest.mark.parametrize('make_s', [0.0, 0.8])
+def test_an_estimator_changes_between_cycles_and_none_is_lost(network, state, make_s):
+    net = network(make_s=make_s, step_timeout_s=2.0, begin_s=0.0)
+    net.run_cycles(2)
+    net.run_to(state)
+    net.change('positioner', estimator='ml')
+    waiting = {'pending.estimator': 'ml'} if make_s else {}
+    assert told(net, 'positioner', 'pending') == waiting
+    net.run(lambda: not told(net, 'positioner', 'pending'))
+    net.run_cycles(2)
+    assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
+    names = list(estimators(net).values())
+    assert names[:2] == ['centre'] * 2
+    assert names == sorted(names) and names[-1] == 'ml'
+    assert told(net, 'positioner', 'parameter.estimator') == {'parameter.estimator': 'ml'}
+    assert not net['positioner'].counters
+    net.verify()
+
+
+def test_signals_that_were_answered_get_the_same_answer_again(network):
+    net = network()
+    net.run_to(State.STEERING)
+    net.change('positioner', estimator='ml')
+    (signals,) = net.sent(m.ReceivedSignals)
+    net.tell('positioner', signals)
+    assert [estimate.estimator for estimate in net.sent(m.PositionEstimate)] == ['centre'] * 2
+
+
+@pytest.mark.parametrize('make_s', [0.0, 0.5])
+def test_an_estimator_that_cannot_be_made_leaves_the_old_one(network, make_s):
+    net = network(make_s=make_s, step_timeout_s=2.0)
+    net.run_cycles(2)
+    net.change('positioner', **UNFIT)
+    net.run_cycles(10)
+    assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
+    assert set(estimators(net).values()) == {'centre'}
+    assert net.kept == [PositionerSettings()]
+    assert net.said('positioner')[1:] == [
+        'estimator neural not used, bayes stays: model_file: unfit']
+    assert told(net, 'positioner', 'pending') == {}
+    assert told(net, 'positioner', 'failed') == {
+        'failed.estimator': 'neural: model_file: unfit'}
+    net.change('positioner', estimator='ml')
+    assert told(net, 'positioner', 'failed') == {}
+    net.run(lambda: not told(net, 'positioner', 'pending'))
+    net.run_cycles(2)
+    assert list(estimators(net).values())[-1] == 'ml'
+
+
+def test_of_several_estimators_the_last_is_used(network):
+    net = network(make_s=0.5, step_timeout_s=2.0)
+    net.run_cycles(1)
+    net.change('positioner', estimator='neural')
+    net.change('positioner', **UNFIT)
+    net.change('positioner', estimator='ml', model_file='')
+    net.run(limit_s=10.0)
+    assert set(estimators(net).values()) == {'centre', 'ml'}
+    assert net.kept == []
+    # Taken back while it is made: nothing changes.
+    net.change('positioner', estimator='bayes')
+    net.change('positioner', estimator='ml')
+    assert told(net, 'positioner', 'pending') == {}
+    net.run(limit_s=5.0)
+    assert list(estimators(net).values())[-1] == 'ml'
+    net.verify()
+
+
+@pytest.mark.parametrize('codebook_first', [True, False])
+@pytest.mark.parametrize('changed', [{'estimator': 'ml'}, UNFIT])
+def test_estimator_and_codebook_change_together(network, codebooks, codebook_first, changed):
+    net = network(make_s=0.4, step_timeout_s=2.0)
+    net.run_cycles(2)
+    net.run_to(State.SOUNDING)
+    acts = [lambda: net.offer(codebooks[1]), lambda: net.change('positioner', **changed)]
+    for act in acts if codebook_first else acts[::-1]:
+        act()
+    net.run_cycles(15)
+    assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
+    last = net.sent(m.PositionEstimate)[-1]
+    assert last.codebook_id == codebooks[1].id
+    assert last.estimator == ('ml' if changed is not UNFIT else 'centre')
+    estimators(net)
+    net.verify()
+
+
+def test_a_codebook_that_comes_back_comes_with_the_newest_estimator(network, codebooks):
+    net = network()
+    net.run_cycles(1)
+    net.offer(codebooks[1])
+    net.run_cycles(1)
+    net.change('positioner', estimator='ml')
+    net.run_cycles(1)
+    net.offer(codebooks[0])
+    net.run_cycles(1)
+    assert list(estimators(net).values()) == ['centre', 'centre', 'ml', 'ml']
+
+
+def test_without_a_codebook_the_estimator_is_only_noted(network, codebooks):
+    net = network(codebook=None)
+    net.change('positioner', estimator='ml')
+    net.offer(codebooks[0])
+    net.run_cycles(1)
+    assert list(estimators(net).values()) == ['ml']
+
+
+def test_the_air_changes_when_a_cycle_begins(network):
+    net = network()
+    net._roles['channel'] = Impaired(
+        net['channel'], Impairments(), np.random.default_rng(1))
+    net.run_cycles(1)
+    net.run_to(State.SOUNDING)
+    net.change('channel', delay_s=0.2)
+    begin_s = net.now_s
+    assert told(net, 'channel', 'pending') == {'pending.delay_s': '0.2'}
+    net.run_cycles(1)
+    assert net.now_s - begin_s < 0.2
+    net.run_to(State.CONFIGURING)
+    begin_s = net.now_s
+    net.run_cycles(1)
+    # Two bands and the data.
+    assert net.now_s - begin_s > 0.6
+    assert told(net, 'channel', 'p') == {
+        'parameter.loss_probability': '0.0', 'parameter.double_probability': '0.0',
+        'parameter.delay_s': '0.2', 'parameter.jitter_s': '0.0'}
+    assert net.served() == [1, 1, 1]
+    net.change('channel', loss_probability=1.0, delay_s=0.0)
+    net.run_cycles(2)
+    assert net.outcomes()[3:] == [(4, 1, 'user_gone'), (5, 1, 'user_gone')]
+    net.change('channel', loss_probability=0.0)
+    net.run_cycles(2)
+    assert net.served()[3:] == [1, 1]
+
+
+def test_the_codebook_in_use_is_told(network, codebooks):
+    net = network()
+    net.run_cycles(1)
+    net.run_to(State.SOUNDING)
+    net.offer(codebooks[1])
+    takers = ('bs', 'rhs_controller', 'positioner', 'transmission')
+    assert {net[name].standing()['codebook_id'] for name in takers} == {codebooks[0].id}
+    net.run_cycles(2)
+    assert {net[name].standing()['codebook_id'] for name in takers} == {codebooks[1].id}
