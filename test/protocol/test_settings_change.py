@@ -182,6 +182,18 @@ def test_of_several_estimators_the_last_is_used(network):
     net.verify()
 
 
+def test_that_an_estimator_fails_which_nobody_wants_any_more_is_not_told(network):
+    net = network(make_s=0.5, step_timeout_s=2.0)
+    net.run_cycles(1)
+    net.change('positioner', **UNFIT)
+    net.change('positioner', estimator='ml', model_file='')
+    net.run(limit_s=5.0)
+    assert list(estimators(net).values())[-1] == 'ml'
+    assert net.kept == []
+    assert not [text for text in net.said('positioner') if 'not used' in text]
+    assert told(net, 'positioner', 'failed') == {}
+
+
 @pytest.mark.parametrize('codebook_first', [True, False])
 @pytest.mark.parametrize('changed', [{'estimator': 'ml'}, UNFIT])
 def test_estimator_and_codebook_change_together(network, codebooks, codebook_first, changed):
