@@ -97,6 +97,9 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
 
     # The last to listen does so for the first cycle; who does too much has done it by then.
     watch.until_served(2, processes=[network, visualizer])
+    watch.until(lambda: {f'{place}/{name}' for name, place in
+                         watch.node.get_node_names_and_namespaces()} >= allowed.keys(),
+                'every node in the graph', [network, visualizer])
     for path, rights in allowed.items():
         watch.until(lambda path=path, rights=rights: all(
             used(path)[right] >= rights[right] for right in RIGHTS), f'{path} in the graph')
