@@ -10,8 +10,8 @@ from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.positioning import Estimate
-from rhs_isac_ros.protocol import bs_table, user
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol import user
 from rhs_isac_ros.protocol.bs import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.events import (
@@ -23,7 +23,7 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
 from rhs_isac_ros.protocol.rhs_controller import RhsController
-from rhs_isac_ros.protocol.roster import Roster
+from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.topics import NAMES
 
@@ -65,9 +65,9 @@ def cycle():
         'rhs_controller': RhsController(), 'transmission': Transmission(scenario),
         'positioner': Positioner(scenario, lambda: 0.0),
         'bs': BaseStation(
-            scenario, Roster('first', np.random.default_rng(0)),
-            lambda codebook, feeds, user, cycle_id: receive_feeds(scenario, codebook, feeds, None),
-            bs_table.timeouts(0.1, 1.0, 0.1), 1e-3),
+            scenario, BaseStationSettings(policy='first'), np.random.default_rng(0),
+            lambda codebook, feeds, user, cycle_id, noise: receive_feeds(
+                scenario, codebook, feeds, None)),
     }
     sent, queue, now_s = [], collections.deque(), 0.0
 

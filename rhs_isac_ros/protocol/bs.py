@@ -13,7 +13,6 @@ from rhs_isac_ros.protocol.events import (
     Action,
     CodebookOffered,
     Event,
-    Note,
     PeersChanged,
     Send,
     SettingsOffered,
@@ -143,8 +142,8 @@ class BaseStation(Machine):
     def _classify_tick(self) -> Input:
         if self.state is State.BEACONING and self._roster.answered:
             return Input.WINDOW_OVER
-        idle = self.state in (State.RESTING, State.BEACONING)
-        if idle and (self._missing or not self._offered):
+        lacks = self._missing or not self._offered
+        if lacks and self.state in (State.RESTING, State.BEACONING):
             return Input.NOT_READY
         again = self.state in STEPS and self.repeats < self._settings.in_use.retries
         return Input.RETRY if again else Input.TIMEOUT
@@ -213,15 +212,14 @@ class BaseStation(Machine):
         self._codebook = self._offered
         self._complaints.begun()
         self._cycle_id += 1
-        self._attempt = 0
-        self._user, self._band = 0, 0
+        self._attempt = self._user = self._band = 0
         self._frames, self._beam, self._applied = Frames(self._scenario.sizes), None, False
         self._roster.open()
         return self._beacon(now_s)
 
     def _beacon_again(self, event: Event, now_s: float) -> list[Action]:
-        self._attempt += 1
         # Nothing of the cycle depends on the codebook before the grant.
+        self._attempt += 1
         self._codebook = self._offered
         return self._beacon(now_s)
 
@@ -237,11 +235,10 @@ class BaseStation(Machine):
 
     def _grant(self, event: Event, now_s: float) -> list[Action]:
         lost = self._roster.give_up()
-        self.counters.update({'user_lost': len(lost)} if lost else {})
+        self.counters.update('user_lost' for _ in lost)
         self._user = self._roster.select()
         self._band = -1
-        return [Send(m.Grant(self._cycle_id, self._user)),
-                *(Note(f'user {user} answers no more', warning=True) for user in lost)]
+        return [Send(m.Grant(self._cycle_id, self._user)), *self._complaints.lost(lost)]
 
     def _announce_positioning(self, event: Event, now_s: float) -> list[Action]:
         return self._announce(m.Phase.POSITIONING, now_s)
@@ -263,8 +260,7 @@ class BaseStation(Machine):
     def _deliver(self, event: Event, now_s: float) -> list[Action]:
         signals = self._receiver(self._codebook, self._frames.stack(), self._user,
                                  self._cycle_id, self._settings.in_use.receiver_noise)
-        self._received = m.ReceivedSignals(
-            self._cycle_id, self._user, self._codebook_id, signals)
+        self._received = m.ReceivedSignals(self._cycle_id, self._user, self._codebook_id, signals)
         return [Send(self._received), *self._announce(m.Phase.ESTIMATING, now_s)]
 
     def _deliver_again(self, event: Event, now_s: float) -> list[Action]:
@@ -281,10 +277,9 @@ class BaseStation(Machine):
         return [*self._offer_again(event, now_s), *self._announce(m.Phase.TRANSMITTING, now_s)]
 
     def _offer_again(self, event: Event, now_s: float) -> list[Action]:
-        duration_s = self._settings.in_use.data_duration_s
-        bits = self._beam.expected_bps * duration_s // 1
+        span_s = self._settings.in_use.data_duration_s
         return [Send(m.Data(self._cycle_id, self._user, m.Direction.DOWNLINK, m.Stage.OFFERED,
-                            duration_s, bits))]
+                            span_s, self._beam.expected_bps * span_s // 1))]
 
     def _forget_user(self, event: Event, now_s: float) -> None:
         self._roster.forget(self._user)

@@ -41,6 +41,22 @@ class Complaints:
         """Enter that a cycle has begun."""
         self._needs = ()
 
+    @staticmethod
+    def lost(users: Iterable[int]) -> list[Note]:
+        """Enter users that are not waited for any more.
+
+        Parameters
+        ----------
+        users
+            Their numbers.
+
+        Returns
+        -------
+        list of Note
+            A warning of each.
+        """
+        return [Note(f'user {user} answers no more', warning=True) for user in users]
+
     def given_up(self, cycle_id: int, user: int, reason: str) -> list[Note]:
         """Enter a cycle that was given up.
 

@@ -9,37 +9,24 @@ the same run and with the same executor.
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 import rclpy
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
+from parts.hops import hops_of, ping_pong
 
-from rhs_isac_msgs.msg import FeedSignals
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.demo import start_network, watch
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
-from rhs_isac_ros.ros.run import find_each_other_quickly, run
+from rhs_isac_ros.ros.run import find_each_other_quickly
 
-# The chain of a cycle; the pilots of a band travel side by side and count once.
-BEFORE = ('beacon', 'ack')
-PER_BAND = ('rhs/command', 'rhs/configuration', 'pilot_request', 'pilot', 'feed_signals')
-AFTER = ('received_signals', 'position_estimate', 'beam', 'rhs/configuration',
-         'data', 'data', 'data', 'data')
-ROUND_TRIPS = 2000
 # Between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
-PONG = '--pong'
 
 
 def main() -> int:
@@ -52,7 +39,7 @@ def main() -> int:
     options = parser.parse_args()
     os.environ.update(private_domain())
     scenario = Scenario()
-    hops = len(BEFORE) + scenario.n_bands * len(PER_BAND) + len(AFTER)
+    hops = hops_of(scenario)
     find_each_other_quickly()
     rclpy.init(args=[])
     try:
@@ -98,56 +85,5 @@ def run_cycles(scenario: Scenario, users: int, cycles: int) -> list:
     return observer.log.complete
 
 
-def ping_pong(scenario: Scenario) -> np.ndarray:
-    """Measure round trips between this process and another one [s]."""
-    feeds = np.ones((scenario.n_subbands, scenario.n_feeds), complex)
-    ball = convert.to_ros(m.FeedSignals(1, 1, 0, 0, feeds), None)
-    times_s: list[float] = []
-    node = Node('ping')
-    publisher = node.create_publisher(FeedSignals, 'benchmark/ping', qos.EXCHANGE)
-
-    def on_pong(message: FeedSignals) -> None:
-        times_s.append(time.perf_counter() - on_pong.sent_s)
-        on_pong.sent_s = time.perf_counter()
-        publisher.publish(ball)
-
-    node.create_subscription(
-        FeedSignals, 'benchmark/pong', on_pong, qos.EXCHANGE,
-        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
-    executor = EventsExecutor()
-    executor.add_node(node)
-    other = subprocess.Popen([sys.executable, __file__, PONG])
-    try:
-        while not (publisher.get_subscription_count() and node.count_publishers('benchmark/pong')):
-            executor.spin_once(timeout_sec=0.1)
-        while len(times_s) < ROUND_TRIPS:
-            before = len(times_s)
-            if before == 0:
-                on_pong.sent_s = time.perf_counter()
-                publisher.publish(ball)
-            executor.spin_once(timeout_sec=1.0)
-    finally:
-        other.terminate()
-        other.wait()
-        executor.shutdown()
-        node.destroy_node()
-    return np.array(times_s[ROUND_TRIPS // 10:])
-
-
-def pong() -> int:
-    """Send back what comes, until a signal ends the process."""
-    def make() -> list[Node]:
-        node = Node('pong')
-        publisher = node.create_publisher(FeedSignals, 'benchmark/pong', qos.EXCHANGE)
-        node.create_subscription(
-            FeedSignals, 'benchmark/ping', publisher.publish, qos.EXCHANGE,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
-        return [node]
-
-    return run(make, [])
-
-
 if __name__ == '__main__':
-    if sys.argv[1:] == [PONG]:
-        sys.exit(pong())
     sys.exit(main())

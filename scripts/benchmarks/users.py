@@ -10,18 +10,21 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
-import cycle
 import numpy as np
 import rclpy
+from parts.hops import hops_of, ping_pong
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.nodes.demo import start_network, watch
-from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.nodes.chaos.watcher import Watcher
+from rhs_isac_ros.nodes.demo import start_network
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
+
+PATIENCE_S = 600.0
 
 
 def main() -> int:
@@ -43,10 +46,10 @@ def main() -> int:
     try:
         few, many = (run_network(scenario, users, cycles, options.composed)
                      for users in (options.few, options.users))
-        hop_s = np.median(cycle.ping_pong(scenario)) / 2
+        hop_s = np.median(ping_pong(scenario)) / 2
     finally:
         rclpy.try_shutdown()
-    hops = len(cycle.BEFORE) + scenario.n_bands * len(cycle.PER_BAND) + len(cycle.AFTER)
+    hops = hops_of(scenario)
     figures = {
         'composed': options.composed, 'hop_us': 1e6 * hop_s, 'floor_ms': 1e3 * hops * hop_s,
         'few': few, 'many': many, 'rate_ratio': many['rate_hz'] / few['rate_hz'],
@@ -56,9 +59,8 @@ def main() -> int:
     for name in ('few', 'many'):
         one = figures[name]
         print(f'{one["users"]:3d} users, {where}: {one["rate_hz"]:.2f} cycles/s, cycle '
-              f'{one["cycle_ms"]:.1f} ms from the grant, {one["beaconing_ms"]:.1f} ms for beacon '
-              f'and acks; each waits {one["longest_wait_cycles"]} cycles at most, '
-              f'{one["longest_wait_s"]:.2f} s')
+              f'{one["cycle_ms"]:.1f} ms, {one["given_up"]} given up; each waits '
+              f'{one["longest_wait_cycles"]} cycles at most, {one["longest_wait_s"]:.2f} s')
     print(f'bare rclpy: {figures["floor_ms"]:.2f} ms for the {hops} hops of a cycle')
     print(f'rate with {options.users} users, of that with {options.few}: '
           f'{figures["rate_ratio"]:.2f}; fair within one round: {figures["fair"]}')
@@ -69,7 +71,7 @@ def main() -> int:
 
 def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> dict:
     """Run a network until everybody is known, and so many cycles more."""
-    observer = CycleObserver()
+    watcher = Watcher(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             if composed:
@@ -77,43 +79,36 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
             else:
                 start_network(
                     processes, users, 0, None, default_codebook_file(), scenario, rest_s=0.0)
-            problem = wait_for_all(observer, processes, users)
-            first = len(observer.log.complete)
-            problem = problem or watch(observer, processes, first + cycles, lambda *_: None)
-    observer.destroy_node()
-    if problem:
-        raise RuntimeError(problem)
-    records = observer.log.complete[first:]
-    begins_s = np.array([record.began_s for record in records])
-    spans = [record.durations_s() for record in records]
-    beaconing = next(iter(spans[0]))
+            spin(watcher, lambda: {end.user for end in watcher.ends} == {*range(1, users + 1)},
+                 'a cycle of each user')
+            first = len(watcher.ends)
+            spin(watcher, lambda: len(watcher.ends) >= first + cycles, f'{cycles} cycles')
+    watcher.destroy_node()
+    ends = watcher.ends[first:first + cycles]
+    served = [end for end in ends if end.outcome == 'served']
+    ended_s = np.array([end.ended_s for end in served])
     return {
-        'users': users, 'cycles': len(records), 'given_up': len(observer.log.given_up),
-        'rate_hz': (len(records) - 1) / (begins_s[-1] - begins_s[0]),
-        'beaconing_ms': 1e3 * np.median([span[beaconing] for span in spans]),
-        'cycle_ms': 1e3 * np.median(
-            [sum(span.values()) - span[beaconing] for span in spans]),
-        **waits([record.user for record in records], begins_s),
+        'users': users, 'cycles': len(ends), 'given_up': len(ends) - len(served),
+        'rate_hz': (len(served) - 1) / (ended_s[-1] - ended_s[0]),
+        'cycle_ms': 1e3 * np.median([end.ended_s - end.began_s for end in served]),
+        **waits([end.user for end in served], ended_s),
     }
 
 
-def wait_for_all(observer: CycleObserver, processes: Processes, users: int) -> str:
-    """Watch until every user was served; return what went wrong, or nothing."""
-    problem, served = '', set()
-    while len(served) < users and not problem:
-        problem = watch(observer, processes, len(observer.log.complete) + 1, lambda *_: None)
-        served = {record.user for record in observer.log.complete}
-    return problem
+def spin(watcher: Watcher, done: Callable[[], bool], what: str) -> None:
+    """Hear messages until something is so."""
+    if not watcher.spin_until(done, PATIENCE_S):
+        raise RuntimeError(f'{what}: not within {PATIENCE_S:g} s')
 
 
-def waits(order: list[int], begins_s: np.ndarray) -> dict:
+def waits(order: list[int], ended_s: np.ndarray) -> dict:
     """Longest wait of any user, in cycles and in time, from one of its cycles to the next."""
     last: dict[int, int] = {}
     longest, longest_s = 0, 0.0
     for index, user in enumerate(order):
         if user in last:
             longest = max(longest, index - last[user])
-            longest_s = max(longest_s, float(begins_s[index] - begins_s[last[user]]))
+            longest_s = max(longest_s, float(ended_s[index] - ended_s[last[user]]))
         last[user] = index
     # Who does not come again still waits.
     for index in last.values():

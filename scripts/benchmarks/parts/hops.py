@@ -1,0 +1,81 @@
+"""The hops of a cycle as bare rclpy ping-pong: the floor under every cycle."""
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+
+from rhs_isac_msgs.msg import FeedSignals
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros.run import run
+
+# The chain of a cycle; the pilots of a band travel side by side and count once.
+BEFORE = ('beacon', 'ack')
+PER_BAND = ('rhs/command', 'rhs/configuration', 'pilot_request', 'pilot', 'feed_signals')
+AFTER = ('received_signals', 'position_estimate', 'beam', 'rhs/configuration',
+         'data', 'data', 'data', 'data')
+ROUND_TRIPS = 2000
+
+
+def hops_of(scenario: Scenario) -> int:
+    """Count the messages of a cycle that wait for each other."""
+    return len(BEFORE) + scenario.n_bands * len(PER_BAND) + len(AFTER)
+
+
+def ping_pong(scenario: Scenario) -> np.ndarray:
+    """Measure round trips between this process and another one [s]."""
+    feeds = np.ones((scenario.n_subbands, scenario.n_feeds), complex)
+    ball = convert.to_ros(m.FeedSignals(1, 1, 0, 0, feeds), None)
+    times_s: list[float] = []
+    node = Node('ping')
+    publisher = node.create_publisher(FeedSignals, 'benchmark/ping', qos.EXCHANGE)
+
+    def on_pong(message: FeedSignals) -> None:
+        times_s.append(time.perf_counter() - on_pong.sent_s)
+        on_pong.sent_s = time.perf_counter()
+        publisher.publish(ball)
+
+    node.create_subscription(
+        FeedSignals, 'benchmark/pong', on_pong, qos.EXCHANGE,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+    executor = EventsExecutor()
+    executor.add_node(node)
+    other = subprocess.Popen([sys.executable, __file__])
+    try:
+        while not (publisher.get_subscription_count() and node.count_publishers('benchmark/pong')):
+            executor.spin_once(timeout_sec=0.1)
+        while len(times_s) < ROUND_TRIPS:
+            before = len(times_s)
+            if before == 0:
+                on_pong.sent_s = time.perf_counter()
+                publisher.publish(ball)
+            executor.spin_once(timeout_sec=1.0)
+    finally:
+        other.terminate()
+        other.wait()
+        executor.shutdown()
+        node.destroy_node()
+    return np.array(times_s[ROUND_TRIPS // 10:])
+
+
+def pong() -> int:
+    """Send back what comes, until a signal ends the process."""
+    def make() -> list[Node]:
+        node = Node('pong')
+        publisher = node.create_publisher(FeedSignals, 'benchmark/pong', qos.EXCHANGE)
+        node.create_subscription(
+            FeedSignals, 'benchmark/ping', publisher.publish, qos.EXCHANGE,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        return [node]
+
+    return run(make, [])
+
+
+if __name__ == '__main__':
+    sys.exit(pong())
