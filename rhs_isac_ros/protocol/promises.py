@@ -70,7 +70,8 @@ class Promises:
         self._cycles: dict[int, _Evidence] = {}
         self._results: collections.deque[tuple[float, m.PositionEstimate | m.Capacity]] = (
             collections.deque())
-        self._unheard: set[type[m.Message]] = set()
+        # At first everybody is still being found.
+        self._unheard: set[type[m.Message]] = set(RECEIVES)
         self.checked = self.unverified = 0
         self.broken: list[str] = []
 

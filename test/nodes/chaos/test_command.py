@@ -30,7 +30,7 @@ def test_a_node_is_killed_and_served_again(small_files, tmp_path):
         small_files, tmp_path, '--nodes', 'rhs_controller', '--phases', 'positioning')
     assert figures['cells'] == 1
     assert figures['wrong_publications'] == 0, said
-    assert figures['checked_publications'] > 5
+    assert figures['checked_publications'] > figures['unverified_publications']
     (cell,) = figures['table']
     assert (cell['node'], cell['phase'], cell['others_alive']) == (
         'rhs_controller', 'positioning', True)
