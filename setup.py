@@ -53,8 +53,7 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
-            *(f'{tool} = {NAME}.nodes.cli.{tool}:main' for tool in TOOLS),
+            f'{name} = {NAME}.executables:{name}' for name in (*NODES, *TOOLS)
         ],
     },
 )

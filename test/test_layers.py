@@ -67,7 +67,7 @@ def test_the_package_is_made_of_its_layers():
                if path.is_dir() and any(path.rglob('*.py'))}
     assert folders <= set(LAYERS)
     assert set(PURE_LAYERS[:4]) <= folders
-    assert {path.name for path in ROOT.glob('*.py')} == {'__init__.py'}
+    assert {path.name for path in ROOT.glob('*.py')} == {'__init__.py', 'executables.py'}
 
 
 @pytest.mark.parametrize('path', MODULES, ids=module_name)

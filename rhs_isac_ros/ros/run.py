@@ -19,14 +19,20 @@ from rhs_isac_ros.ros.resources import discovery_profile_file
 
 # The executor looks at least this often whether a signal has come.
 _POLL_S = 0.5
+# Where Fast DDS is told of a file with profiles.
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 def find_each_other_quickly() -> None:
     """Have Fast DDS tell sooner than usual who is gone and who is back, in this process.
 
-    It reads a profile when the first node is made; one that the environment names already stays.
+    It reads a profile when the first node is made. One that the environment names already stays;
+    an empty name stands for none at all.
     """
-    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(discovery_profile_file()))
+    file = os.environ.setdefault(_PROFILES, str(discovery_profile_file()))
+    if not file:
+        # Fast DDS would complain of it.
+        del os.environ[_PROFILES]
 
 
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,

@@ -31,7 +31,8 @@ def test_random_messages_can_be_sent_and_some_are_malformed(kind):
 
 
 def test_mutants_of_a_true_message_are_partly_well_formed():
-    true = serialize_message(ros.PilotRequest(cycle_id=7, user=1, band=1, n_frames=Scenario().n_frames))
+    true = serialize_message(ros.PilotRequest(
+        cycle_id=7, user=1, band=1, n_frames=Scenario().n_frames))
     rng = np.random.default_rng(1)
     lies = [lie(ros.PilotRequest, [true], rng) for _ in range(400)]
     good = [content for content in lies if verdict(m.PilotRequest, content)]
