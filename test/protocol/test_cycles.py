@@ -367,3 +367,13 @@ def test_a_cycle_of_table_1_finds_the_user(network_class, shipped, table1_estima
         assert estimate.estimator == 'bayes'
         assert report.expected_bps == pytest.approx(report.actual_bps, rel=0.05)
         assert 0 <= report.loss_percent < 1
+
+
+def test_of_64_users_none_waits_more_than_a_round(network, places):
+    net = network({user: places[0] for user in range(1, 65)}, rest_s=0.0)
+    net.run_cycles(1 + 64 + 4)
+    # The first ack ends the wait of the first cycle: nobody else is known yet.
+    assert net.counters() == {'bs': {'late_ack': 63}}
+    served = net.served()[1:]
+    assert sorted(served[:64]) == list(range(1, 65))
+    assert served[64:] == served[:4]
