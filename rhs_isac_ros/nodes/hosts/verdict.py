@@ -10,7 +10,7 @@ from rhs_isac_ros.protocol.cycle_log import CycleRecord
 
 # A network that is whole again serves within this time [s].
 PROMISE_S = 3.0
-_WAITS = 'waiting for '
+_WARNS, _WAITS = '[WARN]', 'waiting for '
 # What was under way when a link was pulled is through by then [s].
 _CUT_S = 0.2
 
@@ -32,8 +32,10 @@ class Pull:
         Complete cycles in some seconds before the pull, of those that began and ended during it,
         and after it until the end of the watch. A network lacks something without any of its
         hosts: a cycle during the pull has found another way than the link.
-    said, diagnosed
-        Nodes that said during the pull, in their log or diagnostics, for whom they wait.
+    said
+        Nodes that warned in their log during the pull.
+    diagnosed
+        Nodes whose diagnostics told during the pull for whom they wait.
     untold
         Nodes that should have said so, and did not.
     repeated
@@ -113,8 +115,9 @@ def judge(
     wait = tuple(sorted(node for node, texts in lines.items() if texts))
     diagnosed = tuple(sorted(node for node, texts in warnings.items()
                              if any(text.startswith(_WAITS) for text in texts)))
+    spoke = tuple(sorted(node for node, text in said.items() if _WARNS in text))
     return Pull(
-        host, back_s - pulled_s, recovery_s(cycles, back_s), *counts, wait, diagnosed,
+        host, back_s - pulled_s, recovery_s(cycles, back_s), *counts, spoke, diagnosed,
         untold=tuple(node for node in waiters if node not in wait or node not in diagnosed),
         repeated=tuple(sorted(node for node, texts in lines.items()
                               if max(collections.Counter(texts).values(), default=0) > 1)))
