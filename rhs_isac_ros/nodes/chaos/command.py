@@ -20,12 +20,13 @@ from rhs_isac_ros.nodes.chaos import crashes, fuzzing, report, soaking
 from rhs_isac_ros.nodes.chaos.watcher import Watcher
 from rhs_isac_ros.nodes.demo import start_network
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.promises import SETTLE_S
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
 
-# Pause between cycles [s].
-_REST_S = 0.02
+# Pause between cycles; beside lies, so long that true messages leave room in the queues [s].
+_REST_S, _REST_BESIDE_LIES_S = 0.02, 0.2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with processes:
                 start_network(
                     processes, 2, options.seed, options.config, codebook_file, scenario,
-                    rest_s=_REST_S, first_cycle=0,
+                    rest_s=_REST_BESIDE_LIES_S if options.fuzz else _REST_S, first_cycle=0,
                     impairments=soaking.AIR if options.soak else None)
                 figures = _run(watcher, processes, scenario, options)
         except crashes.ChaosError as error:
@@ -90,7 +91,8 @@ def _soak(watcher: Watcher, processes: Processes, options: argparse.Namespace) -
     soaked = soaking.soak(
         watcher, processes, options.soak, lambda minutes, cycles: _progress(
             f'{minutes:.1f} of {options.soak:g} minutes, {cycles} cycles'))
-    watcher.promises.close()
+    # What came last cannot be judged yet, and what comes now need not be.
+    watcher.spin_until(lambda: False, SETTLE_S)
     figures = report.soak_figures(soaked, watcher.promises)
     print(report.soak_text(soaked, figures))
     return figures
@@ -116,7 +118,7 @@ def _crash(watcher: Watcher, processes: Processes, options: argparse.Namespace) 
     cells = crashes.crash_all(
         watcher, processes, options.nodes, [m.Phase[name.upper()] for name in options.phases],
         lambda cell: print(report.crash_line(cell), flush=True))
-    watcher.promises.close()
+    watcher.spin_until(lambda: False, SETTLE_S)
     figures = report.crash_figures(cells, watcher.promises)
     print(report.crash_summary(figures))
     return figures

@@ -22,8 +22,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.processes import Processes
 
-# Lies on one topic at a time; the queues of the nodes take twice as many.
-_BATCH = 64
+# Lies on one topic at a time; the queues of the nodes take four times as many.
+_BATCH = 32
 _PATIENCE_S = 30.0
 _HEARD = 32
 # What is not a message of the protocol, by topic.

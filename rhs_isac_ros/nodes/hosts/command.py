@@ -115,7 +115,6 @@ class Trial:
     def settle(self) -> None:
         """Watch until all that is still on its way has come."""
         self._spin(promises.SETTLE_S)
-        self._observer.promises.close()
 
     def _spin(self, seconds: float, cycles: int = 0) -> None:
         """Watch for a time, or until that many more cycles began and were served."""
