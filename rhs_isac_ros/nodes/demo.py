@@ -42,13 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    if not options.picture.resolve().parent.is_dir():
-        parser.error(f'argument --picture: {options.picture}, expected a file in a directory '
-                     'that exists')
+    check_directory(parser, '--picture', options.picture)
     try:
-        scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
-        codebook_file = Path(options.codebook or default_codebook_file()).resolve()
-        Codebook.load(codebook_file).check(scenario)
+        scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
         print(f'error: {error}\nA codebook for a scenario is made by: python -m '
               'rhs_isac_ros.codebook --scenario FILE --output FILE', file=sys.stderr)
@@ -80,6 +76,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report(observer, scenario, options, problem)
     except KeyboardInterrupt:
         return 0
+
+
+def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
+    """Read a scenario, and see whether a codebook fits it.
+
+    Parameters
+    ----------
+    config
+        File of the scenario, or None for Table I.
+    codebook
+        File of the codebook, or None for the package's.
+
+    Returns
+    -------
+    tuple of Scenario and pathlib.Path
+        The scenario, and where the codebook lies.
+
+    Raises
+    ------
+    ScenarioError
+        If the scenario file is wrong.
+    CodebookError
+        If the codebook file is wrong, or does not fit.
+    """
+    scenario = Scenario.from_yaml(config) if config else Scenario()
+    codebook_file = Path(codebook or default_codebook_file()).resolve()
+    Codebook.load(codebook_file).check(scenario)
+    return scenario, codebook_file
+
+
+def check_directory(parser: argparse.ArgumentParser, argument: str, file: Path | None) -> None:
+    """End with a usage error if a file could not be written at the end of a run.
+
+    Parameters
+    ----------
+    parser
+        The parser of the command line.
+    argument
+        Name of the argument.
+    file
+        Its value; None if it was not given.
+    """
+    if file and not file.resolve().parent.is_dir():
+        parser.error(f'argument {argument}: {file}, expected a file in a directory that exists')
 
 
 def start_network(

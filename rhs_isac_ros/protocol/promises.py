@@ -112,11 +112,6 @@ class Promises:
         while self._results and self._results[0][0] <= now_s:
             self._judge(self._results.popleft()[1])
 
-    def close(self) -> None:
-        """Judge the results that are left, as if nothing more came."""
-        while self._results:
-            self._judge(self._results.popleft()[1])
-
     def _note(self, message: m.Message) -> None:
         cycle = self._cycles.get(message.cycle_id)
         if cycle is None:

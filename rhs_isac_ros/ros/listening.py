@@ -1,19 +1,46 @@
-"""Listening to a network from outside: what is malformed is dropped, with a word in the log."""
+"""Subscribing, and listening to a network from outside."""
 
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+
+
+def subscribe(
+        node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
+        raw: bool = False) -> None:
+    """Subscribe to a topic, without the events that would make executors slow.
+
+    Parameters
+    ----------
+    node
+        The node that listens.
+    kind
+        ROS type of the topic.
+    name
+        Name of the topic.
+    callback
+        Called with each message.
+    profile
+        Quality of service.
+    raw
+        Whether the callback gets the message in CDR, as bytes.
+    """
+    node.create_subscription(
+        kind, name, callback, profile, raw=raw,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
 
 
 def listen(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         then: Callable[[m.Message], None],
         dropped: Callable[[m.MessageError], None] | None = None) -> None:
-    """Subscribe to messages of the protocol.
+    """Subscribe to messages of the protocol; what is malformed is dropped, with a word in the log.
 
     Parameters
     ----------
@@ -41,7 +68,5 @@ def listen(
             return
         then(plain)
     for kind in kinds:
-        node.create_subscription(
-            convert.ros_type(kind), topics.NAMES[kind],
-            lambda message, kind=kind: take(kind, message), qos.of(kind),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
+                  lambda message, kind=kind: take(kind, message), qos.of(kind))

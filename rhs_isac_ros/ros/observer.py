@@ -3,13 +3,12 @@
 import time
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 
 from rhs_isac_ros.protocol import cycle_log
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.listening import listen
 from rhs_isac_ros.ros.recording import Recorder
 
 
@@ -36,15 +35,11 @@ class CycleObserver(Node):
             recorder.listen(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))
             return
-        for kind in cycle_log.RECEIVES:
-            self.create_subscription(
-                convert.ros_type(kind), topics.NAMES[kind],
-                lambda message, kind=kind: self._on_message(kind, message), qos.EXCHANGE,
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        listen(self, cycle_log.RECEIVES, None, self._on_message)
 
     def _on_recorded(self, kind: type[m.Message] | None, message: bytes) -> None:
         if kind is not None:
-            self._on_message(kind, deserialize_message(message, convert.ros_type(kind)))
+            self._on_message(convert.from_bytes(kind, message))
 
-    def _on_message(self, kind: type[m.Message], message: Any) -> None:
-        self.log.add(convert.from_ros(kind, message), time.monotonic())
+    def _on_message(self, message: m.Message) -> None:
+        self.log.add(message, time.monotonic())

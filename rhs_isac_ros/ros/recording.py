@@ -14,7 +14,6 @@ import yaml
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
@@ -22,6 +21,7 @@ from rclpy.serialization import deserialize_message
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.listening import subscribe
 
 # What stands between the definitions of a schema, as in ROS 1 and 2.
 _RULE = '=' * 80
@@ -166,9 +166,8 @@ class Recorder:
                 schema_id=self._writer.register_schema(
                     type_name(kind), 'ros2msg', schema(kind).encode()),
                 metadata={'offered_qos_profiles': _offered(profile)})
-            node.create_subscription(
-                kind, name, self._writes(channel, name, then), profile, raw=True,
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+            subscribe(
+                node, kind, name, self._writes(channel, name, then), profile, raw=True)
 
     def _writes(
             self, channel: int, name: str, then: Callable[[str, bytes], None] | None

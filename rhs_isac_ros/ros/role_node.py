@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
@@ -23,6 +22,7 @@ from rhs_isac_ros.protocol.health import Health, Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.listening import subscribe
 from rhs_isac_ros.ros.settable_node import SettableNode
 from rhs_isac_ros.ros.timers import steady_timer
 
@@ -170,10 +170,8 @@ class RoleNode(SettableNode):
         for kind in receives:
             if kind not in self._listening:
                 self._listening.add(kind)
-                self.create_subscription(
-                    convert.ros_type(kind), topics.NAMES[kind], self._receiver(kind),
-                    qos.of(kind), raw=True, event_callbacks=SubscriptionEventCallbacks(
-                        use_default_callbacks=False))
+                subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
+                          self._receiver(kind), qos.of(kind), raw=True)
 
     @staticmethod
     def now_s() -> float:

@@ -9,6 +9,9 @@ import pytest
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.promises import RECEIVES, Promises
 
+# Of a cycle without results: what came before it is judged.
+END = m.Grant(0, 1)
+
 
 @pytest.fixture
 def heard(network):
@@ -24,7 +27,7 @@ def judge(net, messages, codebooks=True):
         promises.know(codebook)
     for message in messages:
         promises.add(message, 0.0)
-    promises.close()
+    promises.add(END, 1e9)
     return promises
 
 
@@ -127,14 +130,14 @@ def test_what_a_new_publisher_said_before_it_was_heard_is_not_missed(heard):
         # The first estimate to be heard is that of cycle 3.
         if not (isinstance(message, m.PositionEstimate) and message.cycle_id < 3):
             promises.add(message, 0.0)
-    promises.close()
+    promises.add(END, 1e9)
     assert promises.broken == []
     assert (promises.checked, promises.unverified) == (6, 2)
     # What was heard must fit all the same, and later ones may not be missing.
     for message in messages_of(heard):
         if not isinstance(message, m.PositionEstimate) and message.cycle_id == 4:
             promises.add(dataclasses.replace(message, cycle_id=5), 0.0)
-    promises.close()
+    promises.add(END, 1e9)
     assert promises.broken == [
         f'Capacity of cycle 5, user 2, codebook {next(iter(heard.codebooks))}: no such estimate']
 

@@ -13,16 +13,15 @@ import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.nodes.chaos import crashes, fuzzing, report, soaking
 from rhs_isac_ros.nodes.chaos.watcher import Watcher
-from rhs_isac_ros.nodes.demo import start_network
+from rhs_isac_ros.nodes.demo import check_directory, load_files, start_network
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.promises import SETTLE_S
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
 
 # Pause between cycles; beside lies, so long that true messages leave room in the queues [s].
@@ -43,11 +42,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0 if all promises held, also after Ctrl-C; 1 if one was broken; 2 if an
         argument or a file is wrong.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    check_directory(parser, '--json', options.json)
     try:
-        scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
-        codebook_file = Path(options.codebook or default_codebook_file()).resolve()
-        Codebook.load(codebook_file).check(scenario)
+        scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
@@ -20,6 +19,7 @@ from rhs_isac_ros.nodes.chaos.lies import lie
 from rhs_isac_ros.nodes.chaos.watcher import Watcher
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.listening import subscribe
 from rhs_isac_ros.ros.processes import Processes
 
 # Lies on one topic at a time; the queues of the nodes take four times as many.
@@ -79,9 +79,7 @@ class _Mouth:
         self.publisher = node.create_publisher(kind, name, profile)
         self.heard: collections.deque[bytes] = collections.deque(maxlen=_HEARD)
         self._told: collections.deque[bytes] = collections.deque(maxlen=4 * _BATCH)
-        node.create_subscription(
-            kind, name, self._hear, profile, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        subscribe(node, kind, name, self._hear, profile, raw=True)
 
     def tell(self, rng: np.random.Generator) -> bytes:
         """Publish a lie, and return it."""

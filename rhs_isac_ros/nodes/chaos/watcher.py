@@ -9,7 +9,6 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
@@ -19,6 +18,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import promises
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.listening import subscribe
 
 _HEARS = (*promises.RECEIVES, m.Beacon, m.ProtocolState)
 
@@ -135,9 +135,7 @@ class Watcher(Node):
             # the class is RuntimeError at least.
             with contextlib.suppress(m.MessageError, CodebookError, RuntimeError, ValueError):
                 take(content)
-        self.create_subscription(
-            kind, name, receive, profile, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        subscribe(self, kind, name, receive, profile, raw=True)
 
     def _on_message(self, message: m.Message, now_s: float) -> None:
         m.check(message, self._sizes)

@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
@@ -16,7 +15,7 @@ from rhs_isac_ros.nodes.cli.session import say
 from rhs_isac_ros.nodes.cli.watch_view import render
 from rhs_isac_ros.protocol.overview import RECEIVES, Overview
 from rhs_isac_ros.ros import diagnostics, qos, topics
-from rhs_isac_ros.ros.listening import listen
+from rhs_isac_ros.ros.listening import listen, subscribe
 from rhs_isac_ros.ros.run import run
 
 _REFRESH_S = 0.25
@@ -39,9 +38,7 @@ class WatchNode(Node):
         # What is malformed, the nodes count: a word in the log would go across the view.
         listen(self, RECEIVES, None,
                lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
-        self.create_subscription(
-            DiagnosticArray, topics.DIAGNOSTICS, self._hear, qos.EXCHANGE,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._hear, qos.EXCHANGE)
 
     def _hear(self, message: DiagnosticArray) -> None:
         for name, report in diagnostics.from_ros(message):

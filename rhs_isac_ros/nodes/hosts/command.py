@@ -12,16 +12,17 @@ from pathlib import Path
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.nodes.demo import start_network
+from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.nodes.demo import check_directory, load_files, start_network
 from rhs_isac_ros.nodes.hosts import plan
 from rhs_isac_ros.nodes.hosts.namespaces import Hosts, NamespacesRefused, guarded
 from rhs_isac_ros.nodes.hosts.observer import HostsObserver
 from rhs_isac_ros.nodes.hosts.verdict import PROMISE_S, Pull, figures, judge, table
 from rhs_isac_ros.protocol import promises
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.ros.resources import default_codebook_file, discovery_profile_file
+from rhs_isac_ros.ros.resources import discovery_profile_file
 
 # Exit code of what could not be tried, as test drivers know it.
 SKIPPED = 77
@@ -145,13 +146,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    if options.json and not options.json.resolve().parent.is_dir():
-        parser.error(f'argument --json: {options.json}, expected a file in a directory that '
-                     'exists')
+    check_directory(parser, '--json', options.json)
     try:
-        scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
-        codebook_file = Path(options.codebook or default_codebook_file()).resolve()
-        Codebook.load(codebook_file).check(scenario)
+        scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
@@ -225,13 +222,11 @@ def _report(
         print(f'wrong: {text}')
     good = not wrong and all(pull.holds for pull in pulls)
     if file is not None:
-        aside = file.with_name(f'{file.name}.part')
-        aside.write_text(json.dumps({
+        write_whole(file, json.dumps({
             **figures(pulls), 'wrong_publications': len(wrong), 'wrong': wrong,
             'cycles_served': len(observer.log.complete),
             'cycles_given_up': len(observer.log.given_up),
-            'packets': packets, 'passed': good}, indent=1) + '\n', encoding='utf-8')
-        aside.replace(file)
+            'packets': packets, 'passed': good}, indent=1) + '\n')
     return 0 if good else 1
 
 

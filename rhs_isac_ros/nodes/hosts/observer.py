@@ -4,15 +4,14 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import cycle_log, promises
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.listening import listen, subscribe
 
 
 class HostsObserver(Node):
@@ -38,27 +37,18 @@ class HostsObserver(Node):
         self.log = cycle_log.CycleLog()
         self.promises = promises.Promises(scenario)
         self.warnings: dict[str, list[str]] = {}
-        for kind in topics.NAMES:
-            self._listen(
-                convert.ros_type(kind), topics.NAMES[kind],
-                lambda message, kind=kind: self._on_message(kind, message))
-        self._listen(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics)
-        self._listen(ros.Codebook, topics.CODEBOOK, lambda message: self.promises.know(
+        kinds = dict.fromkeys((*cycle_log.RECEIVES, *promises.RECEIVES))
+        listen(self, kinds, scenario.sizes, self._on_message)
+        subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.EXCHANGE)
+        subscribe(self, ros.Codebook, topics.CODEBOOK, lambda message: self.promises.know(
             convert.codebook_from_ros(message)), qos.LATCHED)
 
-    def _listen(
-            self, kind: type, topic: str, callback: Any, profile: QoSProfile = qos.EXCHANGE
-    ) -> None:
-        self.create_subscription(
-            kind, topic, callback, profile,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
-
-    def _on_message(self, kind: type[m.Message], message: Any) -> None:
-        plain, now_s = convert.from_ros(kind, message), time.monotonic()
-        if isinstance(plain, cycle_log.RECEIVES):
-            self.log.add(plain, now_s)
-        if isinstance(plain, promises.RECEIVES):
-            self.promises.add(plain, now_s)
+    def _on_message(self, message: m.Message) -> None:
+        now_s = time.monotonic()
+        if isinstance(message, cycle_log.RECEIVES):
+            self.log.add(message, now_s)
+        if isinstance(message, promises.RECEIVES):
+            self.promises.add(message, now_s)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
