@@ -9,8 +9,8 @@ import os
 import signal
 from collections.abc import Callable
 
-# Modules with a function `main`, by the name of the executable, where that differs.
-_ELSEWHERE = {name: f'cli.{name}' for name in ('record', 'replay', 'snapshot', 'watch')}
+# Executables whose module is in `tools`; those of all others are in `nodes`.
+_TOOLS = ('demo', 'record', 'replay', 'snapshot', 'watch')
 
 
 def __getattr__(name: str) -> Callable[[], int]:
@@ -37,7 +37,8 @@ def __getattr__(name: str) -> Callable[[], int]:
     def main() -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: os._exit(0))
-        module = importlib.import_module(f'rhs_isac_ros.nodes.{_ELSEWHERE.get(name, name)}')
+        module = importlib.import_module(
+            f'rhs_isac_ros.{"tools" if name in _TOOLS else "nodes"}.{name}')
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         return module.main()

@@ -1,5 +1,6 @@
 """Fixtures that all tests share, and the paper's equations written out index by index."""
 
+import importlib.util
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,10 @@ import pytest
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 
+# Fixtures that several folders share. Those of processes need ROS, which the pure layers do not.
+pytest_plugins = ['in_memory_network']
+if importlib.util.find_spec('rclpy'):
+    pytest_plugins.append('node_processes')
 HERE = Path(__file__).resolve().parent
 
 # The same examples in every run, or many more and others each time.

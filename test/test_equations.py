@@ -9,7 +9,7 @@ import pytest
 import rhs_isac_ros
 
 ROOT = Path(rhs_isac_ros.__file__).parent
-WANTED = [f'Eq. ({number})' for number in range(1, 19)] + ['Proposition 2', 'Proposition 3']
+WANTED = [f'Eq. ({number})' for number in range(1, 18)] + ['Proposition 2', 'Proposition 3']
 
 
 def claims() -> dict[str, list[str]]:

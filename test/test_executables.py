@@ -25,8 +25,8 @@ def names():
 def test_every_executable_has_a_main(name):
     main = getattr(executables, name)
     assert callable(main)
-    folder = ROOT / 'rhs_isac_ros' / 'nodes'
-    assert (folder / f'{name}.py').exists() != (folder / 'cli' / f'{name}.py').exists()
+    folder = ROOT / 'rhs_isac_ros'
+    assert (folder / 'nodes' / f'{name}.py').exists() != (folder / 'tools' / f'{name}.py').exists()
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

@@ -11,9 +11,9 @@ import pytest
 import rhs_isac_ros
 
 LAYERS = (
-    'model', 'bounds', 'codebook', 'positioning', 'link', 'experiments', 'protocol', 'ros',
-    'nodes')
-ROS_LAYERS = ('ros', 'nodes')
+    'model', 'bounds', 'codebook', 'positioning', 'link', 'experiments', 'protocol',
+    'monitoring', 'ros', 'nodes', 'tools')
+ROS_LAYERS = ('ros', 'nodes', 'tools')
 PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)
 # All that the pure layers may import besides the standard library and their own.
 LIBRARIES = {'numpy', 'scipy', 'yaml'}

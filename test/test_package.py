@@ -25,7 +25,9 @@ PIP_ONLY = {
     'pymoo': 'pymoo', 'rosbags': 'rosbags',
 }
 # The repository's own.
-OWN = {'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest'}
+OWN = {
+    'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest', 'in_memory_network',
+    'node_processes', 'system'}
 
 
 @functools.cache

@@ -61,9 +61,9 @@ def test_both_look_at_the_frame_of_all_positions(rviz):
 def test_rviz_names_the_markers(rviz):
     """Each namespace can be switched off."""
     pytest.importorskip('rclpy')
-    from rhs_isac_ros.ros import scene
+    from rhs_isac_ros.ros import markers
     (display,) = [one for one in rviz['Displays'] if one['Class'].endswith('/MarkerArray')]
-    source = Path(scene.__file__).read_text(encoding='utf-8')
+    source = Path(markers.__file__).read_text(encoding='utf-8')
     assert set(display['Namespaces']) == set(re.findall(r"_marker\('(\w+)'", source))
 
 

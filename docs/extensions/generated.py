@@ -17,7 +17,9 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 from visualization_msgs.msg import MarkerArray
 
-from rhs_isac_ros.protocol import bs_table, diagram, health
+from rhs_isac_ros.monitoring import role_statistics as health
+from rhs_isac_ros.protocol import base_station_table as bs_table
+from rhs_isac_ros.protocol import diagram
 from rhs_isac_ros.ros import parameters, qos, recording, topics
 
 ROOT = Path(__file__).parents[2]

@@ -12,31 +12,26 @@ from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user
-from rhs_isac_ros.protocol.bs import BaseStation
+from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.events import (
+    BuildEstimator,
     CodebookOffered,
-    MakeEstimator,
     PeersChanged,
     Send,
     Tick,
 )
-from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
+from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.transmission import Transmission
+from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros.topics import NAMES
 
-# What each role takes, in the order of the picture.
-HEARS = {
-    'user': (m.Beacon, m.Grant, m.PilotRequest, m.Data),
-    'channel': (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
-    'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.NoFix, m.Beam,
-           m.Data),
-    'rhs_controller': (m.Grant, m.RhsCommand, m.Beam),
-    'positioner': (m.ReceivedSignals,),
-    'transmission': (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth),
-}
+# The roles in the order of the picture.
+RECEIVES = {'user': User.RECEIVES, 'channel': Channel.RECEIVES, 'bs': BaseStation.RECEIVES,
+            'rhs_controller': RhsController.RECEIVES, 'positioner': Positioner.RECEIVES,
+            'transmission': Transmission.RECEIVES}
 _COLUMN, _ROW, _TOP, _LEFT = 165, 24, 50, 70
 _STYLE = ('text{font:11px monospace;fill:#222}.role{font-weight:bold;font-size:13px}'
           '.life{stroke:#aab;stroke-dasharray:4 4}path,circle{stroke:#567;fill:#567}')
@@ -73,12 +68,12 @@ def cycle():
 
     def tell(name, event):
         for action in roles[name].handle(event, now_s):
-            if isinstance(action, MakeEstimator):
-                tell(name, make_estimator_for(
+            if isinstance(action, BuildEstimator):
+                tell(name, build_estimator(
                     action.codebook, lambda codebook: _Centre(scenario), lambda: 0.0))
             elif isinstance(action, Send):
                 sent.append((name, action.message))
-                queue.extend((other, action.message) for other, kinds in HEARS.items()
+                queue.extend((other, action.message) for other, kinds in RECEIVES.items()
                              if other != name and type(action.message) in kinds)
     for name in ('rhs_controller', 'transmission', 'positioner', 'bs'):
         tell(name, CodebookOffered(codebook))
@@ -98,8 +93,8 @@ def svg():
     """Draw the cycle: a column for each role, a row for each message; runs of equals are one."""
     rows = [(sender, kind, list(run)) for (sender, kind), run in itertools.groupby(
         cycle(), key=lambda item: (item[0], type(item[1])))]
-    place = {name: _LEFT + _COLUMN * number for number, name in enumerate(HEARS)}
-    width = _LEFT * 2 + _COLUMN * (len(HEARS) - 1)
+    place = {name: _LEFT + _COLUMN * number for number, name in enumerate(RECEIVES)}
+    width = _LEFT * 2 + _COLUMN * (len(RECEIVES) - 1)
     height = _TOP + _ROW * (len(rows) + 1)
     parts = []
     for name, x in place.items():
@@ -108,11 +103,11 @@ def svg():
     for number, (sender, kind, run) in enumerate(rows):
         y = _TOP + _ROW * (number + 1)
         label = NAMES[kind] + _detail([message for _, message in run])
-        takers = [name for name, kinds in HEARS.items() if kind in kinds and name != sender]
+        takers = [name for name, kinds in RECEIVES.items() if kind in kinds and name != sender]
         if kind is m.Data:
             takers = (['channel'] if run[0][1].stage is m.Stage.OFFERED else
                       ['user' if run[0][1].direction is m.Direction.DOWNLINK else 'bs'])
-        last = sender == list(HEARS)[-1]
+        last = sender == list(RECEIVES)[-1]
         parts += _arrows(place[sender], [place[name] for name in takers], y, label, last)
     return (f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
             f'viewBox="0 0 {width} {height}" role="img"><title>One cycle</title>'

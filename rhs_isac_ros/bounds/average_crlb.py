@@ -11,7 +11,7 @@ from rhs_isac_ros.model.surface import Beamforming
 
 def average_crlb(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> Gradient:
-    """Average bound over positions, Eq. (18), with its gradients by Propositions 2 and 3.
+    """Average bound over positions, Eq. (17), with its gradients by Propositions 2 and 3.
 
     Parameters
     ----------

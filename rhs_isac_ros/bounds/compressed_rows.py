@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rhs_isac_ros.bounds.rows import Collected, Pass, RowSource, blocks
+from rhs_isac_ros.bounds.rows import GradientSums, Pass, RowSource, blocks
 from rhs_isac_ros.model import Scenario, streams
 
 # Least columns of the first sketch; each next one has twice as many.
@@ -100,14 +100,14 @@ class _CompressedPass:
         # The conjugate of what is wanted: coefficients stay as they lie in memory.
         self._weights[band] += self._rows(block, band).T @ np.conj(weighted)
 
-    def collected(self, band: int) -> Collected:
+    def collected(self, band: int) -> GradientSums:
         basis, whitener = self._bases[band], self._whiteners[band]
         n_subbands, n_elements, _ = basis.shape
         weights = np.conj(self._weights[band]) @ np.conj(whitener)
         zeta = self._filters[band] @ np.conj(whitener)
         frames = np.moveaxis(weights.reshape(len(weights), n_subbands, -1), 1, 0)
         by_mean = np.matmul(basis, frames)
-        return Collected(np.swapaxes(by_mean, 1, 2).reshape(-1, n_elements),
+        return GradientSums(np.swapaxes(by_mean, 1, 2).reshape(-1, n_elements),
                          weights.T @ np.conj(zeta))
 
 

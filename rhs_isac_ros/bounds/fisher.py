@@ -56,7 +56,7 @@ def factor(scenario: Scenario, codebook: Beamforming) -> Factors:
 def crlb(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
         factors: Factors | None = None) -> np.ndarray:
-    """Implements Eq. (12). Cramer-Rao lower bound of the squared positioning error.
+    """Implements Eq. (11). Cramer-Rao lower bound of the squared positioning error.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
 def fisher_information(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
         factors: Factors | None = None) -> np.ndarray:
-    """Implements Eq. (13). Fisher information of the received signals about the position.
+    """Implements Eq. (12). Fisher information of the received signals about the position.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def fisher_information(
 
 
 def information_of(whitened: np.ndarray) -> np.ndarray:
-    """One band's share of Eq. (13), from the whitened derivatives of its mean.
+    """One band's share of Eq. (12), from the whitened derivatives of its mean.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def information_of(whitened: np.ndarray) -> np.ndarray:
 
 
 def mean_derivative(slopes: np.ndarray, pattern: np.ndarray) -> np.ndarray:
-    """Implements Eq. (14). Derivative of one band's mean signal by the position.
+    """Implements Eq. (13). Derivative of one band's mean signal by the position.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def mean_derivative(slopes: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 
 def covariance(scenario: Scenario, patterns: np.ndarray) -> np.ndarray:
-    """Implements Eq. (15). Covariance of the received signals; independent of the position.
+    """Implements Eq. (14). Covariance of the received signals; independent of the position.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def whitening_matrices(scenario: Scenario, patterns: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Implements Eq. (16). Correlation of the multipath over sub-bands and over frames.
+    """Implements Eq. (15). Correlation of the multipath over sub-bands and over frames.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ _BLOCK = 128
 _CACHE_BYTES = 1 << 30
 
 
-class Collected(NamedTuple):
+class GradientSums(NamedTuple):
     """What an evaluation leaves for the gradients of one band.
 
     Attributes
@@ -70,7 +70,7 @@ class Pass(Protocol):
         """
         ...
 
-    def collected(self, band: int) -> Collected:
+    def collected(self, band: int) -> GradientSums:
         """Return what was collected.
 
         Parameters
@@ -80,7 +80,7 @@ class Pass(Protocol):
 
         Returns
         -------
-        Collected
+        GradientSums
             The sums over all blocks.
         """
         ...
@@ -206,8 +206,8 @@ class _ExactPass:
         weights = np.conj(weights).reshape(n * n_rows, n_subbands, -1).transpose(1, 2, 0)
         self._by_mean[band] += np.conj(np.matmul(weights, stacked)).reshape(-1, n_elements)
 
-    def collected(self, band: int) -> Collected:
-        return Collected(self._by_mean[band], self._spread[band])
+    def collected(self, band: int) -> GradientSums:
+        return GradientSums(self._by_mean[band], self._spread[band])
 
 
 def blocks(n_items: int) -> Iterator[slice]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from rhs_isac_ros.bounds import AverageCrlb, PairConfusion
+from rhs_isac_ros.bounds import AverageCrlb, PairwiseErrorCost
 from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.codebook.sampling import confusable
 from rhs_isac_ros.model import Scenario
@@ -18,7 +18,7 @@ _PAIRS_A_POSITION = 128
 
 def average_bound(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
-    """Implements Eq. (18). Objective of P1 on sampled positions.
+    """Implements Eq. (17). Objective of P1 on sampled positions.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def ambiguity(
         If `positions` is empty or not a finite [N, 3] array.
     """
     firsts = np.repeat(positions, _PAIRS_A_POSITION, axis=0)
-    return PairConfusion(
+    return PairwiseErrorCost(
         scenario, firsts, confusable(scenario, firsts, rng), tolerance=ROW_TOLERANCE)
 
 

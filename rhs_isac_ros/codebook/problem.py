@@ -8,7 +8,7 @@ from rhs_isac_ros.model import Scenario
 
 
 class Problem:
-    """Implements Eq. (17). Problem P1: average bound, fixed power, configurations in [0, 1].
+    """Implements Eq. (16). Problem P1: average bound, fixed power, configurations in [0, 1].
 
     Solvers see one real vector, the configurations followed by the real and the imaginary parts
     of unscaled combining vectors. Scaling these to P_max takes the power constraint out of the

@@ -100,7 +100,7 @@ class Search:
         return value
 
     def finish(self) -> None:
-        """Note what was reached since the last step, if there is anything."""
+        """LogMessage what was reached since the last step, if there is anything."""
         if self._evaluations > self.history[-1].evaluations:
             self.on_step()
 
@@ -154,7 +154,7 @@ class Search:
         return self._last[1:]
 
     def on_step(self) -> None:
-        """Note that a step is done."""
+        """LogMessage that a step is done."""
         elapsed = time.perf_counter() - self._begin
         step = self._first_step + len(self.history)
         entry = Progress(step, self._evaluations, self.value_m2, elapsed)

@@ -31,7 +31,7 @@ class Beam:
 
 
 def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
-    """Implements Eq. (11). Capacity of a beam for users at some positions.
+    """Implements Eq. (10). Capacity of a beam for users at some positions.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
 
 
 def direct_power_w(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
-    """Power that a beam brings to some positions over the line of sight, as Eq. (11) counts it.
+    """Power that a beam brings to some positions over the line of sight, as Eq. (10) counts it.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ _FARTHEST_M = 1e6
 
 def expected_capacity(
         scenario: Scenario, beam: Beam, mean: np.ndarray, covariance: np.ndarray) -> float:
-    """Mean of Eq. (11) over a Gaussian posterior of the user's position.
+    """Mean of Eq. (10) over a Gaussian posterior of the user's position.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ _IMPROVED = 4
 
 
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
-    """Find a beam that maximises Eq. (11) for a user at a position.
+    """Find a beam that maximises Eq. (10) for a user at a position.
 
     A search from many starts finds promising configurations. The best few of these and of the
     matched filter's are then improved together with the digital part, so that the outcome is never

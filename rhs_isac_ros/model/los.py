@@ -39,7 +39,7 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
 def los_derivative(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
     """Derivative of the line-of-sight gain by the three coordinates of the user.
 
-    The H-dot of Eq. (14): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d, and with a gain
+    The H-dot of Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d, and with a gain
     pattern what the angle from the boresight adds.
 
     Parameters

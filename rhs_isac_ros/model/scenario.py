@@ -46,7 +46,7 @@ class Scenario:
         (2.5e9, 3.0e9), 1e6, 1e13, 'Centre frequency f_c,i of each band.', 'Hz')
     n_subbands: int = _field(8, 1, 4096, 'Sub-bands N_SB of each band.')
     subband_width_hz: float = _field(125e3, 1.0, 1e10, 'Width W of a sub-band.', 'Hz')
-    n_frames: int = _field(4, 1, 4096, 'Frames F of each band.')
+    n_frames: int = _field(4, 1, 4096, 'FrameBuffer F of each band.')
     frame_duration_s: float = _field(4e-6, 1e-12, 1.0, 'Duration of a frame.', 's')
     elements_per_side: int = _field(10, 1, 128, 'Elements along one side of the square surface.')
     element_interval_wavelengths: float = _field(

@@ -147,7 +147,7 @@ def radiation_matrix(scenario: Scenario, beams: Beamforming) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def onboard_matrix(scenario: Scenario) -> np.ndarray:
-    """Implements Eq. (10). Propagation between every feed and element, B; C and S are the beams'.
+    """On-board propagation between every element and feed, the matrix B below Eq. (9).
 
     Parameters
     ----------

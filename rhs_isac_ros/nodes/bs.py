@@ -10,34 +10,29 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import streams
 from rhs_isac_ros.model.receive import receive_feeds
-from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.bs import BaseStation
+from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged
 from rhs_isac_ros.protocol.settings import BaseStationSettings
-from rhs_isac_ros.ros import peers
+from rhs_isac_ros.ros import peer_monitor
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-
-SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
-         m.ProtocolState)
-RECEIVES = (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.NoFix, m.Beam,
-            m.Data)
 
 
 class BsNode(RoleNode):
     """The base station."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('bs', SENDS, **node_options)
+        super().__init__('bs', BaseStation.SENDS, **node_options)
         values = self.values
         rng = streams.generator(values.seed, streams.BASE_STATION)
         self.start(BaseStation(
             self.scenario, self.settings(values), rng, self._receive,
-            values.first_cycle or _number_from_the_clock()), RECEIVES)
-        self.follow_codebook(lambda codebook: self.tell(CodebookOffered(codebook)))
-        self._peers = peers.PeerWatch(
-            self, peers.OF_BASE_STATION, lambda missing: self.tell(PeersChanged(missing)))
+            values.first_cycle or _number_from_the_clock()), BaseStation.RECEIVES)
+        self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
+        self._peers = peer_monitor.PeerMonitor(
+            self, peer_monitor.OF_BASE_STATION,
+            lambda missing: self.dispatch(PeersChanged(missing)))
 
     def settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
         """Return how the base station is to work.

@@ -5,26 +5,22 @@ import types
 from typing import Any
 
 from rhs_isac_ros.model import streams
-from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.impairments import Impaired, Impairments
+from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-
-SENDS = (m.FeedSignals, m.Data)
-RECEIVES = (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data)
 
 
 class ChannelNode(RoleNode):
     """Air, multipath, surface and on-board propagation."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('channel', SENDS, **node_options)
+        super().__init__('channel', Channel.SENDS, **node_options)
         values = self.values
         rng = streams.generator(values.seed, streams.AIR)
-        self.start(Impaired(
-            Channel(self.scenario, values.seed), self.settings(values), rng), RECEIVES)
+        self.start(ImpairedChannel(
+            Channel(self.scenario, values.seed), self.settings(values), rng), Channel.RECEIVES)
 
     def settings(self, values: types.SimpleNamespace) -> Impairments:
         """Return what the air is to do to messages.

@@ -17,7 +17,7 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options
 from rhs_isac_ros.codebook.command import run as run_command
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.protocol.health import Report
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.push import PushError, push

@@ -25,12 +25,12 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     Action,
+    BuildEstimator,
     CodebookOffered,
     EstimatorFailed,
-    EstimatorMade,
-    MakeEstimator,
+    EstimatorReady,
 )
-from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
+from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import Background
@@ -38,21 +38,18 @@ from rhs_isac_ros.ros.parameters import ParameterError, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
-SENDS = (m.PositionEstimate, m.NoFix)
-RECEIVES = (m.ReceivedSignals,)
-
 
 class PositionerNode(RoleNode):
     """The positioner; it listens to received signals once its tables are built."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('positioner', SENDS, **node_options)
+        super().__init__('positioner', Positioner.SENDS, **node_options)
         settings = self.settings(self.values)
         self._background = Background(self)
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
         self.start(Positioner(self.scenario, time.perf_counter, settings), ())
-        self.follow_codebook(lambda codebook: self.tell(CodebookOffered(codebook)))
+        self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
     def settings(self, values: types.SimpleNamespace) -> PositionerSettings:
         """Return which estimator to use; whether its model fits a codebook shows later.
@@ -116,18 +113,18 @@ class PositionerNode(RoleNode):
         TypeError
             If it asks for anything else.
         """
-        if not isinstance(action, MakeEstimator):
+        if not isinstance(action, BuildEstimator):
             super().perform(action)
         self._background.run(
             functools.partial(
-                make_estimator_for, action.codebook,
+                build_estimator, action.codebook,
                 functools.partial(self._make, action.settings), time.perf_counter),
             self._on_estimator)
 
-    def _on_estimator(self, event: EstimatorMade | EstimatorFailed) -> None:
-        self.tell(event)
-        if isinstance(event, EstimatorMade):
-            self.listen(RECEIVES)
+    def _on_estimator(self, event: EstimatorReady | EstimatorFailed) -> None:
+        self.dispatch(event)
+        if isinstance(event, EstimatorReady):
+            self.listen(Positioner.RECEIVES)
 
     def publish(self, message: m.Message) -> bool:
         """Publish an estimate, and the same as a standard pose.

@@ -3,27 +3,23 @@
 import sys
 from typing import Any
 
-from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-
-SENDS = (m.RhsConfiguration,)
-RECEIVES = (m.Grant, m.RhsCommand, m.Beam)
 
 
 class RhsControllerNode(RoleNode):
     """The controller of the surface; it listens to commands once it has a codebook."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('rhs_controller', SENDS, **node_options)
+        super().__init__('rhs_controller', RhsController.SENDS, **node_options)
         self.start(RhsController(), ())
         self.follow_codebook(self._on_codebook)
 
     def _on_codebook(self, codebook: Any) -> None:
-        self.tell(CodebookOffered(codebook))
-        self.listen(RECEIVES)
+        self.dispatch(CodebookOffered(codebook))
+        self.listen(RhsController.RECEIVES)
 
 
 main = entry(lambda: [RhsControllerNode()])

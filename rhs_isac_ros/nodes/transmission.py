@@ -5,16 +5,12 @@ import types
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.parameters import ParameterError, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-
-SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
-RECEIVES = (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth)
 
 
 class TransmissionNode(RoleNode):
@@ -50,9 +46,9 @@ class TransmissionNode(RoleNode):
         return settings_of(TransmissionSettings, values)
 
     def _on_codebook(self, codebook: Codebook) -> None:
-        self.tell(CodebookOffered(codebook))
-        self.advertise(SENDS)
-        self.listen(RECEIVES)
+        self.dispatch(CodebookOffered(codebook))
+        self.advertise(Transmission.SENDS)
+        self.listen(Transmission.RECEIVES)
 
 
 main = entry(lambda: [TransmissionNode()])

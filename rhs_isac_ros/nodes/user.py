@@ -6,31 +6,27 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model import mobility, plugins, streams
-from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import PeersChanged
 from rhs_isac_ros.protocol.user import User, timeouts
-from rhs_isac_ros.ros import peers
+from rhs_isac_ros.ros import peer_monitor
 from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.timers import steady_timer
-
-SENDS = (m.Ack, m.GroundTruth, m.Pilot, m.Data)
-RECEIVES = (m.Beacon, m.Grant, m.PilotRequest, m.Data)
 
 
 class UserNode(RoleNode):
     """A user."""
 
     def __init__(self, name: str = '', **node_options: Any) -> None:
-        super().__init__('user', SENDS, name, **node_options)
+        super().__init__('user', User.SENDS, name, **node_options)
         values = self.values
         self._user = User(
             values.user_id, self._mobility(),
             timeouts(values.step_timeout_s, values.beacon_timeout_s))
-        self.start(self._user, RECEIVES)
-        self._peers = peers.PeerWatch(
-            self, peers.OF_USER, lambda missing: self.tell(PeersChanged(missing)))
+        self.start(self._user, User.RECEIVES)
+        self._peers = peer_monitor.PeerMonitor(
+            self, peer_monitor.OF_USER, lambda missing: self.dispatch(PeersChanged(missing)))
         steady_timer(self, values.ground_truth_period_s, self._show)
 
     def _mobility(self) -> mobility.Mobility:
@@ -77,7 +73,7 @@ class UserNode(RoleNode):
         return points
 
     def _show(self) -> None:
-        self.publish(self._user.whereabouts(self.now_s()))
+        self.publish(self._user.ground_truth(self.now_s()))
 
 
 main = entry(lambda: [UserNode()])

@@ -11,13 +11,13 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from visualization_msgs.msg import Marker, MarkerArray
 
-from rhs_isac_ros.link import Beam, pattern
+from rhs_isac_ros.link import Beam, beam_pattern
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.sightings import RECEIVES, Sighting, Sightings
-from rhs_isac_ros.ros import parameters, qos, scene, topics
-from rhs_isac_ros.ros.listening import listen
+from rhs_isac_ros.ros import markers, parameters, qos, topics
 from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.ros.subscriptions import listen
 from rhs_isac_ros.ros.timers import steady_timer
 
 # Each path is a topic of its own: a crowd would flood the graph.
@@ -33,7 +33,7 @@ class VisualizerNode(Node):
         self._scenario = (
             Scenario.from_yaml(values.scenario_file) if values.scenario_file else Scenario())
         self._forget_s = values.forget_s
-        self._sightings = Sightings()
+        self._sightings = SceneState()
         # The beam that was drawn last, and its drawing: a pattern takes its time.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
@@ -54,7 +54,7 @@ class VisualizerNode(Node):
         if self._publisher.get_subscription_count():
             self._show_markers(stamp)
 
-    def _show_paths(self, sighting: Sighting, stamp: Time) -> None:
+    def _show_paths(self, sighting: UserState, stamp: Time) -> None:
         if sighting.user not in self._paths:
             if len(self._paths) == _MOST_PATHS:
                 return
@@ -64,31 +64,31 @@ class VisualizerNode(Node):
         ways = sighting.path, sighting.true_path
         for publisher, way in zip(self._paths[sighting.user], ways, strict=True):
             if way and publisher.get_subscription_count():
-                publisher.publish(scene.path(way, stamp))
+                publisher.publish(markers.path(way, stamp))
 
     def _show_markers(self, stamp: Time) -> None:
         now = self._sightings
-        markers = [scene.region(self._scenario, stamp), scene.board(
+        shown_markers = [markers.region(self._scenario, stamp), markers.board(
             self._scenario, now.configuration.analog if now.configuration else None, stamp)]
         for sighting in now.users.values():
             if sighting.truth:
-                markers.append(scene.truth(sighting.truth, stamp))
+                shown_markers.append(markers.truth(sighting.truth, stamp))
             if sighting.estimate:
-                markers.append(scene.estimate(sighting.estimate, stamp))
+                shown_markers.append(markers.estimate(sighting.estimate, stamp))
         if now.beam:
-            markers.append(self._draw(now.beam, stamp))
-        shown = {(marker.ns, marker.id) for marker in markers}
-        markers += [scene.gone(*key, stamp) for key in sorted(self._shown - shown)]
+            shown_markers.append(self._draw(now.beam, stamp))
+        shown = {(marker.ns, marker.id) for marker in shown_markers}
+        shown_markers += [markers.gone(*key, stamp) for key in sorted(self._shown - shown)]
         self._shown = shown
-        self._publisher.publish(MarkerArray(markers=markers))
+        self._publisher.publish(MarkerArray(markers=shown_markers))
 
     def _draw(self, message: m.Beam, stamp: Time) -> Marker:
         """Draw the pattern of a beam as it is at the distance of the region's centre."""
         if self._drawn is None or self._drawn[0] is not message:
-            found = pattern(
+            found = beam_pattern(
                 self._scenario, Beam(message.analog, message.digital, message.band),
                 math.hypot(*self._scenario.roi_center_m))
-            self._drawn = message, scene.beam(found, message.user, stamp)
+            self._drawn = message, markers.beam(found, message.user, stamp)
         self._drawn[1].header.stamp = stamp
         return self._drawn[1]
 

@@ -19,7 +19,7 @@ def simulate_pairs(
 
     A seed stands for one endless sequence of pairs, of which this returns a part, bit for bit the
     same however the sequence is cut. Multipath and noise are drawn as the signals see them, with
-    the covariance of Eq. (15); `simulate_received` draws every element's gain, for the same
+    the covariance of Eq. (14); `simulate_received` draws every element's gain, for the same
     distribution in a hundred times the time.
 
     Parameters

@@ -90,7 +90,7 @@ class WhitenedModel:
             frames, moments = self._frames[band], self._moments[band]
             sums = np.matmul(gain.transpose(1, 0, 2), frames).transpose(1, 0, 2)
             mean[:, band] = sums.reshape(n, n_rows) @ whitener.T
-            # Eq. (14) with p - p_m drawn out: the sum over the elements of a T (p - p_m).
+            # Eq. (13) with p - p_m drawn out: the sum over the elements of a T (p - p_m).
             sums = np.matmul(rate.transpose(1, 0, 2), moments)
             sums = sums.reshape(-1, n, 4, frames.shape[2]).transpose(2, 1, 0, 3)
             sums = sums.reshape(4, n, n_rows)

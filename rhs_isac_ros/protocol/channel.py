@@ -50,6 +50,9 @@ class Channel(PlainRole):
         Seed of the multipath, which depends on it, the user and the cycle alone.
     """
 
+    SENDS = (m.FeedSignals, m.Data)
+    RECEIVES = (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data)
+
     def __init__(self, scenario: Scenario, seed: int) -> None:
         super().__init__()
         self._scenario, self._seed = scenario, seed

@@ -11,11 +11,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from rhs_isac_ros.protocol import bs_table, rhs_controller, user
-from rhs_isac_ros.protocol.machine import ANY, SAME, Step
+from rhs_isac_ros.protocol import base_station_table as bs_table
+from rhs_isac_ros.protocol import rhs_controller, user
+from rhs_isac_ros.protocol.state_machine import ANY, SAME, Transition
 
 # States of every role, the first one first, and its table.
-ROLES: Mapping[str, tuple[type[enum.Enum], Mapping[tuple, Step]]] = {
+ROLES: Mapping[str, tuple[type[enum.Enum], Mapping[tuple, Transition]]] = {
     'bs': (bs_table.State, bs_table.TABLE),
     'user': (user.State, user.TABLE),
     'rhs_controller': (rhs_controller.State, rhs_controller.TABLE),

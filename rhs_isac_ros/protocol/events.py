@@ -36,8 +36,8 @@ class PeersChanged:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class EstimatorMade:
-    """What `MakeEstimator` asked for is there; it took `elapsed_s`."""
+class EstimatorReady:
+    """What `BuildEstimator` asked for is there; it took `elapsed_s`."""
 
     codebook: Codebook
     estimator: Estimator
@@ -46,13 +46,13 @@ class EstimatorMade:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorFailed:
-    """What `MakeEstimator` asked for cannot be had."""
+    """What `BuildEstimator` asked for cannot be had."""
 
     codebook: Codebook
     reason: str
 
 
-Event = (Message | Tick | CodebookOffered | SettingsOffered | PeersChanged | EstimatorMade
+Event = (Message | Tick | CodebookOffered | SettingsOffered | PeersChanged | EstimatorReady
          | EstimatorFailed)
 
 
@@ -64,7 +64,7 @@ class Send:
 
 
 @dataclasses.dataclass(frozen=True)
-class Note:
+class LogMessage:
     """Tell the person who watches; `warning` if something is amiss."""
 
     text: str
@@ -72,7 +72,7 @@ class Note:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MakeEstimator:
+class BuildEstimator:
     """Make an estimator for a codebook, meanwhile, and answer with one of two events."""
 
     codebook: Codebook
@@ -80,10 +80,10 @@ class MakeEstimator:
 
 
 @dataclasses.dataclass(frozen=True)
-class SettingsKept:
+class SettingsReverted:
     """What was offered last cannot be used: parameters are to tell these settings again."""
 
     settings: Any
 
 
-Action = Send | Note | MakeEstimator | SettingsKept
+Action = Send | LogMessage | BuildEstimator | SettingsReverted

@@ -10,7 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Tick
-from rhs_isac_ros.protocol.standing import Standing
+from rhs_isac_ros.protocol.pending_settings import PendingSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Impairments:
     jitter_s: float = 0.0
 
 
-class Impaired:
+class ImpairedChannel:
     """A channel whose messages go through an air that need not be ideal.
 
     Other impairments hold from the true position on with which the next cycle begins.
@@ -56,7 +56,7 @@ class Impaired:
     """
 
     def __init__(self, role: Any, impairments: Impairments, rng: np.random.Generator) -> None:
-        self._role, self._settings, self._rng = role, Standing(impairments), rng
+        self._role, self._settings, self._rng = role, PendingSettings(impairments), rng
         self._cycle_id = 0
         self.counters = role.counters
         self._serial = itertools.count()
@@ -96,7 +96,7 @@ class Impaired:
             arriving.append(heapq.heappop(self._on_the_way)[2])
         return arriving
 
-    def standing(self) -> Mapping[str, str]:
+    def status(self) -> Mapping[str, str]:
         """Return the impairments in use, and those that wait.
 
         Returns
@@ -104,7 +104,7 @@ class Impaired:
         Mapping
             Values by name.
         """
-        return self._settings.tell()
+        return self._settings.describe()
 
     def next_deadline(self) -> float | None:
         """Return when the next message arrives.

@@ -10,22 +10,22 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Estimator, SignalError
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import (
     Action,
+    BuildEstimator,
     CodebookOffered,
     EstimatorFailed,
-    EstimatorMade,
+    EstimatorReady,
     Event,
-    MakeEstimator,
-    Note,
+    LogMessage,
     Send,
-    SettingsKept,
     SettingsOffered,
+    SettingsReverted,
 )
+from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.protocol.settings import PositionerSettings
-from rhs_isac_ros.protocol.shelf import Shelf
-from rhs_isac_ros.protocol.standing import Standing
 
 
 class _Job(NamedTuple):
@@ -66,15 +66,18 @@ class Positioner(PlainRole):
         Which estimator to use, until others are offered; by default the usual one.
     """
 
+    SENDS = (m.PositionEstimate, m.NoFix)
+    RECEIVES = (m.ReceivedSignals,)
+
     def __init__(
             self, scenario: Scenario, stopwatch: Callable[[], float],
             settings: PositionerSettings | None = None) -> None:
         super().__init__()
         self._scenario, self._stopwatch = scenario, stopwatch
-        self._settings = Standing(settings or PositionerSettings())
+        self._settings = PendingSettings(settings or PositionerSettings())
         # Why the last change of settings came to nothing, if it did.
         self._failure = ''
-        self._estimators: Shelf[_Made] = Shelf()
+        self._estimators: CodebookCache[_Made] = CodebookCache()
         self._codebook: Codebook | None = None
         # The estimator that is being made, and the newest one wanted since.
         self._making: _Job | None = None
@@ -106,7 +109,7 @@ class Positioner(PlainRole):
                 return self._want(_Job(codebook, self._settings.newest))
             case SettingsOffered(settings):
                 return self._take_settings(settings)
-            case EstimatorMade(codebook, estimator, elapsed_s):
+            case EstimatorReady(codebook, estimator, elapsed_s):
                 return [*self._keep(self._job_of(codebook), estimator, elapsed_s),
                         *self._go_on()]
             case EstimatorFailed(codebook, reason):
@@ -115,7 +118,7 @@ class Positioner(PlainRole):
                 return self._receive(event)
         return []
 
-    def standing(self) -> Mapping[str, str]:
+    def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use, those that wait, and what failed.
 
         Returns
@@ -124,7 +127,7 @@ class Positioner(PlainRole):
             Values by name.
         """
         failed = {'failed.estimator': self._failure} if self._failure else {}
-        return self._settings.tell() | failed | {'codebook_id': self._estimators.in_use}
+        return self._settings.describe() | failed | {'codebook_id': self._estimators.in_use}
 
     def _take_settings(self, settings: PositionerSettings) -> list[Action]:
         self._settings.newest, self._failure = settings, ''
@@ -141,7 +144,7 @@ class Positioner(PlainRole):
             self._next = None if job.is_as(self._making) else job
             return []
         self._making = job
-        return [MakeEstimator(job.codebook, job.settings)]
+        return [BuildEstimator(job.codebook, job.settings)]
 
     def _job_of(self, codebook: Codebook) -> _Job:
         return self._making or _Job(codebook, self._settings.newest)
@@ -154,22 +157,23 @@ class Positioner(PlainRole):
             return []
         self._estimators.put(codebook.id, _Made(job, factor(self._scenario, codebook), estimator))
         self._settings.in_use = job.settings
-        return [Note(f'{estimator.name} is ready for codebook {codebook.id} after '
+        return [LogMessage(f'{estimator.name} is ready for codebook {codebook.id} after '
                      f'{elapsed_s:.1f} s')]
 
     def _do_without(self, job: _Job, reason: str) -> list[Action]:
         """Stay with the settings in use if others were the reason that nothing was made."""
         kept = self._settings.in_use
         if job.settings == kept:
-            return [Note(f'no estimator for codebook {job.codebook.id}: {reason}', warning=True)]
+            return [LogMessage(
+                f'no estimator for codebook {job.codebook.id}: {reason}', warning=True)]
         if job.settings != self._settings.newest:
             return []
         self._settings.newest = kept
         self._failure = f'{job.settings.estimator}: {reason}'
         # Whichever codebook is wanted by now, it is wanted with the settings in use.
         self._next = _Job((self._next or job).codebook, kept)
-        return [Note(f'estimator {job.settings.estimator} not used, {kept.estimator} stays: '
-                     f'{reason}', warning=True), SettingsKept(kept)]
+        return [LogMessage(f'estimator {job.settings.estimator} not used, {kept.estimator} stays: '
+                     f'{reason}', warning=True), SettingsReverted(kept)]
 
     def _go_on(self) -> list[Action]:
         """After an estimator was made: the signals that waited for it, and the next one."""
@@ -213,15 +217,15 @@ class Positioner(PlainRole):
     def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
         self.counters['no_fix'] += 1
         sent = Send(m.NoFix(received.cycle_id, received.user, received.codebook_id, reason))
-        note = Note(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)
+        note = LogMessage(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)
         said, self._is_lost = self._is_lost, True
         return [sent] if said else [sent, note]
 
 
-def make_estimator_for(
+def build_estimator(
         codebook: Codebook, make: Callable[[Codebook], Estimator],
-        stopwatch: Callable[[], float]) -> EstimatorMade | EstimatorFailed:
-    """Do what `MakeEstimator` asks for; this may run in another thread.
+        stopwatch: Callable[[], float]) -> EstimatorReady | EstimatorFailed:
+    """Do what `BuildEstimator` asks for; this may run in another thread.
 
     Parameters
     ----------
@@ -234,7 +238,7 @@ def make_estimator_for(
 
     Returns
     -------
-    EstimatorMade or EstimatorFailed
+    EstimatorReady or EstimatorFailed
         The event for the role.
     """
     begin = stopwatch()
@@ -243,4 +247,4 @@ def make_estimator_for(
     # What a codebook, a model file or a full disk may be the reason of.
     except (ValueError, OSError, MemoryError) as error:
         return EstimatorFailed(codebook, str(error) or type(error).__name__)
-    return EstimatorMade(codebook, estimator, stopwatch() - begin)
+    return EstimatorReady(codebook, estimator, stopwatch() - begin)

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Note, Send
-from rhs_isac_ros.protocol.machine import ANY, SAME, Machine, Step
-from rhs_isac_ros.protocol.shelf import Shelf
+from rhs_isac_ros.protocol.codebook_cache import CodebookCache
+from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, LogMessage, Send
+from rhs_isac_ros.protocol.state_machine import ANY, SAME, StateMachine, Transition
 
 
 class State(enum.Enum):
@@ -35,34 +35,37 @@ class Input(enum.Enum):
 
 S, I = State, Input  # noqa: E741
 
-TABLE: Mapping[tuple[State | None, Input], Step] = {
-    (ANY, I.CODEBOOK): Step(SAME, ('keep',)),
-    (ANY, I.GRANT): Step(SAME, ('note_grant',)),
-    (ANY, I.COMMAND): Step(S.POSITIONING, ('apply_band',)),
-    (S.POSITIONING, I.BEAM): Step(S.TRANSMITTING, ('apply_beam',)),
-    (S.TRANSMITTING, I.BEAM): Step(SAME, ('apply_beam',), counts='duplicate'),
+TABLE: Mapping[tuple[State | None, Input], Transition] = {
+    (ANY, I.CODEBOOK): Transition(SAME, ('keep',)),
+    (ANY, I.GRANT): Transition(SAME, ('note_grant',)),
+    (ANY, I.COMMAND): Transition(S.POSITIONING, ('apply_band',)),
+    (S.POSITIONING, I.BEAM): Transition(S.TRANSMITTING, ('apply_beam',)),
+    (S.TRANSMITTING, I.BEAM): Transition(SAME, ('apply_beam',), counts='duplicate'),
     # Who asks again may not have heard the answer.
-    (ANY, I.DUPLICATE): Step(SAME, ('apply_band',), counts='duplicate'),
-    (ANY, I.STALE_COMMAND): Step(SAME, counts='stale_command'),
-    (ANY, I.WRONG_CODEBOOK): Step(SAME, ('complain',), counts='wrong_codebook'),
-    (ANY, I.WRONG_CYCLE): Step(SAME, counts='wrong_cycle'),
-    (ANY, I.WRONG_USER): Step(SAME, counts='wrong_user'),
+    (ANY, I.DUPLICATE): Transition(SAME, ('apply_band',), counts='duplicate'),
+    (ANY, I.STALE_COMMAND): Transition(SAME, counts='stale_command'),
+    (ANY, I.WRONG_CODEBOOK): Transition(SAME, ('complain',), counts='wrong_codebook'),
+    (ANY, I.WRONG_CYCLE): Transition(SAME, counts='wrong_cycle'),
+    (ANY, I.WRONG_USER): Transition(SAME, counts='wrong_user'),
 }
 # Grants and commands that are known again when they come late or doubled.
 _MOST_KNOWN = 8
 
 
-class RhsController(Machine):
+class RhsController(StateMachine):
     """The role of the controller of the surface.
 
     Which of the codebooks it knows applies is for the base station's commands to say.
     """
 
+    SENDS = (m.RhsConfiguration,)
+    RECEIVES = (m.Grant, m.RhsCommand, m.Beam)
+
     TABLE = TABLE
 
     def __init__(self) -> None:
         super().__init__(State.IDLE, {})
-        self._codebooks: Shelf[Codebook] = Shelf()
+        self._codebooks: CodebookCache[Codebook] = CodebookCache()
         self._cycle_id = 0
         self._granted: collections.deque[m.Grant] = collections.deque(maxlen=_MOST_KNOWN)
         # Cycle, band and codebook of what was applied, the present one last.
@@ -71,7 +74,7 @@ class RhsController(Machine):
         # Said once until a command is obeyed.
         self._has_complained = False
 
-    def standing(self) -> Mapping[str, str]:
+    def status(self) -> Mapping[str, str]:
         """Return the codebook in use.
 
         Returns
@@ -136,5 +139,5 @@ class RhsController(Machine):
         if self._has_complained:
             return []
         self._has_complained = True
-        return [Note(f'codebook {event.codebook_id!r} asked for, known: '
+        return [LogMessage(f'codebook {event.codebook_id!r} asked for, known: '
                      f'{self._codebooks.ids()}', warning=True)]

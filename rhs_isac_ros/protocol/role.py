@@ -16,7 +16,7 @@ class PlainRole:
     def __init__(self) -> None:
         self.counters: collections.Counter[str] = collections.Counter()
 
-    def standing(self) -> Mapping[str, str]:
+    def status(self) -> Mapping[str, str]:
         """Return what is in use and what waits, for the diagnostics.
 
         Returns

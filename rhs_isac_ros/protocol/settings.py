@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from rhs_isac_ros.protocol.gate import users_of
+from rhs_isac_ros.protocol.ack_filter import parse_users
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +27,7 @@ class BaseStationSettings:
     data_duration_s
         How long each direction transmits data [s].
     allowed_users
-        Users whose acks it takes, as `users_of` reads them.
+        Users whose acks it takes, as `parse_users` reads them.
     ack_rate_hz
         Acks that it takes of each user in a second.
 
@@ -50,7 +50,7 @@ class BaseStationSettings:
     def __post_init__(self) -> None:
         """Check what a type and a range do not tell."""
         try:
-            users_of(self.allowed_users)
+            parse_users(self.allowed_users)
         except ValueError as error:
             raise ValueError(f'allowed_users: {error}') from None
 
@@ -102,7 +102,7 @@ def changes(old: Any, new: Any) -> dict[str, Any]:
             if getattr(new, name) != getattr(old, name)}
 
 
-def tell(in_use: Any, newest: Any) -> dict[str, str]:
+def describe_settings(in_use: Any, newest: Any) -> dict[str, str]:
     """Put settings in words, for the diagnostics.
 
     Parameters

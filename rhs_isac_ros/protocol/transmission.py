@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 from rhs_isac_ros.link import Beam, Outcome, RunningQuartiles, capacity, choose_beam, outcome
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send, SettingsOffered
+from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.protocol.settings import TransmissionSettings
-from rhs_isac_ros.protocol.shelf import Shelf
-from rhs_isac_ros.protocol.standing import Standing
 
 # Figures of a report that statistics are kept of; `CapacityStatistics` has the same names.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
@@ -40,11 +40,14 @@ class Transmission(PlainRole):
         The band, until another one is offered; by default in each cycle the best.
     """
 
+    SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
+    RECEIVES = (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth)
+
     def __init__(self, scenario: Scenario, settings: TransmissionSettings | None = None) -> None:
         super().__init__()
         self._scenario = scenario
-        self._settings = Standing(settings or TransmissionSettings())
-        self._codebooks: Shelf[None] = Shelf()
+        self._settings = PendingSettings(settings or TransmissionSettings())
+        self._codebooks: CodebookCache[None] = CodebookCache()
         # By cycle: the estimate, the beam, the true position, and whether its report is in the
         # statistics already.
         self._estimates: dict[int, m.PositionEstimate] = {}
@@ -85,7 +88,7 @@ class Transmission(PlainRole):
                 return self._report(event)
         return []
 
-    def standing(self) -> Mapping[str, str]:
+    def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use.
 
         Returns
@@ -93,7 +96,7 @@ class Transmission(PlainRole):
         Mapping
             Values by name.
         """
-        return self._settings.tell() | {'codebook_id': self._codebooks.in_use}
+        return self._settings.describe() | {'codebook_id': self._codebooks.in_use}
 
     def _bands(self, cycle_id: int) -> Sequence[int]:
         """Bands that a cycle may use: the same for all that is asked of it."""

@@ -6,16 +6,16 @@ from typing import Any
 
 from rhs_isac_ros.model.mobility import Mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, Event, Note, PeersChanged, Send, Tick
-from rhs_isac_ros.protocol.machine import ANY, SAME, Machine, Step
+from rhs_isac_ros.protocol.events import Action, Event, LogMessage, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.state_machine import ANY, SAME, StateMachine, Transition
 
 
 class State(enum.Enum):
     """States of a user."""
 
-    ALONE = 'alone'                # base station or channel is not there
+    DISCONNECTED = 'disconnected'                # base station or channel is not there
     LISTENING = 'listening'        # for a beacon
-    UNCALLED = 'uncalled'          # the same, for too long
+    NO_BEACON = 'no_beacon'          # the same, for too long
     ACKNOWLEDGED = 'acknowledged'  # waiting for the grant
     GRANTED = 'granted'            # being positioned and served
 
@@ -41,39 +41,39 @@ class Input(enum.Enum):
 
 S, I = State, Input  # noqa: E741
 
-TABLE: Mapping[tuple[State | None, Input], Step] = {
-    (S.ALONE, I.CONNECTED): Step(S.LISTENING, ('say_found',)),
-    (S.ALONE, I.CUT_OFF): Step(SAME, ('say_missing',)),
-    (S.ALONE, I.BEACON): Step(SAME),
-    (ANY, I.CONNECTED): Step(SAME),
-    (ANY, I.CUT_OFF): Step(S.ALONE, ('say_missing',)),
+TABLE: Mapping[tuple[State | None, Input], Transition] = {
+    (S.DISCONNECTED, I.CONNECTED): Transition(S.LISTENING, ('say_found',)),
+    (S.DISCONNECTED, I.CUT_OFF): Transition(SAME, ('say_missing',)),
+    (S.DISCONNECTED, I.BEACON): Transition(SAME),
+    (ANY, I.CONNECTED): Transition(SAME),
+    (ANY, I.CUT_OFF): Transition(S.DISCONNECTED, ('say_missing',)),
     # The base station may take longer than this user waited.
-    (S.LISTENING, I.GRANT): Step(S.GRANTED, ('stand',)),
-    (S.LISTENING, I.BEACON): Step(S.ACKNOWLEDGED, ('acknowledge',)),
-    (S.LISTENING, I.TIMEOUT): Step(S.UNCALLED, ('say_uncalled',), counts='no_beacon'),
-    (S.UNCALLED, I.GRANT): Step(S.GRANTED, ('say_called', 'stand')),
-    (S.UNCALLED, I.BEACON): Step(S.ACKNOWLEDGED, ('say_called', 'acknowledge')),
-    (S.ACKNOWLEDGED, I.BEACON): Step(SAME, ('acknowledge',), rearm=True),
-    (S.ACKNOWLEDGED, I.GRANT): Step(S.GRANTED, ('stand',)),
+    (S.LISTENING, I.GRANT): Transition(S.GRANTED, ('stand',)),
+    (S.LISTENING, I.BEACON): Transition(S.ACKNOWLEDGED, ('acknowledge',)),
+    (S.LISTENING, I.TIMEOUT): Transition(S.NO_BEACON, ('say_uncalled',), counts='no_beacon'),
+    (S.NO_BEACON, I.GRANT): Transition(S.GRANTED, ('say_called', 'stand')),
+    (S.NO_BEACON, I.BEACON): Transition(S.ACKNOWLEDGED, ('say_called', 'acknowledge')),
+    (S.ACKNOWLEDGED, I.BEACON): Transition(SAME, ('acknowledge',), rearm=True),
+    (S.ACKNOWLEDGED, I.GRANT): Transition(S.GRANTED, ('stand',)),
     # A request that overtakes the grant says the same.
-    (S.ACKNOWLEDGED, I.PILOT_REQUEST): Step(S.GRANTED, ('stand', 'send_pilots')),
-    (S.ACKNOWLEDGED, I.OTHER_GRANT): Step(S.LISTENING),
-    (S.ACKNOWLEDGED, I.TIMEOUT): Step(S.LISTENING, counts='not_granted'),
-    (S.GRANTED, I.GRANT): Step(SAME),
-    (S.GRANTED, I.PILOT_REQUEST): Step(SAME, ('send_pilots',), rearm=True),
+    (S.ACKNOWLEDGED, I.PILOT_REQUEST): Transition(S.GRANTED, ('stand', 'send_pilots')),
+    (S.ACKNOWLEDGED, I.OTHER_GRANT): Transition(S.LISTENING),
+    (S.ACKNOWLEDGED, I.TIMEOUT): Transition(S.LISTENING, counts='not_granted'),
+    (S.GRANTED, I.GRANT): Transition(SAME),
+    (S.GRANTED, I.PILOT_REQUEST): Transition(SAME, ('send_pilots',), rearm=True),
     # Something was lost: perhaps the pilots, perhaps where they come from.
-    (S.GRANTED, I.SAME_REQUEST): Step(
+    (S.GRANTED, I.SAME_REQUEST): Transition(
         SAME, ('stand', 'send_pilots'), counts='asked_again', rearm=True),
-    (S.GRANTED, I.DOWNLINK): Step(S.LISTENING, ('send_uplink',)),
-    (S.LISTENING, I.DOWNLINK): Step(SAME, ('send_uplink',), counts='asked_again'),
-    (S.GRANTED, I.BEACON): Step(S.ACKNOWLEDGED, ('acknowledge',), counts='abandoned'),
-    (S.GRANTED, I.TIMEOUT): Step(S.LISTENING, counts='bs_silent'),
-    (ANY, I.STALE_BEACON): Step(SAME, counts='stale_beacon'),
-    (ANY, I.LATE_GRANT): Step(SAME, counts='late_grant'),
-    (ANY, I.OTHER_GRANT): Step(SAME),
-    (ANY, I.OTHER_USER): Step(SAME),
-    (ANY, I.OTHER_DATA): Step(SAME),
-    (ANY, I.WRONG_CYCLE): Step(SAME, counts='wrong_cycle'),
+    (S.GRANTED, I.DOWNLINK): Transition(S.LISTENING, ('send_uplink',)),
+    (S.LISTENING, I.DOWNLINK): Transition(SAME, ('send_uplink',), counts='asked_again'),
+    (S.GRANTED, I.BEACON): Transition(S.ACKNOWLEDGED, ('acknowledge',), counts='abandoned'),
+    (S.GRANTED, I.TIMEOUT): Transition(S.LISTENING, counts='bs_silent'),
+    (ANY, I.STALE_BEACON): Transition(SAME, counts='stale_beacon'),
+    (ANY, I.LATE_GRANT): Transition(SAME, counts='late_grant'),
+    (ANY, I.OTHER_GRANT): Transition(SAME),
+    (ANY, I.OTHER_USER): Transition(SAME),
+    (ANY, I.OTHER_DATA): Transition(SAME),
+    (ANY, I.WRONG_CYCLE): Transition(SAME, counts='wrong_cycle'),
 }
 
 
@@ -103,7 +103,7 @@ def timeouts(step_s: float, beacon_s: float) -> dict[State, float]:
             State.GRANTED: _SILENT_STEPS * step_s}
 
 
-class User(Machine):
+class User(StateMachine):
     """The role of a user.
 
     Parameters
@@ -116,12 +116,15 @@ class User(Machine):
         Time-outs by state.
     """
 
+    SENDS = (m.Ack, m.GroundTruth, m.Pilot, m.Data)
+    RECEIVES = (m.Beacon, m.Grant, m.PilotRequest, m.Data)
+
     TABLE = TABLE
-    LACKING = frozenset({State.ALONE, State.UNCALLED})
+    LACKING = frozenset({State.DISCONNECTED, State.NO_BEACON})
 
     def __init__(
             self, user: int, mobility: Mobility, timeouts_s: Mapping[State, float]) -> None:
-        super().__init__(State.ALONE, timeouts_s)
+        super().__init__(State.DISCONNECTED, timeouts_s)
         self.user = user
         self._mobility = mobility
         self._cycle_id = 0
@@ -131,7 +134,7 @@ class User(Machine):
         self._heard: dict[int, int] = {}
         self._truths: dict[int, m.GroundTruth] = {}
 
-    def whereabouts(self, now_s: float, cycle_id: int = 0) -> m.GroundTruth:
+    def ground_truth(self, now_s: float, cycle_id: int = 0) -> m.GroundTruth:
         """Return where the user is.
 
         Parameters
@@ -182,17 +185,17 @@ class User(Machine):
         return self._cycle_id in self._truths and self.state is not State.GRANTED
 
     def _say_found(self, event: PeersChanged, now_s: float) -> list[Action]:
-        return [Note('listening for beacons')]
+        return [LogMessage('listening for beacons')]
 
     def _say_missing(self, event: PeersChanged, now_s: float) -> list[Action]:
-        return [Note(f'waiting for {", ".join(event.missing)}', warning=True)]
+        return [LogMessage(f'waiting for {", ".join(event.missing)}', warning=True)]
 
     def _say_uncalled(self, event: Tick, now_s: float) -> list[Action]:
         wait_s = self._timeouts_s[State.LISTENING]
-        return [Note(f'no beacon for {wait_s:g} s', warning=True)]
+        return [LogMessage(f'no beacon for {wait_s:g} s', warning=True)]
 
     def _say_called(self, event: m.Beacon | m.Grant, now_s: float) -> list[Action]:
-        return [Note('called again')]
+        return [LogMessage('called again')]
 
     def _acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
         self._cycle_id = event.cycle_id
@@ -200,7 +203,7 @@ class User(Machine):
         return [Send(m.Ack(event.cycle_id, self.user))]
 
     def _stand(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
-        truth = self._truths.get(event.cycle_id) or self.whereabouts(now_s, event.cycle_id)
+        truth = self._truths.get(event.cycle_id) or self.ground_truth(now_s, event.cycle_id)
         _keep(self._truths, event.cycle_id, truth)
         return [Send(truth)]
 

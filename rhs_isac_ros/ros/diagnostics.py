@@ -7,7 +7,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from rhs_isac_ros.protocol.health import Report
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import qos, topics
 from rhs_isac_ros.ros.timers import steady_timer
 

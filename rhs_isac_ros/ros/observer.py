@@ -5,11 +5,11 @@ from typing import Any
 
 from rclpy.node import Node
 
-from rhs_isac_ros.protocol import cycle_log
+from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.listening import listen
 from rhs_isac_ros.ros.recording import Recorder
+from rhs_isac_ros.ros.subscriptions import listen
 
 
 class CycleObserver(Node):

@@ -32,7 +32,7 @@ class Parameter:
         The values that a string may have; empty if any.
     plugins
         Group of entry points whose names are choices too; empty if there is none.
-    hot
+    dynamic
         Whether it may change while the node runs; all others are read at the start.
     """
 
@@ -44,7 +44,7 @@ class Parameter:
     high: float | None = None
     choices: tuple[str, ...] = ()
     plugins: str = ''
-    hot: bool = False
+    dynamic: bool = False
 
     @property
     def kind(self) -> str:

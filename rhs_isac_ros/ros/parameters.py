@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from rhs_isac_ros.model import mobility, plugins
 from rhs_isac_ros.positioning import ESTIMATORS
-from rhs_isac_ros.protocol.roster import POLICIES
+from rhs_isac_ros.protocol.user_scheduler import POLICIES
 from rhs_isac_ros.ros.parameter import Parameter, ParameterError
 
 Settings = TypeVar('Settings')
@@ -25,21 +25,21 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
         SCENARIO, SEED,
         Parameter('policy', 'round_robin', 'How to select among the users that answer.',
-                  choices=POLICIES, hot=True),
+                  choices=POLICIES, dynamic=True),
         Parameter('receiver_noise', True,
-                  'Add thermal noise; false where the radio has its own.', hot=True),
+                  'Add thermal noise; false where the radio has its own.', dynamic=True),
         Parameter('ack_timeout_s', 0.1, 'How long to wait for acks.', 's', 0.001, 60.0,
-                  hot=True),
+                  dynamic=True),
         STEP_TIMEOUT,
         Parameter('retries', 3, 'How often a step is asked for again within step_timeout_s.',
-                  low=0, high=100, hot=True),
-        Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0, hot=True),
+                  low=0, high=100, dynamic=True),
+        Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0, dynamic=True),
         Parameter('data_duration_s', 1e-3, 'Time that each direction transmits data.', 's',
-                  1e-6, 10.0, hot=True),
+                  1e-6, 10.0, dynamic=True),
         Parameter('allowed_users', '',
-                  'Users whose acks it takes, such as 1, 4, 10-20; empty: all.', hot=True),
+                  'Users whose acks it takes, such as 1, 4, 10-20; empty: all.', dynamic=True),
         Parameter('ack_rate_hz', 200.0, 'Acks that it takes of each user in a second.', 'Hz',
-                  1.0, 1e6, hot=True),
+                  1.0, 1e6, dynamic=True),
         Parameter('first_cycle', 0,
                   'Number of the first cycle; 0: from the clock, so that none is repeated after '
                   'a restart.', low=0, high=2**53),
@@ -65,25 +65,26 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     'channel': (
         SCENARIO, SEED,
         Parameter('loss_probability', 0.0, 'That the air loses a signal or a packet.',
-                  low=0.0, high=1.0, hot=True),
+                  low=0.0, high=1.0, dynamic=True),
         Parameter('double_probability', 0.0, 'That one arrives twice.', low=0.0, high=1.0,
-                  hot=True),
-        Parameter('delay_s', 0.0, 'How long each takes at least.', 's', 0.0, 10.0, hot=True),
+                  dynamic=True),
+        Parameter('delay_s', 0.0, 'How long each takes at least.', 's', 0.0, 10.0, dynamic=True),
         Parameter('jitter_s', 0.0, 'How much longer at most, each at random: they overtake.', 's',
-                  0.0, 10.0, hot=True),
+                  0.0, 10.0, dynamic=True),
     ),
     'positioner': (
         SCENARIO,
         Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS),
-                  plugins=plugins.ESTIMATORS, hot=True),
+                  plugins=plugins.ESTIMATORS, dynamic=True),
         Parameter('table_folder', '',
                   "Where tables are kept between runs; empty: the user's folder for caches."),
-        Parameter('model_file', '', 'Trained model; the estimator neural needs one.', hot=True),
+        Parameter('model_file', '', 'Trained model; the estimator neural needs one.',
+                  dynamic=True),
     ),
     'transmission': (
         SCENARIO,
         Parameter('band', -1, 'Band of the transmission, from 0; -1: in each cycle the best.',
-                  low=-1, high=4095, hot=True),
+                  low=-1, high=4095, dynamic=True),
     ),
     'optimizer': (
         SCENARIO,
@@ -135,7 +136,7 @@ def _declare_one(node: Any, parameter: Parameter) -> Any:
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.text + unit, additional_constraints=parameter.expected,
-        read_only=not parameter.hot)
+        read_only=not parameter.dynamic)
     if parameter.low is not None and type(default) is int:
         descriptor.integer_range = [
             IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high))]
@@ -201,7 +202,7 @@ def table() -> str:
         shown = str(default).lower() if isinstance(default, bool) else default or 'empty'
         shown = default if type(default) in (int, float) else shown
         lines.append(f'| `{name}` | {parameter.kind} | {shown} | {parameter.range} | '
-                     f'{"yes" if parameter.hot else ""} | {", ".join(owners)} | '
+                     f'{"yes" if parameter.dynamic else ""} | {", ".join(owners)} | '
                      f'{parameter.text} |')
     return '\n'.join(lines)
 

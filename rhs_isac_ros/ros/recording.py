@@ -21,7 +21,7 @@ from rclpy.serialization import deserialize_message
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.listening import subscribe
+from rhs_isac_ros.ros.subscriptions import subscribe
 
 # What stands between the definitions of a schema, as in ROS 1 and 2.
 _RULE = '=' * 80

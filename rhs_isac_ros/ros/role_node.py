@@ -8,22 +8,22 @@ from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     Action,
     Event,
-    Note,
+    LogMessage,
     Send,
-    SettingsKept,
     SettingsOffered,
+    SettingsReverted,
     Tick,
 )
-from rhs_isac_ros.protocol.health import Health, Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.codebook_source import CodebookSource
 from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.listening import subscribe
 from rhs_isac_ros.ros.settable_node import SettableNode
+from rhs_isac_ros.ros.subscriptions import subscribe
 from rhs_isac_ros.ros.timers import steady_timer
 
 
@@ -40,7 +40,7 @@ class Role(Protocol):
         """Return when the role wants a `Tick`."""
         ...
 
-    def standing(self) -> Mapping[str, str]:
+    def status(self) -> Mapping[str, str]:
         """Return what is in use and what waits, by name."""
         ...
 
@@ -88,7 +88,7 @@ class RoleNode(SettableNode):
         self._outlets: dict[type[m.Message], Publisher] = {}
         self.advertise(sends)
         self._complaints: set[str] = set()
-        self._health = Health()
+        self._health = RoleStatistics()
         # One timer for all deadlines. It is set anew only when it rings too early or too late.
         self._timer = steady_timer(self, 3600.0, self._ring)
         self._timer.cancel()
@@ -119,10 +119,10 @@ class RoleNode(SettableNode):
         state = getattr(self._role, 'state', None)
         if state is None:
             return self._health.report(
-                '', self._role.counters, standing=self._role.standing())
+                '', self._role.counters, standing=self._role.status())
         return self._health.report(
             state.value, self._role.counters, state in self._role.LACKING,
-            self._role.standing())
+            self._role.status())
 
     def offer(self, settings: Any) -> None:
         """Offer the role other settings.
@@ -132,7 +132,7 @@ class RoleNode(SettableNode):
         settings
             The settings.
         """
-        self.tell(SettingsOffered(settings))
+        self.dispatch(SettingsOffered(settings))
 
     def follow_codebook(self, on_codebook: Callable[[Codebook], None]) -> None:
         """Fetch the codebook from the optimizer, and every change of it.
@@ -184,7 +184,7 @@ class RoleNode(SettableNode):
         """
         return time.monotonic()
 
-    def tell(self, event: Event) -> None:
+    def dispatch(self, event: Event) -> None:
         """Hand an event to the role and do what it asks for.
 
         Parameters
@@ -246,7 +246,7 @@ class RoleNode(SettableNode):
                 self._role.counters['malformed'] += 1
                 self._complain('dropped', error)
                 return
-            self.tell(message)
+            self.dispatch(message)
         return receive
 
     def _hand(self, event: Event, now_s: float) -> None:
@@ -260,11 +260,11 @@ class RoleNode(SettableNode):
             match action:
                 case Send(message):
                     self.publish(message)
-                case Note(text, True):
+                case LogMessage(text, True):
                     self.get_logger().warning(text)
-                case Note(text):
+                case LogMessage(text):
                     self.get_logger().info(text)
-                case SettingsKept(settings):
+                case SettingsReverted(settings):
                     self.restore(settings)
                 case _:
                     self.perform(action)
@@ -289,6 +289,6 @@ class RoleNode(SettableNode):
         if deadline_s is None:
             return
         if deadline_s <= now_s:
-            self.tell(Tick())
+            self.dispatch(Tick())
         else:
             self._set_timer(deadline_s - now_s, deadline_s)

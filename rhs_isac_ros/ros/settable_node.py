@@ -37,8 +37,8 @@ class SettableNode(Node):
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(name or executable, **node_options)
         self.values = parameters.declare(self, executable)
-        self._hot = {parameter.name: parameter for parameter in parameters.NODES[executable]
-                     if parameter.hot}
+        self._dynamic = {parameter.name: parameter for parameter in parameters.NODES[executable]
+                     if parameter.dynamic}
         # The values that were set last, and what `settings` made of those checked last.
         self._set_last, self._checked = self.values, None
         self._is_restoring = False
@@ -86,7 +86,7 @@ class SettableNode(Node):
         try:
             self.set_parameters_atomically([
                 Parameter(name, value=value)
-                for name, value in dataclasses.asdict(settings).items() if name in self._hot])
+                for name, value in dataclasses.asdict(settings).items() if name in self._dynamic])
         finally:
             self._is_restoring = False
 
@@ -110,11 +110,11 @@ class SettableNode(Node):
         return super().set_parameters_atomically(parameter_list)
 
     def _mine(self, changes: Iterable[Parameter]) -> dict[str, Any]:
-        return {p.name: p.value for p in changes if p.name in self._hot}
+        return {p.name: p.value for p in changes if p.name in self._dynamic}
 
     def _check_each(self, changes: Iterable[Parameter]) -> None:
         for name, value in self._mine(changes).items():
-            self._hot[name].check(value)
+            self._dynamic[name].check(value)
 
     def _with(self, changes: Iterable[Parameter]) -> types.SimpleNamespace:
         return types.SimpleNamespace(**{**vars(self._set_last), **self._mine(changes)})

@@ -18,12 +18,12 @@ import rclpy
 from parts.hops import hops_of, ping_pong
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.nodes.demo import start_network, watch
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.tools.demo import start_network, watch
 
 # Between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05

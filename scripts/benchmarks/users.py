@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from parts.hops import hops_of, ping_pong
+from system.chaos.watcher import Watcher
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.nodes.chaos.watcher import Watcher
-from rhs_isac_ros.nodes.demo import start_network
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.tools.demo import start_network
 
 PATIENCE_S = 600.0
 

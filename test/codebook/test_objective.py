@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import PairConfusion, crlb
+from rhs_isac_ros.bounds import PairwiseErrorCost, crlb
 from rhs_isac_ros.codebook import OBJECTIVES, objective, optimize, random_codebook
 from rhs_isac_ros.codebook.objective import ambiguity, average_bound
 from rhs_isac_ros.codebook.problem import Problem
@@ -83,7 +83,7 @@ def test_optimising_ambiguity_confuses_fewer_pairs_also_of_others(scenario):
                       max_steps=30)
     rng = np.random.default_rng(99)
     firsts = scenario.sample_positions(1500, rng)
-    held_out = PairConfusion(scenario, firsts, confusable(scenario, firsts, rng))
+    held_out = PairwiseErrorCost(scenario, firsts, confusable(scenario, firsts, rng))
     start = random_codebook(scenario, np.random.default_rng(1))
     bound = optimize(scenario, n_positions=128, seed=1, max_steps=30)
     found = held_out.value(result.codebook)

@@ -9,7 +9,7 @@ from rhs_isac_ros.link import Beam
 class PlainLink:
     """One band's link, one index at a time; V comes from outside.
 
-    The direct parts of Eq. (11) and the K x K channels behind it, for one scenario and band.
+    The direct parts of Eq. (10) and the K x K channels behind it, for one scenario and band.
     """
 
     def __init__(self, plain, spatial, band=0):

@@ -1,4 +1,4 @@
-"""Eq. (11) against independent values and against plain loops."""
+"""Eq. (10) against independent values and against plain loops."""
 
 import dataclasses
 

@@ -169,7 +169,7 @@ def test_mean_power_weighs_the_users_pattern(scenario):
 
 
 def test_bounds_are_those_of_differences(scenario, codebook):
-    """Eq. (12) from the mean signals alone."""
+    """Eq. (11) from the mean signals alone."""
     positions = scenario.sample_positions(5, np.random.default_rng(2))
     whiteners = factor(scenario, codebook).whiteners
     step = 1e-5

@@ -28,7 +28,7 @@ def test_every_node_tells_phase_cycles_drops_and_codebook(processes, make_watch,
     assert told.keys() == NODES
     assert int(values['bs']['cycles.served']) >= 3
     assert {'phase', 'cycle_ms.p50', 'handling_ms.p99'} <= values['bs'].keys()
-    assert values['user_1']['phase'] in {'alone', 'listening', 'acknowledged', 'granted'}
+    assert values['user_1']['phase'] in {'disconnected', 'listening', 'acknowledged', 'granted'}
     assert float(values['positioner']['estimate_ms.p50']) > 0
     takers = {'bs', 'rhs_controller', 'positioner', 'transmission', 'optimizer'}
     assert len({values[name]['codebook_id'] for name in takers}) == 1

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from rhs_isac_ros.protocol import diagram
-from rhs_isac_ros.protocol.machine import ANY, SAME
+from rhs_isac_ros.protocol.state_machine import ANY, SAME
 
 SVG = '{http://www.w3.org/2000/svg}'
 each_role = pytest.mark.parametrize('role', diagram.ROLES)

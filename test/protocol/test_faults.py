@@ -10,7 +10,7 @@ from rhs_isac_ros.model import mobility
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
-from rhs_isac_ros.protocol.bs_table import State
+from rhs_isac_ros.protocol.base_station_table import State
 from rhs_isac_ros.protocol.events import PeersChanged
 
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
@@ -544,7 +544,7 @@ def test_what_is_missing_is_not_said_again_for_news_that_change_nothing(network,
     net = network(absent=['positioner'])
     for codebook in codebooks:
         net.offer(codebook)
-        net.tell('bs', PeersChanged(('positioner',)))
+        net.dispatch('bs', PeersChanged(('positioner',)))
     assert net.said('bs') == ['waiting for positioner']
 
 
@@ -561,7 +561,7 @@ def test_a_user_without_a_base_station_waits_and_says_so_once(network):
     net = network(absent=['bs'])
     net.run(limit_s=30.0)
     assert net.said('user1') == ['waiting for bs']
-    assert net['user1'].state is user_role.State.ALONE
+    assert net['user1'].state is user_role.State.DISCONNECTED
     net.publish(m.Beacon(7, 0))
     net.run(limit_s=1.0)
     assert net.sent(m.Ack) == []
@@ -610,7 +610,7 @@ def test_a_base_station_that_is_gone_leaves_the_users_alone(network):
     net.run_cycles(2)
     net.run_to(State.SOUNDING)
     net.remove('bs')
-    assert [net[u].state for u in ('user1', 'user2')] == [user_role.State.ALONE] * 2
+    assert [net[u].state for u in ('user1', 'user2')] == [user_role.State.DISCONNECTED] * 2
     net.run(limit_s=5.0)
     assert net.said('user1')[-1] == 'waiting for bs'
 

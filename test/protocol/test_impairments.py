@@ -5,8 +5,8 @@ import pytest
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.events import Note, Send, Tick
-from rhs_isac_ros.protocol.impairments import Impaired, Impairments
+from rhs_isac_ros.protocol.events import LogMessage, Send, Tick
+from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.protocol.role import PlainRole
 
 
@@ -14,14 +14,14 @@ class Repeats(PlainRole):
     """Sends on what it is told, with a note."""
 
     def handle(self, event, now_s):
-        return [Send(event), Note('heard')]
+        return [Send(event), LogMessage('heard')]
 
 
 @pytest.fixture
 def impaired():
     """Function of impairments: `Repeats` behind such an air."""
     def make(seed=0, **impairments):
-        return Impaired(Repeats(), Impairments(**impairments), np.random.default_rng(seed))
+        return ImpairedChannel(Repeats(), Impairments(**impairments), np.random.default_rng(seed))
     return make
 
 
@@ -30,13 +30,14 @@ def through(role, n):
     arrived = [action for cycle in range(n) for action in role.handle(m.Beacon(cycle, 0), 0.0)]
     while (due_s := role.next_deadline()) is not None:
         arrived += role.handle(Tick(), due_s)
-    assert sum(isinstance(action, Note) for action in arrived) == n
+    assert sum(isinstance(action, LogMessage) for action in arrived) == n
     return [action.message.cycle_id for action in arrived if isinstance(action, Send)]
 
 
 def test_an_ideal_air_changes_nothing(impaired):
     role = impaired()
-    (sent, note) = sorted(role.handle(m.Beacon(5, 0), 1.0), key=lambda a: isinstance(a, Note))
+    (sent, note) = sorted(
+        role.handle(m.Beacon(5, 0), 1.0), key=lambda a: isinstance(a, LogMessage))
     assert (sent.message.cycle_id, note.text) == (5, 'heard')
     assert role.next_deadline() is None
     assert role.counters == {}
@@ -80,7 +81,7 @@ def test_nearly_all_cycles_are_served_through_a_bad_air(network):
     net = network(2, rest_s=0.0, retries=3)
     channel = Channel(net.scenario, net.seed)
     air = Impairments(0.05, 0.05, 1e-3, 5e-3)
-    net._roles['channel'] = Impaired(channel, air, np.random.default_rng(1))
+    net._roles['channel'] = ImpairedChannel(channel, air, np.random.default_rng(1))
     net.run_cycles(300, limit_s=600.0)
     outcomes = [outcome for _, _, outcome in net.outcomes()]
     assert outcomes.count('served') >= 0.99 * len(outcomes)

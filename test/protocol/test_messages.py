@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import CodebookOffered, Note, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, PeersChanged, Send, Tick
 
 KINDS = [kind for _, kind in inspect.getmembers(m, inspect.isclass)
          if issubclass(kind, m.Message) and kind is not m.Message]
@@ -39,7 +39,7 @@ def test_messages_cannot_be_changed(example, kind):
 
 @pytest.mark.parametrize(('event', 'field'), [
     (CodebookOffered(None), 'codebook'), (PeersChanged(()), 'missing'),
-    (Send(None), 'message'), (Note('text'), 'text'), (Note('text'), 'warning')])
+    (Send(None), 'message'), (LogMessage('text'), 'text'), (LogMessage('text'), 'warning')])
 def test_events_and_actions_cannot_be_changed(event, field):
     with pytest.raises(dataclasses.FrozenInstanceError):
         setattr(event, field, None)
@@ -56,7 +56,7 @@ def test_messages_are_the_same_if_all_that_they_say_is(example):
 def test_events_without_arrays_compare_by_value():
     assert Tick() == Tick()
     assert PeersChanged(('a',)) == PeersChanged(('a',)) != PeersChanged(('b',))
-    assert Note('a') == Note('a', False) != Note('a', True)
+    assert LogMessage('a') == LogMessage('a', False) != LogMessage('a', True)
 
 
 def test_messages_compare_by_identity(example):

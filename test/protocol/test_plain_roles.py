@@ -15,15 +15,15 @@ from rhs_isac_ros.positioning import Estimate, SignalError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.events import (
+    BuildEstimator,
     CodebookOffered,
     EstimatorFailed,
-    EstimatorMade,
-    MakeEstimator,
-    Note,
+    EstimatorReady,
+    LogMessage,
     Send,
     SettingsOffered,
 )
-from rhs_isac_ros.protocol.positioner import Positioner, make_estimator_for
+from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 
@@ -210,12 +210,12 @@ def signals(codebooks, example):
 
 
 def made(codebook, estimator=None):
-    return EstimatorMade(codebook, estimator or Fixed(codebook), 1.5)
+    return EstimatorReady(codebook, estimator or Fixed(codebook), 1.5)
 
 
 def wanted(actions):
     """Ids of the codebooks that estimators are asked for."""
-    return [action.codebook.id for action in actions if isinstance(action, MakeEstimator)]
+    return [action.codebook.id for action in actions if isinstance(action, BuildEstimator)]
 
 
 def test_the_positioner_uses_the_estimator_of_the_signals_codebook(
@@ -223,7 +223,7 @@ def test_the_positioner_uses_the_estimator_of_the_signals_codebook(
     for codebook in codebooks[:2]:
         assert wanted(positioner.handle(CodebookOffered(codebook), 0.0)) == [codebook.id]
         assert positioner.handle(made(codebook), 0.0) == [
-            Note(f'fixed {codebook.id} is ready for codebook {codebook.id} after 1.5 s')]
+            LogMessage(f'fixed {codebook.id} is ready for codebook {codebook.id} after 1.5 s')]
     for number in (0, 1, 0, 1):
         codebook = codebooks[number]
         ((estimate,),) = feed(positioner, [signals(5, number)])
@@ -304,7 +304,7 @@ def test_an_estimator_that_cannot_be_made_leaves_the_old_one(positioner, codeboo
     feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0]),
                       CodebookOffered(codebooks[1]), signals(4, 1)])
     assert positioner.handle(EstimatorFailed(codebooks[1], 'no model'), 0.0) == [
-        Note(f'no estimator for codebook {codebooks[1].id}: no model', warning=True)]
+        LogMessage(f'no estimator for codebook {codebooks[1].id}: no model', warning=True)]
     assert [len(sent) for sent in feed(positioner, [signals(5), signals(6, 1)])] == [1, 0]
     assert positioner.counters == {'wrong_codebook': 2}
     # It may be offered again.
@@ -333,7 +333,7 @@ def test_without_a_fix_the_positioner_says_so_and_why(positioner, codebooks, sig
     assert (send.message.cycle_id, send.message.user) == (9, 2)
     assert send.message.codebook_id == codebooks[0].id
     assert send.message.reason == 'received: all wrong'
-    assert note == Note('cycle 9: no fix: received: all wrong', warning=True)
+    assert note == LogMessage('cycle 9: no fix: received: all wrong', warning=True)
     assert positioner.counters == {'no_fix': 1}
 
 
@@ -341,7 +341,7 @@ def test_without_a_fix_the_positioner_says_so_and_why(positioner, codebooks, sig
 def test_what_goes_wrong_while_an_estimator_is_made_is_an_event(codebooks, error):
     def make(codebook):
         raise error
-    event = make_estimator_for(codebooks[0], make, lambda: 0.0)
+    event = build_estimator(codebooks[0], make, lambda: 0.0)
     assert isinstance(event, EstimatorFailed)
     assert event.codebook is codebooks[0]
     assert event.reason == (str(error) or 'MemoryError')
@@ -349,7 +349,7 @@ def test_what_goes_wrong_while_an_estimator_is_made_is_an_event(codebooks, error
 
 def test_an_estimator_that_was_made_comes_with_its_time(codebooks):
     watch = iter([3.0, 5.5])
-    event = make_estimator_for(codebooks[0], Fixed, lambda: next(watch))
+    event = build_estimator(codebooks[0], Fixed, lambda: next(watch))
     assert (event.codebook, event.elapsed_s) == (codebooks[0], 2.5)
     assert event.estimator.name == f'fixed {codebooks[0].id}'
 
@@ -526,8 +526,8 @@ def test_a_cycle_stays_in_its_bands_when_others_are_to_be_used(
     role = Transmission(scenario, TransmissionSettings(1))
     (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
     assert role.handle(SettingsOffered(TransmissionSettings(0)), 0.0) == [
-        Note("from now on: band '0'")]
-    assert role.standing()['parameter.band'] == '0'
+        LogMessage("from now on: band '0'")]
+    assert role.status()['parameter.band'] == '0'
     moved = dataclasses.replace(estimate, position=estimate.position + 0.1)
     (again,), (other,), _, (report, _) = feed(role, [estimate, moved, truth, configured(beam)])
     assert again is beam
@@ -561,7 +561,7 @@ def test_no_sequence_of_messages_breaks_them(
         if name != 'channel' and rng.random() < 0.05:
             offered = CodebookOffered(codebooks[rng.integers(3)])
             for action in role.handle(offered, float(n)):
-                role.handle(EstimatorMade(action.codebook, Fixed(action.codebook), 0.0), float(n))
+                role.handle(EstimatorReady(action.codebook, Fixed(action.codebook), 0.0), float(n))
         for action in role.handle(example(kind, rng, **given), float(n)):
             assert isinstance(action, Send)
             m.check(action.message, scenario.sizes)

@@ -4,15 +4,15 @@ import dataclasses
 
 import pytest
 
-from rhs_isac_ros.protocol.events import Note
+from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
     PositionerSettings,
     changes,
+    describe_settings,
     shown,
-    tell,
 )
-from rhs_isac_ros.protocol.standing import Standing
 
 
 def test_changes_are_the_new_values_of_what_is_another():
@@ -23,7 +23,7 @@ def test_changes_are_the_new_values_of_what_is_another():
 
 
 def test_what_is_in_use_is_told_and_what_waits():
-    told = tell(PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
+    told = describe_settings(PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
     assert told == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
                     'pending.estimator': 'neural'}
 
@@ -41,13 +41,13 @@ def test_what_is_no_list_of_users_is_refused(users):
 
 def test_the_newest_settings_wait_until_they_are_settled():
     old, new = PositionerSettings(), PositionerSettings('ml')
-    standing = Standing(old)
+    standing = PendingSettings(old)
     assert standing.settle() == []
     standing.newest = PositionerSettings('neural')
     standing.newest = new
     assert standing.in_use == old
-    assert standing.tell()['pending.estimator'] == 'ml'
-    assert standing.settle() == [Note("from now on: estimator 'ml'")]
+    assert standing.describe()['pending.estimator'] == 'ml'
+    assert standing.settle() == [LogMessage("from now on: estimator 'ml'")]
     assert standing.in_use == new
-    assert 'pending.estimator' not in standing.tell()
+    assert 'pending.estimator' not in standing.describe()
     assert standing.settle() == []

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.bs_table import State
-from rhs_isac_ros.protocol.impairments import Impaired, Impairments
+from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
 IN_A_CYCLE = [State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
@@ -15,7 +15,7 @@ UNFIT = {'estimator': 'neural', 'model_file': 'unfit'}
 
 def told(net, role, beginning):
     """What a role tells under names with a beginning."""
-    return {name: value for name, value in net[role].standing().items()
+    return {name: value for name, value in net[role].status().items()
             if name.startswith(beginning)}
 
 
@@ -139,7 +139,7 @@ def test_signals_that_were_answered_get_the_same_answer_again(network):
     net.run_to(State.STEERING)
     net.change('positioner', estimator='ml')
     (signals,) = net.sent(m.ReceivedSignals)
-    net.tell('positioner', signals)
+    net.dispatch('positioner', signals)
     assert [estimate.estimator for estimate in net.sent(m.PositionEstimate)] == ['centre'] * 2
 
 
@@ -234,7 +234,7 @@ def test_without_a_codebook_the_estimator_is_only_noted(network, codebooks):
 
 def test_the_air_changes_when_a_cycle_begins(network):
     net = network()
-    net._roles['channel'] = Impaired(
+    net._roles['channel'] = ImpairedChannel(
         net['channel'], Impairments(), np.random.default_rng(1))
     net.run_cycles(1)
     net.run_to(State.SOUNDING)
@@ -266,6 +266,6 @@ def test_the_codebook_in_use_is_told(network, codebooks):
     net.run_to(State.SOUNDING)
     net.offer(codebooks[1])
     takers = ('bs', 'rhs_controller', 'positioner', 'transmission')
-    assert {net[name].standing()['codebook_id'] for name in takers} == {codebooks[0].id}
+    assert {net[name].status()['codebook_id'] for name in takers} == {codebooks[0].id}
     net.run_cycles(2)
-    assert {net[name].standing()['codebook_id'] for name in takers} == {codebooks[1].id}
+    assert {net[name].status()['codebook_id'] for name in takers} == {codebooks[1].id}

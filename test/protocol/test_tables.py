@@ -8,19 +8,21 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import mobility
-from rhs_isac_ros.protocol import bs, bs_table, rhs_controller, user
+from rhs_isac_ros.protocol import base_station as bs
+from rhs_isac_ros.protocol import base_station_table as bs_table
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol import rhs_controller, user
 from rhs_isac_ros.protocol.events import (
     CodebookOffered,
-    Note,
+    LogMessage,
     PeersChanged,
     Send,
     SettingsOffered,
     Tick,
 )
-from rhs_isac_ros.protocol.machine import ANY, SAME
-from rhs_isac_ros.protocol.roster import POLICIES, Roster
 from rhs_isac_ros.protocol.settings import BaseStationSettings
+from rhs_isac_ros.protocol.state_machine import ANY, SAME
+from rhs_isac_ros.protocol.user_scheduler import POLICIES, UserScheduler
 
 ROLES = {
     'bs': types.SimpleNamespace(
@@ -28,8 +30,8 @@ ROLES = {
         initial=bs_table.State.WAITING, home=bs_table.State.BEACONING,
         endless={bs_table.State.WAITING}),
     'user': types.SimpleNamespace(
-        machine=user.User, states=user.State, inputs=user.Input, initial=user.State.ALONE,
-        home=user.State.UNCALLED, endless={user.State.ALONE, user.State.UNCALLED}),
+        machine=user.User, states=user.State, inputs=user.Input, initial=user.State.DISCONNECTED,
+        home=user.State.NO_BEACON, endless={user.State.DISCONNECTED, user.State.NO_BEACON}),
     'rhs_controller': types.SimpleNamespace(
         machine=rhs_controller.RhsController, states=rhs_controller.State,
         inputs=rhs_controller.Input, initial=rhs_controller.State.IDLE,
@@ -185,7 +187,7 @@ def test_a_row_for_any_state_is_not_hidden_by_rows_for_all(role):
 
 def snapshot(thing):
     """All that a machine remembers, besides its counters."""
-    return {name: snapshot(value) if isinstance(value, Roster) else
+    return {name: snapshot(value) if isinstance(value, UserScheduler) else
             copy.copy(value) if isinstance(value, dict | list) else value
             for name, value in vars(thing).items() if name not in ('counters', '_classify')}
 
@@ -250,7 +252,7 @@ def test_no_sequence_of_events_breaks_a_role(
         now_s += rng.exponential(0.05)
         before = subject.state
         for action in subject.handle(event, now_s):
-            assert isinstance(action, Send | Note)
+            assert isinstance(action, Send | LogMessage)
             if isinstance(action, Send):
                 m.check(action.message, scenario.sizes)
                 sent.add(type(action.message))

@@ -5,7 +5,7 @@ import pytest
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Note, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Send, Tick
 from rhs_isac_ros.protocol.user import State, User, timeouts
 
 DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
@@ -59,7 +59,7 @@ def test_every_further_beacon_is_answered_and_starts_the_time_out_afresh(user, c
 
 
 def test_a_grant_is_answered_with_the_position_of_the_moment(user):
-    user.whereabouts(8.0)
+    user.ground_truth(8.0)
     (truth,) = grant(user)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
     np.testing.assert_allclose(truth.position, (7, 0, 0))
@@ -68,9 +68,9 @@ def test_a_grant_is_answered_with_the_position_of_the_moment(user):
 
 
 def test_whereabouts_belong_to_no_cycle_unless_told(user):
-    assert user.whereabouts(0.0).cycle_id == 0
-    assert user.whereabouts(0.0, 9).cycle_id == 9
-    assert user.whereabouts(0.0).user == 4
+    assert user.ground_truth(0.0).cycle_id == 0
+    assert user.ground_truth(0.0, 9).cycle_id == 9
+    assert user.ground_truth(0.0).user == 4
 
 
 def test_a_pilot_request_is_answered_frame_by_frame_and_starts_the_time_out_afresh(user):
@@ -170,10 +170,10 @@ def test_waiting_in_vain_ends_with_listening(user, granted, deadline_s, reason):
 def test_a_user_that_is_cut_off_says_so_and_is_silent(user, state):
     user.state = state
     assert user.handle(PeersChanged(('channel', 'bs')), 1.0) == [
-        Note('waiting for channel, bs', warning=True)]
-    assert user.state is State.ALONE
+        LogMessage('waiting for channel, bs', warning=True)]
+    assert user.state is State.DISCONNECTED
     assert user.handle(m.Beacon(7, 0), 1.0) == []
-    assert user.handle(PeersChanged(()), 2.0) == [Note('listening for beacons')]
+    assert user.handle(PeersChanged(()), 2.0) == [LogMessage('listening for beacons')]
     assert user.state is State.LISTENING
 
 

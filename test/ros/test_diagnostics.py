@@ -4,7 +4,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from rhs_isac_ros.protocol.health import Report
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import qos, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics, from_ros, to_ros
 

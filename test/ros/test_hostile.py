@@ -41,8 +41,8 @@ class Stage:
         self._bench = bench
         probe = bench.add(Node, 'probe')
         self._outlets = {kind: bench.outlet(probe, kind) for kind in hears}
-        self._told, self._tell = 0, self.node.tell
-        self.node.tell = self._note
+        self._told, self._tell = 0, self.node.dispatch
+        self.node.dispatch = self._note
         self.heard = bench.hear(probe, answers)
         self.scenario = self.node.scenario
         self.codebook = Codebook.load(files / 'first.yaml')

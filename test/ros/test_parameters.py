@@ -82,7 +82,7 @@ def test_descriptors(make, executable):
     declare(node, executable)
     for p in NODES[executable]:
         descriptor = node.describe_parameter(p.name)
-        assert descriptor.read_only == (not p.hot)
+        assert descriptor.read_only == (not p.dynamic)
         assert descriptor.type == TYPES[type(p.default)]
         assert descriptor.description.startswith(p.text)
         assert f'[{p.unit}]' in descriptor.description or not p.unit
@@ -154,7 +154,7 @@ def test_choices(make, executable, parameter):
     assert refusal(make, executable, parameter.name, '').startswith(f"{parameter.name}: ''")
 
 
-@only(lambda p: not p.hot)
+@only(lambda p: not p.dynamic)
 def test_what_is_not_hot_does_not_change_at_run_time(make, executable, parameter):
     node = make()
     declare(node, executable)
@@ -175,7 +175,7 @@ def test_what_is_not_hot_does_not_change_at_run_time(make, executable, parameter
 def test_what_is_hot_is_in_the_settings_of_the_role(executable, settings):
     fields = {field.name: field.default for field in dataclasses.fields(settings)}
     declared = {p.name: p for p in NODES[executable]}
-    hot = {name for name, p in declared.items() if p.hot}
+    hot = {name for name, p in declared.items() if p.dynamic}
     # A base station shares its patience with users, who know of no change.
     assert fields.keys() - hot == ({'step_timeout_s'} if executable == 'bs' else set())
     assert hot <= fields.keys()
@@ -183,7 +183,7 @@ def test_what_is_hot_is_in_the_settings_of_the_role(executable, settings):
 
 
 def test_other_nodes_have_nothing_hot():
-    hot = {executable for executable, p in PAIRS if p.hot}
+    hot = {executable for executable, p in PAIRS if p.dynamic}
     assert hot == {'bs', 'channel', 'positioner', 'transmission'}
 
 
@@ -205,7 +205,7 @@ def test_table_lists_every_parameter_once_with_all_that_is_to_know():
         assert {p.text, ', '.join(nodes)} <= set(cells)
         assert all(choice in row for choice in p.choices)
         assert p.unit in row
-        assert ('yes' in cells) == p.hot
+        assert ('yes' in cells) == p.dynamic
 
 
 def test_a_parameter_that_nodes_share_is_the_same_in_all():

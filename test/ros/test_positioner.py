@@ -59,7 +59,7 @@ def send(bench, node, codebooks):
 
 def test_the_estimate_is_that_of_the_library(bench, node, send, codebooks, tmp_path):
     estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
-    node.tell(CodebookOffered(codebooks[0]))
+    node.dispatch(CodebookOffered(codebooks[0]))
     signals = send(3)
     (estimate,) = bench.until(lambda: estimates)
     expected = make_estimator('bayes', node.scenario, codebooks[0]).estimate(signals)
@@ -79,10 +79,10 @@ def test_signals_are_answered_while_another_estimator_is_made(
         return make_estimator(name, scenario, codebook, **options)
     monkeypatch.setattr(positioner, 'make_estimator', slowly)
     estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
-    node.tell(CodebookOffered(codebooks[0]))
+    node.dispatch(CodebookOffered(codebooks[0]))
     send(1)
     bench.until(lambda: len(estimates) == 1)
-    node.tell(CodebookOffered(codebooks[1]))
+    node.dispatch(CodebookOffered(codebooks[1]))
     bench.until(begun.is_set)
     send(2, 1)
     send(3)
@@ -101,7 +101,7 @@ def test_a_node_that_ends_meanwhile_ends_well(bench, node, codebooks, monkeypatc
         made.append(make_estimator(name, scenario, codebook, **options))
         return made[0]
     monkeypatch.setattr(positioner, 'make_estimator', slowly)
-    node.tell(CodebookOffered(codebooks[0]))
+    node.dispatch(CodebookOffered(codebooks[0]))
     assert begun.wait(10)
     bench.remove(node)
     assert len(made) == 1
@@ -111,7 +111,7 @@ def test_a_node_that_ends_meanwhile_ends_well(bench, node, codebooks, monkeypatc
 def test_without_a_fix_it_says_so(bench, node, send, codebooks):
     ear = bench.add(Node, 'ear')
     told, estimates = bench.hear(ear, m.NoFix), bench.hear(ear, m.PositionEstimate)
-    node.tell(CodebookOffered(codebooks[0]))
+    node.dispatch(CodebookOffered(codebooks[0]))
     send(1, factor=0.0)
     send(2, factor=1e3)
     send(3)
@@ -145,10 +145,10 @@ class TestNeural:
         monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
             info=said.append, warning=said.append))
         estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
-        node.tell(CodebookOffered(codebooks[0]))
+        node.dispatch(CodebookOffered(codebooks[0]))
         send(1)
         bench.until(lambda: len(estimates) == 1)
-        node.tell(CodebookOffered(codebooks[1]))
+        node.dispatch(CodebookOffered(codebooks[1]))
         bench.until(lambda: len(said) == 2)
         assert f'no estimator for codebook {codebooks[1].id}: ' in said[1]
         assert f'model.npz: trained for codebook {codebooks[0].id}, expected' in said[1]
@@ -188,7 +188,7 @@ def fails(scenario, codebook):
 
     def test_it_estimates_with_it(self, bench, node, send, codebooks, values):
         estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
-        node.tell(CodebookOffered(codebooks[0]))
+        node.dispatch(CodebookOffered(codebooks[0]))
         send(1)
         (estimate,) = bench.until(lambda: estimates)
         assert estimate.estimator == 'centre'
@@ -217,7 +217,7 @@ def test_a_plug_in_that_fails_is_told_and_named(
     said = []
     monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
         info=said.append, warning=said.append))
-    node.tell(CodebookOffered(codebooks[0]))
+    node.dispatch(CodebookOffered(codebooks[0]))
     bench.until(lambda: said)
     assert said[0].endswith(
         "fails = guesses:fails of guesses: failed: KeyError: 'no such file'")

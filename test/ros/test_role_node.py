@@ -9,7 +9,7 @@ import pytest
 from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Note, Send, Tick
+from rhs_isac_ros.protocol.events import LogMessage, Send, Tick
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.role_node import RoleNode
 
@@ -30,7 +30,7 @@ class Scripted:
     def next_deadline(self):
         return self.deadline_s
 
-    def standing(self):
+    def status(self):
         return {}
 
     @property
@@ -111,7 +111,7 @@ def test_a_wrong_message_of_the_role_is_not_published(each_bench, start, capfd):
     role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)])
     node = start(each_bench, role, sends=(m.FeedSignals,))
     heard = each_bench.hear(each_bench.add(Node, 'probe'), m.FeedSignals)
-    node.tell(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
     each_bench.until(lambda: heard, 'the good message')
     assert [message.user for message in heard] == [2]
     log = capfd.readouterr().err
@@ -120,8 +120,9 @@ def test_a_wrong_message_of_the_role_is_not_published(each_bench, start, capfd):
 
 
 def test_notes_go_to_the_log(bench, start, capfd):
-    role = Scripted(lambda role, event, now_s: [Note('all is well'), Note('beware', True)])
-    start(bench, role).tell(m.Ack(1, 1))
+    role = Scripted(
+        lambda role, event, now_s: [LogMessage('all is well'), LogMessage('beware', True)])
+    start(bench, role).dispatch(m.Ack(1, 1))
     first, second = capfd.readouterr().err.strip().splitlines()
     assert '[INFO]' in first
     assert first.endswith('[scripted]: all is well')
@@ -183,7 +184,7 @@ def deadlines(*delays_s):
 def test_a_tick_comes_when_it_is_due(each_bench, start):
     role = deadlines(0.05, 0.02, 0.1)
     node = start(each_bench, role)
-    node.tell(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
     assert not role.ticks_s
     each_bench.until(lambda: len(role.ticks_s) == 3, 'the last tick')
     for asked_s, tick_s in zip(role.asked_s[:3], role.ticks_s, strict=True):
@@ -194,8 +195,8 @@ def test_a_tick_comes_when_it_is_due(each_bench, start):
 def test_a_deadline_that_moves_ahead_is_met(each_bench, start):
     role = deadlines(3000.0, 0.05)
     node = start(each_bench, role)
-    node.tell(m.Ack(1, 1))
-    node.tell(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
     assert role.ticks_s[0] >= role.asked_s[1]
 
@@ -203,8 +204,8 @@ def test_a_deadline_that_moves_ahead_is_met(each_bench, start):
 def test_a_deadline_that_moves_back_is_met_once(each_bench, start):
     role = deadlines(0.02, 0.3)
     node = start(each_bench, role)
-    node.tell(m.Ack(1, 1))
-    node.tell(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
     assert role.ticks_s[0] >= role.asked_s[1]
     assert len(role.told) == 3
@@ -213,21 +214,21 @@ def test_a_deadline_that_moves_back_is_met_once(each_bench, start):
 def test_a_deadline_that_is_lifted_brings_no_tick(each_bench, start):
     lifted, later = deadlines(0.02, None), deadlines(0.2)
     node = start(each_bench, lifted)
-    node.tell(m.Ack(1, 1))
-    node.tell(m.Ack(1, 1))
-    start(each_bench, later, name='later').tell(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
+    start(each_bench, later, name='later').dispatch(m.Ack(1, 1))
     each_bench.until(lambda: later.ticks_s, 'the later tick')
     assert not lifted.ticks_s
     # And the node takes a new one.
     lifted._script = deadlines(0.02)._script
-    node.tell(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
     each_bench.until(lambda: lifted.ticks_s, 'the tick')
 
 
 def test_a_deadline_in_the_past_brings_its_tick_at_once(bench, start):
     role = deadlines(-1.0, 0.0, -5.0, 0.02)
     node = start(bench, role)
-    node.tell(m.Ack(1, 1))
+    node.dispatch(m.Ack(1, 1))
     assert [type(event) for event, _ in role.told] == [m.Ack, Tick, Tick, Tick]
     bench.until(lambda: len(role.ticks_s) == 4, 'the tick that was not due')
 

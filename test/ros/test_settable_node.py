@@ -14,7 +14,7 @@ from rhs_isac_ros.ros.parameters import NODES
 
 KINDS = {'bs': BsNode, 'channel': ChannelNode, 'positioner': PositionerNode,
          'transmission': TransmissionNode}
-HOT = [(executable, p) for executable, group in NODES.items() for p in group if p.hot]
+HOT = [(executable, p) for executable, group in NODES.items() for p in group if p.dynamic]
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def make(bench, small_files, tmp_path, monkeypatch):
         def note(event):
             assert isinstance(event, SettingsOffered)
             node.offers.append(event.settings)
-        monkeypatch.setattr(node, 'tell', note)
+        monkeypatch.setattr(node, 'dispatch', note)
         return node
     return make
 

@@ -20,11 +20,11 @@ from rhs_isac_ros.experiments import JobError, markdown_table
 from rhs_isac_ros.link import choose_beam, outcome
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.nodes.demo import watch
+from rhs_isac_ros.monitoring.cycle_log import CycleRecord
 from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.protocol.cycle_log import CycleRecord
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.tools.demo import watch
 
 # A network has so many users, each at a place of its own, and serves each so often.
 USERS, CYCLES_A_USER = 25, 4

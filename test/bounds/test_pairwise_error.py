@@ -1,0 +1,249 @@
+"""The error that the confusion of pairs of positions causes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import rows
+from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.multipath import multipath_covariance
+
+N_PAIRS = 9
+
+
+def make_scenario(noise_psd_dbm_hz):
+    return Scenario(
+        center_frequencies_hz=(1.2e9, 2e9), n_subbands=2, n_frames=3, n_feeds=2,
+        elements_per_side=3, subband_width_hz=4e5, frame_duration_s=3e-3,
+        noise_psd_dbm_hz=noise_psd_dbm_hz, roi_center_m=(3, 0, 0), roi_size_m=(2, 4, 2))
+
+
+@pytest.fixture(scope='module')
+def scenario():
+    """With noise that lets pairs be told apart sometimes."""
+    return make_scenario(-95)
+
+
+@pytest.fixture(scope='module')
+def codebook(scenario, random_beams):
+    return random_beams(scenario, np.random.default_rng(0))
+
+
+@pytest.fixture(scope='module')
+def pairs(scenario):
+    return scenario.sample_positions(2 * N_PAIRS, np.random.default_rng(1)).reshape(2, -1, 3)
+
+
+def plain_distances(p, firsts, seconds, spatial):
+    """q of every pair, band by band as the model is written."""
+    q = np.zeros(len(firsts))
+    for i in range(p.scenario.n_bands):
+        inverse = np.linalg.inv(p.covariance(i, spatial[i]))
+        for n, delta in enumerate(p.mean(firsts, i) - p.mean(seconds, i)):
+            q[n] += (delta.conj() @ inverse @ delta).real
+    return q
+
+
+def plain_terms(p, firsts, seconds, spatial):
+    """|p - p'|^2 Q(sqrt(q / 2)) of every pair; Q(x) = erfc(x / sqrt(2)) / 2."""
+    return np.array([
+        math.dist(first, second)**2 * math.erfc(math.sqrt(q / 2) / math.sqrt(2)) / 2
+        for first, second, q in zip(
+            firsts, seconds, plain_distances(p, firsts, seconds, spatial), strict=True)])
+
+
+@pytest.fixture(scope='module')
+def plain_of(scenario, plain):
+    """Function of analog, digital and positions: the terms of all pairs."""
+    spatial = multipath_covariance(scenario)
+
+    def of(analog, digital, firsts, seconds):
+        return plain_terms(plain(scenario, analog, digital), firsts, seconds, spatial)
+    return of
+
+
+def assert_near(outcome, expected, tolerance):
+    for actual, wanted in zip(outcome, expected, strict=True):
+        assert np.isfinite(actual).all()
+        np.testing.assert_allclose(
+            actual, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
+
+
+def test_the_pairs_of_these_tests_are_neither_clear_nor_hopeless(
+        scenario, codebook, pairs, plain):
+    p = plain(scenario, codebook.analog, codebook.digital)
+    q = plain_distances(p, *pairs, multipath_covariance(scenario))
+    assert 0.05 < q.min() < 2 < q.max() < 50
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
+def test_value_is_the_plain_one(scenario, codebook, pairs, plain_of, tolerance):
+    confusion = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)
+    expected = plain_of(codebook.analog, codebook.digital, *pairs).mean()
+    assert confusion.value(codebook) == pytest.approx(expected, rel=1e-8)
+    value = confusion(codebook).value
+    assert type(value) is float
+    assert value == pytest.approx(expected, rel=1e-8)
+    for n in range(N_PAIRS):
+        single = PairwiseErrorCost(scenario, *pairs[:, n:n + 1], tolerance=tolerance)
+        assert single.value(codebook) == pytest.approx(
+            plain_of(codebook.analog, codebook.digital, *pairs[:, n:n + 1])[0], rel=1e-7)
+
+
+def test_the_likelier_of_two_positions_is_wrong_as_often_as_that(
+        scenario, codebook, pairs, plain):
+    """Signals of the first position are drawn, and the second one's likelihood is compared."""
+    p = plain(scenario, codebook.analog, codebook.digital)
+    rng, n_draws = np.random.default_rng(2), 20_000
+    spatial = multipath_covariance(scenario)
+    q = plain_distances(p, *pairs, spatial)
+    n = int(np.argmin(np.abs(q - 2)))
+    ahead = np.zeros(n_draws)
+    for i in range(2):
+        covariance = p.covariance(i, spatial[i])
+        inverse = np.linalg.inv(covariance)
+        first, second = p.mean(pairs[:, n], i)
+        noise = rng.normal(size=(n_draws, 6, 2)) @ [1, 1j] / np.sqrt(2)
+        signals = first + noise @ np.linalg.cholesky(covariance).T
+        for sign, mean in ((1, first), (-1, second)):
+            offsets = signals - mean
+            ahead += sign * np.einsum('na,ab,nb->n', offsets.conj(), inverse, offsets).real
+    wrong = np.mean(ahead > 0)
+    single = PairwiseErrorCost(scenario, *pairs[:, n:n + 1], tolerance=1e-7)
+    expected = single.value(codebook) / math.dist(*pairs[:, n])**2
+    assert 0.1 < expected < 0.3
+    assert wrong == pytest.approx(expected, abs=4 * math.sqrt(expected / n_draws))
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
+@pytest.mark.parametrize('seed', [0, 1, 2])
+def test_gradients_are_the_limit_of_differences_of_plain_values(
+        scenario, pairs, plain_of, random_beams, seed, tolerance):
+    rng, step = np.random.default_rng(seed), 1e-5
+    codebook = random_beams(scenario, rng)
+    analog, digital = codebook.analog, codebook.digital
+    weights = rng.uniform(0.2, 3, N_PAIRS)
+
+    def value(analog, digital):
+        return np.mean(weights * plain_of(analog, digital, *pairs))
+
+    actual, by_analog, by_digital = PairwiseErrorCost(
+        scenario, *pairs, weights, tolerance=tolerance)(codebook)
+    assert actual == pytest.approx(value(analog, digital), rel=1e-8)
+    assert (by_analog.shape, by_analog.dtype) == (analog.shape, float)
+    assert (by_digital.shape, by_digital.dtype) == (digital.shape, complex)
+    for _ in range(2):
+        way = rng.normal(size=analog.shape)
+        difference = value(analog + step * way, digital) - value(analog - step * way, digital)
+        assert np.sum(by_analog * way) == pytest.approx(
+            difference / (2 * step),
+            abs=1e-6 * np.linalg.norm(by_analog) * np.linalg.norm(way))
+        way = rng.normal(size=(*digital.shape, 2)) @ [1, 1j] * np.abs(digital).max()
+        difference = value(analog, digital + step * way) - value(analog, digital - step * way)
+        assert np.sum(by_digital.conj() * way).real == pytest.approx(
+            difference / (2 * step),
+            abs=1e-6 * np.linalg.norm(by_digital) * np.linalg.norm(way))
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
+def test_pairs_count_by_their_weights_in_all_blocks(
+        scenario, codebook, pairs, plain_of, monkeypatch, tolerance):
+    monkeypatch.setattr(rows, '_BLOCK', 4)
+    weights = np.random.default_rng(3).uniform(0, 2, N_PAIRS)
+    weights[5] = 0
+    expected = np.mean(weights * plain_of(codebook.analog, codebook.digital, *pairs))
+    outcome = PairwiseErrorCost(scenario, *pairs, weights, tolerance)(codebook)
+    assert outcome.value == pytest.approx(expected, rel=1e-5)
+    # A pair of weight two is the same pair twice, and one of no weight is one less.
+    ones = PairwiseErrorCost(
+        scenario, *pairs, np.where(np.arange(N_PAIRS) == 2, 2.0, weights > 1), tolerance)
+    chosen = [*np.flatnonzero((weights > 1) & (np.arange(N_PAIRS) != 2)), 2, 2]
+    assert len(chosen) < N_PAIRS
+    repeated = PairwiseErrorCost(scenario, *pairs[:, chosen], tolerance=tolerance)(codebook)
+    assert_near(ones(codebook), [x * len(chosen) / N_PAIRS for x in repeated], 1e-5)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
+def test_without_weights_all_pairs_count_alike(scenario, codebook, pairs, tolerance):
+    assert_near(PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook),
+                PairwiseErrorCost(scenario, *pairs, np.ones(N_PAIRS), tolerance)(codebook), 1e-14)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
+def test_the_order_in_a_pair_does_not_matter(scenario, codebook, pairs, tolerance):
+    assert_near(PairwiseErrorCost(scenario, *pairs[::-1], tolerance=tolerance)(codebook),
+                PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook), 1e-5)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
+def test_a_pair_of_the_same_position_costs_nothing(scenario, codebook, pairs, tolerance):
+    expected = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook)
+    same = np.concatenate([pairs, pairs[[0, 0], :2]], axis=1)
+    outcome = PairwiseErrorCost(scenario, *same, tolerance=tolerance)(codebook)
+    assert_near(outcome, [x * N_PAIRS / (N_PAIRS + 2) for x in expected], 1e-5)
+    value, by_analog, by_digital = PairwiseErrorCost(
+        scenario, pairs[0], pairs[0], tolerance=tolerance)(codebook)
+    assert value == 0
+    np.testing.assert_array_equal(by_analog, 0)
+    np.testing.assert_array_equal(by_digital, 0)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
+def test_positions_that_look_alike_are_confused_every_other_time(
+        scenario, codebook, pairs, tolerance):
+    """Nothing reaches a surface that is switched off."""
+    dark = Codebook(np.zeros_like(codebook.analog), codebook.digital)
+    value, by_analog, by_digital = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(dark)
+    assert value == pytest.approx(np.mean(np.sum((pairs[0] - pairs[1])**2, axis=1)) / 2, rel=1e-14)
+    assert np.isfinite(by_analog).all()
+    np.testing.assert_array_equal(by_digital, 0)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
+def test_clear_pairs_cost_nothing_without_a_warning(scenario, codebook, pairs, tolerance):
+    """One of the positions is so near to the surface that there is no mistaking it."""
+    near = np.tile([1e-4, 0.0, 0.0], (N_PAIRS, 1))
+    value, by_analog, by_digital = PairwiseErrorCost(
+        scenario, pairs[0], near, tolerance=tolerance)(codebook)
+    assert value == 0
+    np.testing.assert_array_equal(by_analog, 0)
+    np.testing.assert_array_equal(by_digital, 0)
+
+
+def test_clearer_signals_are_confused_less(codebook, pairs):
+    values = [PairwiseErrorCost(make_scenario(noise), *pairs, tolerance=1e-6).value(codebook)
+              for noise in (-80, -95, -110)]
+    assert values[0] > values[1] > values[2] > 0
+
+
+@pytest.mark.parametrize('tolerance', [1e-7, 1e-5, 1e-3])
+def test_compressed_differences_give_the_exact_result_to_the_tolerance(
+        scenario, codebook, pairs, tolerance):
+    assert_near(PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook),
+                PairwiseErrorCost(scenario, *pairs)(codebook), 10 * tolerance)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
+@pytest.mark.parametrize('bad', [
+    [10.0, 0.0, 0.0], [[10.0, 0.0]], [[np.nan, 0.0, 0.0]], [[np.inf, 0.0, 0.0]]])
+def test_malformed_positions_are_errors(scenario, bad, tolerance):
+    good = np.array([[3.0, 0.0, 0.0]])
+    for first, second in ((bad, good), (good, bad)):
+        with pytest.raises(ValueError, match='^positions: .*, expected '):
+            PairwiseErrorCost(scenario, np.array(first), np.array(second), tolerance=tolerance)
+
+
+@pytest.mark.parametrize(('n_firsts', 'n_seconds'), [(0, 0), (3, 2), (1, 3), (2, 0)])
+def test_positions_that_are_not_pairs_are_errors(scenario, n_firsts, n_seconds):
+    with pytest.raises(
+            ValueError, match=f'^seconds: {n_seconds} positions, expected .* {n_firsts}, '):
+        PairwiseErrorCost(scenario, np.ones((n_firsts, 3)), np.ones((n_seconds, 3)))
+
+
+@pytest.mark.parametrize('tolerance', [1e-8, -1.0, np.nan])
+def test_a_tolerance_that_cannot_be_held_is_an_error(scenario, pairs, tolerance):
+    with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
+        PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)

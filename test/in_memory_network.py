@@ -1,0 +1,448 @@
+"""All roles on one bus in memory: virtual clock, transport with faults, record of everything."""
+
+import dataclasses
+import enum
+import heapq
+import itertools
+import types
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.model import Scenario, mobility, streams
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
+from rhs_isac_ros.model.receive import receive_feeds, received_signal
+from rhs_isac_ros.model.surface import radiation_matrix
+from rhs_isac_ros.positioning import Estimate, ModelError
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol import user as user_role
+from rhs_isac_ros.protocol.base_station import BaseStation
+from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.events import (
+    BuildEstimator,
+    CodebookOffered,
+    LogMessage,
+    PeersChanged,
+    Send,
+    SettingsOffered,
+    SettingsReverted,
+    Tick,
+)
+from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
+from rhs_isac_ros.protocol.rhs_controller import RhsController
+from rhs_isac_ros.protocol.settings import BaseStationSettings, PositionerSettings
+from rhs_isac_ros.protocol.transmission import Transmission
+
+ROLES = {'bs': BaseStation, 'user': user_role.User, 'rhs_controller': RhsController,
+         'channel': Channel, 'positioner': Positioner, 'transmission': Transmission}
+SUBSCRIPTIONS = {name: role.RECEIVES for name, role in ROLES.items()}
+PEERS = {
+    'bs': ('rhs_controller', 'channel', 'positioner', 'transmission'),
+    'user': ('channel', 'bs'),
+}
+TAKE_CODEBOOKS = ('bs', 'rhs_controller', 'positioner', 'transmission')
+LATENCY_S = 1e-3
+DATA_DURATION_S = 1e-3
+# A model file that fits no codebook.
+UNFIT = 'unfit'
+
+
+class Centre:
+    """An estimator that always finds the middle of the region."""
+
+    def __init__(self, scenario: Scenario, name: str = 'centre') -> None:
+        self._position, self.name = np.array(scenario.roi_center_m), name
+
+    def estimate(self, received: np.ndarray) -> Estimate:
+        return Estimate(self._position, np.eye(3))
+
+
+class Sent(NamedTuple):
+    time_s: float
+    sender: str
+    message: m.Message
+
+
+class Said(NamedTuple):
+    time_s: float
+    speaker: str
+    note: LogMessage
+
+
+Transport = Callable[[m.Message, str], Iterable[tuple[float, m.Message]]]
+
+
+def on_time(message: m.Message, recipient: str) -> list[tuple[float, m.Message]]:
+    """Deliver a message once; a transport returns delays and what arrives after them."""
+    return [(LATENCY_S, message)]
+
+
+class Noisy:
+    """Loses, doubles and delays messages at random; a lost message is lost for everybody."""
+
+    def __init__(
+            self, seed: int, loss: float = 0.0, doubles: float = 0.0,
+            jitter_s: float = 0.0) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._loss, self._doubles, self._jitter_s = loss, doubles, jitter_s
+        self._last, self._copies = None, 1
+
+    def __call__(self, message: m.Message, recipient: str) -> list[tuple[float, m.Message]]:
+        if message is not self._last:
+            self._last = message
+            self._copies = int(self._rng.random() >= self._loss)
+            self._copies += self._copies and int(self._rng.random() < self._doubles)
+        return [(LATENCY_S + self._jitter_s * self._rng.random(), message)
+                for _ in range(self._copies)]
+
+
+class Network:
+    """The roles, coupled by a bus.
+
+    `users` maps numbers to positions or mobilities; `make` makes the positioner's estimator of a
+    codebook, which takes `make_s`; `ordered` keeps the order of what one role sends to another
+    under one name.
+    """
+
+    def __init__(
+            self, scenario: Scenario, codebook, users, *, policy: str = 'round_robin',
+            seed: int = 0, step_timeout_s: float = 1.0, ack_timeout_s: float = 0.1,
+            rest_s: float = 0.1, transport: Transport = on_time, ordered: bool = True, make=None,
+            make_s: float = 0.0, absent: Iterable[str] = (),
+            begin_s: float = 0.0, retries: int = 0, beacon_timeout_s: float = 3.0,
+            allowed_users: str = '', ack_rate_hz: float = np.inf) -> None:
+        self.scenario, self.seed = scenario, seed
+        self.transport, self.ordered = transport, ordered
+        self.now_s = begin_s
+        self.settings = BaseStationSettings(
+            policy=policy, ack_timeout_s=ack_timeout_s, step_timeout_s=step_timeout_s,
+            retries=retries, rest_s=rest_s, data_duration_s=DATA_DURATION_S,
+            allowed_users=allowed_users, ack_rate_hz=ack_rate_hz)
+        self._beacon_timeout_s = beacon_timeout_s
+        # Whether the base station was to add noise, by cycle.
+        self._noise: dict[int, bool] = {}
+        self.log: list[Sent] = []
+        self.notes: list[Said] = []
+        self.kept: list[Any] = []
+        self._ends: list[tuple[int, int, str]] = []
+        self.codebooks = {} if codebook is None else {codebook.id: codebook}
+        self._roles: dict[str, Any] = {}
+        self._queue: list[tuple[float, int, str, Any, m.Message]] = []
+        self._serial = itertools.count()
+        self._last_arrival_s: dict[tuple[str, str, type], float] = {}
+        self._codebook = codebook
+        self._reported: dict[Any, tuple[str, ...]] = {}
+        self._mobilities = {}
+        self._make = make
+        self._make_s = make_s
+        self._lives = 0
+        self._awake = False
+        for user, place in users.items():
+            self.add_user(user, place)
+        for name in (*PEERS['bs'], 'bs'):
+            if name not in absent:
+                self.add(name)
+        self._awake = True
+        self._look_around()
+
+    def __getitem__(self, name: str):
+        return self._roles[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._roles
+
+    def add_user(self, user: int, place) -> None:
+        moves = hasattr(place, 'state')
+        self._mobilities[f'user{user}'] = place if moves else mobility.Static(place)
+        self.add(f'user{user}')
+
+    def add(self, name: str) -> None:
+        """Start a role afresh."""
+        role = self._roles[name] = self._build(name)
+        if name in TAKE_CODEBOOKS and self._codebook is not None:
+            self.dispatch(name, CodebookOffered(self._codebook))
+        self._reported.pop(role, None)
+        self._look_around()
+
+    def remove(self, name: str, noticed: bool = True) -> None:
+        """Crash a role; unless noticed, its peers are told at the next change only."""
+        del self._roles[name]
+        if noticed:
+            self._look_around()
+
+    def restart(self, name: str, noticed: bool = False) -> None:
+        self.remove(name, noticed)
+        self.add(name)
+
+    def offer(self, codebook) -> None:
+        """Offer a codebook to all that take one, at once."""
+        self._codebook = codebook
+        self.codebooks[codebook.id] = codebook
+        for name in TAKE_CODEBOOKS:
+            if name in self._roles:
+                self.dispatch(name, CodebookOffered(codebook))
+
+    def change(self, name: str, **values) -> None:
+        """Offer a role other settings: those offered last, but for these values."""
+        role = self._roles[name]
+        self.dispatch(name, SettingsOffered(dataclasses.replace(role._settings.newest, **values)))
+
+    def dispatch(self, name: str, event) -> None:
+        for action in self._roles[name].handle(event, self.now_s):
+            if isinstance(action, Send):
+                self.publish(action.message, name)
+            elif isinstance(action, BuildEstimator):
+                self._make_estimator(name, action)
+            elif isinstance(action, SettingsReverted):
+                self.kept.append(action.settings)
+            else:
+                self.notes.append(Said(self.now_s, name, action))
+
+    def _make_estimator(self, name: str, action: BuildEstimator) -> None:
+        """At once, or as something that arrives when it is done."""
+        def centre(codebook):
+            if action.settings.model_file == UNFIT:
+                raise ModelError('model_file: unfit')
+            # The usual one has a name of its own.
+            usual = action.settings == PositionerSettings()
+            return Centre(self.scenario, 'centre' if usual else action.settings.estimator)
+        event = build_estimator(
+            action.codebook, self._make or centre, lambda: self.now_s)
+        if not self._make_s:
+            self.dispatch(name, event)
+            return
+        heapq.heappush(self._queue, (self.now_s + self._make_s, next(self._serial), name,
+                                     self._roles[name], event))
+
+    def publish(self, message: m.Message, sender: str = 'stranger') -> None:
+        m.check(message, self.scenario.sizes)
+        self.log.append(Sent(self.now_s, sender, message))
+        if isinstance(message, m.Grant) and sender == 'bs':
+            self._noise[message.cycle_id] = self._roles['bs']._settings.in_use.receiver_noise
+        if isinstance(message, m.ProtocolState) and message.outcome:
+            self._ends.append((message.cycle_id, message.user, message.outcome))
+        for name, role in self._roles.items():
+            if type(message) not in SUBSCRIPTIONS[self._kind(name)]:
+                continue
+            for delay_s, arriving in self.transport(message, name):
+                key = (sender, name, type(message))
+                time_s = self.now_s + delay_s
+                if self.ordered:
+                    time_s = max(time_s, self._last_arrival_s.get(key, 0.0))
+                    self._last_arrival_s[key] = time_s
+                heapq.heappush(
+                    self._queue, (time_s, next(self._serial), name, role, arriving))
+
+    def run(self, until: Callable[[], bool] | None = None, limit_s: float = 60.0) -> None:
+        """Let time pass: for `limit_s`, or until something is so, which then must happen."""
+        end_s = self.now_s + limit_s
+        since_s, events = self.now_s, 0
+        while until is None or not until():
+            since_s, events = (since_s, events + 1) if self.now_s == since_s else (self.now_s, 0)
+            assert events < 10_000, f'time stands still; counters {self.counters()}'
+            due_s, name = min(
+                ((role.next_deadline(), name) for name, role in self._roles.items()
+                 if role.next_deadline() is not None), default=(np.inf, ''))
+            arrival_s = self._queue[0][0] if self._queue else np.inf
+            if min(due_s, arrival_s) > end_s:
+                self.now_s = end_s
+                if until is not None:
+                    pytest.fail(f'not within {limit_s} s; counters {self.counters()}')
+                return
+            if due_s < arrival_s:
+                self.now_s = max(self.now_s, due_s)
+                self.dispatch(name, Tick())
+            else:
+                self.now_s, _, name, role, message = heapq.heappop(self._queue)
+                if self._roles.get(name) is role:
+                    self.dispatch(name, message)
+
+    def run_cycles(self, n: int, limit_s: float = 60.0) -> None:
+        """Run until so many more cycles have ended, one way or the other."""
+        wanted = len(self._ends) + n
+        self.run(lambda: len(self._ends) >= wanted, limit_s)
+
+    def run_to(self, state, name: str = 'bs', limit_s: float = 60.0) -> None:
+        self.run(lambda: self._roles[name].state is state, limit_s)
+
+    def sent(self, kind: type[m.Message], since: int = 0, **fields) -> list:
+        """Messages of a kind whose fields have these values, from an index of the log on."""
+        return [sent.message for sent in self.log[since:] if type(sent.message) is kind
+                and all(getattr(sent.message, k) == v for k, v in fields.items())]
+
+    def outcomes(self) -> list[tuple[int, int, str]]:
+        """Cycle, user and outcome of the cycles that have ended."""
+        return list(self._ends)
+
+    def served(self) -> list[int]:
+        return [user for _, user, outcome in self.outcomes() if outcome == 'served']
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """What the roles that are there have counted, without those that counted nothing."""
+        return {name: dict(role.counters) for name, role in self._roles.items() if role.counters}
+
+    def said(self, name: str) -> list[str]:
+        return [said.note.text for said in self.notes if said.speaker == name]
+
+    def verify(self) -> None:
+        """Check that no result mixes cycles, users, codebooks or positions."""
+        truths, signals, estimates, beams = {}, set(), set(), set()
+        for _, sender, message in self.log:
+            if sender == 'stranger':
+                continue
+            match message:
+                case m.GroundTruth():
+                    truths[message.cycle_id, message.user] = message.position
+                case m.ReceivedSignals():
+                    key = (message.cycle_id, message.user, message.codebook_id)
+                    expected = self.expected_signals(*key, truths[key[:2]])
+                    np.testing.assert_allclose(
+                        message.signals, expected, rtol=1e-9, atol=1e-9 * abs(expected).max())
+                    signals.add(key)
+                case m.PositionEstimate():
+                    key = (message.cycle_id, message.user, message.codebook_id)
+                    assert key in signals
+                    estimates.add(key)
+                case m.Beam():
+                    key = (message.cycle_id, message.user, message.codebook_id)
+                    assert key in estimates
+                    beams.add(key)
+                case m.Capacity():
+                    key = (message.cycle_id, message.user, message.codebook_id)
+                    assert key in beams
+
+    def expected_signals(
+            self, cycle_id: int, user: int, codebook_id: str, position: np.ndarray) -> np.ndarray:
+        """The received signals by the matrix form of the model, [N_B, N_SB, F]."""
+        scenario = self.scenario
+        shape = (scenario.n_bands, scenario.n_subbands, scenario.n_frames)
+        noise = complex_normal(
+            shape, streams.generator(self.seed, streams.RECEIVER, user, cycle_id))
+        noise *= np.sqrt(scenario.noise_power_w) * self._noise[cycle_id]
+        signals = np.empty(shape, complex)
+        patterns = radiation_matrix(scenario, self.codebooks[codebook_id])
+        for band, pattern in enumerate(patterns):
+            rng = streams.generator(self.seed, streams.CHANNEL, user, cycle_id, band)
+            gains = draw_multipath(scenario, band, 1, rng)
+            los = los_gain(scenario, position[None], band)
+            signals[band] = received_signal(los, gains, pattern, 0.0).reshape(shape[1:])
+        return signals + noise
+
+    @staticmethod
+    def _kind(name: str) -> str:
+        return name.rstrip('0123456789')
+
+    def _build(self, name: str):
+        scenario, step_s = self.scenario, self.settings.step_timeout_s
+        match self._kind(name):
+            case 'bs':
+                rng = streams.generator(self.seed, streams.BASE_STATION)
+                # No number comes twice, as with the clock of the node.
+                first = 1_000_000 * self._lives + 1
+                self._lives += 1
+                return BaseStation(scenario, self.settings, rng, self._receive, first)
+            case 'user':
+                return user_role.User(
+                    int(name.removeprefix('user')), self._mobilities[name],
+                    user_role.timeouts(step_s, self._beacon_timeout_s))
+            case 'rhs_controller':
+                return RhsController()
+            case 'channel':
+                return Channel(scenario, self.seed)
+            case 'positioner':
+                return Positioner(scenario, lambda: self.now_s)
+            case 'transmission':
+                return Transmission(scenario)
+        raise ValueError(name)
+
+    def _receive(self, codebook, feeds, user: int, cycle_id: int, noise: bool) -> np.ndarray:
+        rng = streams.generator(self.seed, streams.RECEIVER, user, cycle_id)
+        return receive_feeds(self.scenario, codebook, feeds, rng if noise else None)
+
+    def _look_around(self) -> None:
+        """Tell those that watch their peers who is missing, where that has changed."""
+        for name in list(self._roles) if self._awake else ():
+            role = self._roles[name]
+            missing = tuple(p for p in PEERS.get(self._kind(name), ()) if p not in self._roles)
+            if self._kind(name) in PEERS and self._reported.get(role) != missing:
+                self._reported[role] = missing
+                self.dispatch(name, PeersChanged(missing))
+
+
+@pytest.fixture(scope='session')
+def scenario() -> Scenario:
+    """A scenario so small that a cycle takes milliseconds."""
+    return Scenario(n_subbands=3, n_frames=2, n_feeds=2, elements_per_side=4)
+
+
+@pytest.fixture(scope='session')
+def codebooks(scenario):
+    """Three codebooks for it."""
+    return [random_codebook(scenario, np.random.default_rng(seed)) for seed in range(3)]
+
+
+@pytest.fixture(scope='session')
+def places(scenario) -> np.ndarray:
+    """Positions of users."""
+    return scenario.sample_positions(5, np.random.default_rng(7))
+
+
+@pytest.fixture
+def network(scenario, codebooks, places):
+    """Function that makes a network; `users` is a number of users or a mapping."""
+    def make(users=1, codebook=codebooks[0], **options) -> Network:
+        if isinstance(users, int):
+            users = {user: places[user - 1] for user in range(1, users + 1)}
+        return Network(scenario, codebook, users, **options)
+    return make
+
+
+@pytest.fixture(scope='session')
+def network_class() -> type[Network]:
+    return Network
+
+
+@pytest.fixture(scope='session')
+def noisy() -> type[Noisy]:
+    return Noisy
+
+
+@pytest.fixture(scope='session')
+def subscriptions() -> dict[str, tuple[type[m.Message], ...]]:
+    return SUBSCRIPTIONS
+
+
+@pytest.fixture(scope='session')
+def example(scenario):
+    """Function that makes a message of a kind: zeros, or random numbers, except what is given."""
+    def make(kind: type[m.Message], rng: np.random.Generator | None = None, **given) -> m.Message:
+        sizes, values = scenario.sizes, {}
+        fields = dataclasses.fields(kind)
+        for field in fields:
+            meta = field.metadata
+            if 'equals' in meta:
+                values[field.name] = sizes[meta['equals']]
+            elif 'below' in meta:
+                values[field.name] = 0 if rng is None else int(rng.integers(sizes[meta['below']]))
+            elif issubclass(field.type, enum.Enum):
+                members = list(field.type)
+                values[field.name] = members[0 if rng is None else rng.integers(len(members))]
+            elif field.type is str:
+                values[field.name] = ''
+            elif field.type in (int, float):
+                least = meta.get('least', 0)
+                values[field.name] = field.type(least if rng is None else rng.integers(1, 4))
+        values |= given
+        sizes |= kind.own_sizes(types.SimpleNamespace(**values), sizes)
+        for field in fields:
+            if 'dims' in field.metadata and field.name not in given:
+                shape = [sizes[d] if d in sizes else int(d) for d in field.metadata['dims']]
+                values[field.name] = np.zeros(shape, field.metadata['kind'])
+                if rng is not None:
+                    values[field.name] += rng.random(shape)
+        return kind(**values)
+    return make

@@ -1,0 +1,178 @@
+"""Cycles as a visualizer sees them."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CycleLog, CycleRecord
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_table import State
+
+
+def log_of(*networks, without=()):
+    log = CycleLog()
+    for sent in itertools.chain.from_iterable(network.log for network in networks):
+        if isinstance(sent.message, RECEIVES) and not isinstance(sent.message, without):
+            log.add(sent.message, sent.time_s)
+    return log
+
+
+def test_a_served_cycle_is_complete(network, scenario, places):
+    net = network()
+    net.run_cycles(3)
+    log = log_of(net)
+    assert log.given_up == []
+    assert [record.cycle_id for record in log.complete] == [1, 2, 3]
+    for record in log.complete:
+        assert (record.user, record.outcome) == (1, 'served')
+        assert record.complete
+        for part in (record.truth, record.estimate, record.capacity):
+            assert (part.cycle_id, part.user) == (record.cycle_id, 1)
+        assert record.error_m == pytest.approx(math.dist(scenario.roi_center_m, places[0]))
+
+
+def test_durations_are_those_of_the_phases(network):
+    net = network(rest_s=0.5)
+    net.run_cycles(2)
+    record = log_of(net).complete[1]
+    times = {type(s.message): s.time_s for s in reversed(net.log) if s.message.cycle_id == 2}
+    durations = record.durations_s()
+    assert list(durations) == [
+        m.Phase.BEACONING, m.Phase.POSITIONING, m.Phase.ESTIMATING, m.Phase.TRANSMITTING]
+    assert durations[m.Phase.BEACONING] == pytest.approx(times[m.Grant] - times[m.Beacon])
+    positioning_s = times[m.ReceivedSignals] - times[m.Grant]
+    assert durations[m.Phase.POSITIONING] == pytest.approx(positioning_s)
+    estimating_s = times[m.Data] - times[m.ReceivedSignals]
+    assert durations[m.Phase.ESTIMATING] == pytest.approx(estimating_s)
+    assert sum(durations.values()) == pytest.approx(record.ended_s - record.began_s)
+
+
+def test_a_cycle_begins_with_its_last_beacon(network, places):
+    net = network(0)
+    net.run(limit_s=3.05)
+    net.add_user(1, places[0])
+    net.run_cycles(1)
+    (record,) = log_of(net).complete
+    assert record.began_s == pytest.approx(3.1)
+    assert record.durations_s()[m.Phase.BEACONING] < 0.01
+
+
+def test_a_cycle_that_is_given_up_has_its_reason_and_no_result(network):
+    net = network()
+    net.run_to(State.SOUNDING)
+    net.remove('positioner', noticed=False)
+    net.run_cycles(1)
+    log = log_of(net)
+    (record,) = log.given_up
+    assert log.complete == []
+    assert (record.user, record.outcome) == (1, 'positioner_silent')
+    assert not record.complete
+    assert record.truth is not None
+    assert record.estimate is record.capacity is None
+    assert math.isnan(record.error_m)
+    assert record.durations_s()[m.Phase.ESTIMATING] == pytest.approx(1.0)
+
+
+def test_a_running_cycle_is_neither(network):
+    net = network()
+    net.run_to(State.STEERING)
+    log = log_of(net)
+    assert log.complete == log.given_up == []
+
+
+@pytest.mark.parametrize('kind', [
+    m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity])
+def test_a_served_cycle_that_lacks_a_message_waits_for_it(network, kind):
+    net = network()
+    net.run_cycles(1)
+    log = log_of(net, without=kind)
+    assert log.complete == log.given_up == []
+    log.add(net.sent(kind)[0], 99.0)
+    (record,) = log.complete
+    assert record.complete
+    assert record.ended_s == net.log[-1].time_s
+
+
+def test_the_order_of_topics_does_not_matter(network):
+    net = network(2)
+    net.run_cycles(3)
+    plain = {r.cycle_id: vars(r) for r in log_of(net).complete}
+    assert plain.keys() == {1, 2, 3}
+    for kinds in itertools.permutations(set(RECEIVES) - {m.Beacon}):
+        log = CycleLog()
+        for kind in (m.Beacon, *kinds):
+            for sent in net.log:
+                if isinstance(sent.message, kind):
+                    log.add(sent.message, sent.time_s)
+        assert {r.cycle_id: vars(r) for r in log.complete} == plain
+        assert log.given_up == []
+
+
+def test_a_network_that_restarts_may_use_its_numbers_again(network):
+    before = network()
+    before.run_cycles(2)
+    before.run_to(State.STEERING)
+    again = network(begin_s=before.now_s)
+    again.run_cycles(2)
+    log = log_of(before, again)
+    assert [r.cycle_id for r in log.complete] == [1, 2, 1, 2]
+    for record in log.complete:
+        assert all(duration >= 0 for duration in record.durations_s().values())
+        assert record.ended_s - record.began_s < 0.1
+
+
+@pytest.mark.parametrize('state', [State.CONFIGURING, State.ESTIMATING, State.TRANSMITTING])
+def test_a_cycle_that_the_restart_cut_short_is_not_mixed_with_its_successor(network, state):
+    before = network()
+    before.run_to(state)
+    again_s = before.now_s
+    net = network(begin_s=again_s)
+    net.run_cycles(1)
+    (record,) = log_of(before, net).complete
+    assert record.cycle_id == 1
+    assert record.began_s >= again_s
+    assert all(duration >= 0 for duration in record.durations_s().values())
+    assert record.truth is net.sent(m.GroundTruth)[-1]
+    assert record.estimate is net.sent(m.PositionEstimate)[-1]
+
+
+def test_a_successor_that_is_given_up_keeps_nothing_of_the_cycle_cut_short(network):
+    before = network()
+    before.run_to(State.TRANSMITTING)
+    net = network(begin_s=before.now_s)
+    net.run_to(State.SOUNDING)
+    net.remove('positioner', noticed=False)
+    net.run_cycles(1)
+    (record,) = log_of(before, net).given_up
+    assert (record.cycle_id, record.outcome) == (1, 'positioner_silent')
+    assert record.estimate is record.capacity is None
+    assert m.Phase.TRANSMITTING not in record.durations_s()
+
+
+def test_messages_of_no_cycle_or_an_unknown_one_make_no_record(example):
+    log = CycleLog()
+    for kind in (m.GroundTruth, m.PositionEstimate, m.Capacity):
+        log.add(example(kind, cycle_id=0), 1.0)
+        log.add(example(kind, cycle_id=7), 1.0)
+    log.add(example(m.ProtocolState, cycle_id=7, outcome='served'), 1.0)
+    log.add(example(m.ProtocolState, cycle_id=7, outcome='user_gone'), 1.0)
+    assert log.complete == log.given_up == []
+
+
+def test_cycles_that_never_end_are_forgotten(example):
+    log = CycleLog()
+    for cycle_id in range(1, 101):
+        log.add(example(m.Beacon, cycle_id=cycle_id), float(cycle_id))
+    for cycle_id in (1, 50, 99, 100):
+        log.add(example(m.ProtocolState, cycle_id=cycle_id, outcome='user_gone'), 200.0)
+    assert [record.cycle_id for record in log.given_up] == [99, 100]
+
+
+def test_the_error_is_the_distance(example):
+    record = CycleRecord(1)
+    assert math.isnan(record.error_m)
+    record.truth = example(m.GroundTruth, position=np.array([1.0, 2.0, 3.0]))
+    record.estimate = example(m.PositionEstimate, position=np.array([1.0, 5.0, -1.0]))
+    assert record.error_m == pytest.approx(5.0)

@@ -1,0 +1,105 @@
+"""The model of the live view, fed by networks without ROS."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.monitoring.overview import RECEIVES, RESTING, Overview
+from rhs_isac_ros.monitoring.role_statistics import Report
+from rhs_isac_ros.protocol import messages as m
+
+
+def ended(cycle_id, user, phase, outcome):
+    return m.ProtocolState(cycle_id, user, phase, outcome, np.zeros(4), 0.0)
+
+
+def overview_of(net, until_s=np.inf):
+    overview = Overview()
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES) and sent.time_s <= until_s:
+            overview.add(sent.message, sent.time_s)
+    return overview
+
+
+def test_it_knows_nothing_before_anything_is_heard():
+    overview = Overview()
+    assert (overview.phase, overview.users, overview.fixes, overview.nodes) == ('', {}, [], {})
+    assert overview.rate_hz(5.0) == 0
+
+
+def test_users_have_the_figures_of_their_newest_cycle(network, codebooks):
+    net = network(users=2, rest_s=0.5)
+    net.run_cycles(4)
+    overview = overview_of(net)
+    assert set(overview.users) == {1, 2}
+    assert [fix.record.cycle_id for fix in overview.fixes] == [4, 3]
+    assert {fix.record.user for fix in overview.fixes} == {1, 2}
+    for fix in overview.fixes:
+        record = fix.record
+        assert record.error_m == np.linalg.norm(record.estimate.position - record.truth.position)
+        assert fix.sigma_m == pytest.approx(np.sqrt(np.trace(record.estimate.covariance_m2)))
+    assert (overview.served, overview.given_up, overview.failure) == (4, 0, '')
+    assert overview.codebook_id == codebooks[0].id
+    assert (overview.phase, overview.cycle_id) == (RESTING, 4)
+
+
+def test_phases_follow_each_other_and_know_their_begin(network):
+    net = network(rest_s=0.5)
+    net.run_cycles(2)
+    seen = {}
+    overview = Overview()
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES):
+            overview.add(sent.message, sent.time_s)
+            seen.setdefault((overview.cycle_id, overview.phase), overview.since_s)
+    names = ['beaconing', 'positioning', 'estimating', 'transmitting', RESTING]
+    assert list(seen) == [(cycle, name) for cycle in (1, 2) for name in names]
+    begins = {(sent.message.cycle_id, sent.message.phase.name.lower()): sent.time_s
+              for sent in net.log if isinstance(sent.message, m.ProtocolState)
+              and not sent.message.outcome}
+    assert begins.items() <= seen.items()
+
+
+def test_a_cycle_that_is_given_up_says_why():
+    overview = Overview()
+    overview.add(m.Beacon(7, 0), 1.0)
+    overview.add(ended(7, 3, m.Phase.POSITIONING, ''), 1.1)
+    overview.add(ended(7, 3, m.Phase.BEACONING, 'rhs_silent'), 2.1)
+    assert (overview.served, overview.given_up) == (0, 1)
+    assert overview.failure == 'cycle 7 of user 3: rhs_silent'
+    assert overview.phase == RESTING
+
+
+def test_the_rate_is_that_of_the_newest_ten_seconds():
+    overview = Overview()
+    for cycle_id in range(1, 101):
+        now_s = 0.5 * cycle_id
+        overview.add(m.Beacon(cycle_id, 0), now_s - 0.1)
+        overview.add(ended(cycle_id, 1, m.Phase.BEACONING, 'served'), now_s)
+        if cycle_id == 4:
+            assert overview.rate_hz(2.4) == pytest.approx(4 / 2.0)
+    assert overview.rate_hz(50.2) == pytest.approx(2.0)
+    assert overview.rate_hz(58.2) == pytest.approx(0.4)
+    assert overview.rate_hz(99.0) == 0
+
+
+def test_it_does_not_grow_with_the_cycles(network):
+    net = network()
+    net.run_cycles(30)
+    overview = overview_of(net)
+    assert overview.served == 30
+    assert len(overview.users) == 1
+    assert (overview._log.complete, overview._log.given_up) == ([], [])
+    overview.rate_hz(1e9)
+    assert not overview._ends_s
+
+
+def test_nodes_tell_what_they_dropped_and_fall_silent():
+    overview = Overview()
+    values = {'phase': 'resting', 'cycles.served': '9', 'cycles.no_fix': '2',
+              'dropped.late_ack': '3', 'dropped.duplicate': '0', 'handling_ms.p50': '0.3'}
+    overview.hear('bs', Report(True, '1 dropped', values), 5.0)
+    health = overview.nodes['bs']
+    assert health.counts('dropped') == {'late_ack': 3}
+    assert health.counts('cycles') == {'served': 9, 'no_fix': 2}
+    assert not health.silent(6.1)
+    assert health.silent(9.0)

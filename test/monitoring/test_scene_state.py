@@ -1,0 +1,91 @@
+"""The scene of a network, told by messages alone."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
+from rhs_isac_ros.protocol import messages as m
+
+
+def truth(user, position, cycle_id=0):
+    return m.GroundTruth(cycle_id, user, np.array(position, float), np.zeros(3))
+
+
+def estimate(user, position, cycle_id):
+    return m.PositionEstimate(
+        cycle_id, user, 'cb', np.array(position, float), np.eye(3), 0.1, 'bayes', 0.01)
+
+
+def beam(user):
+    return m.Beam(1, user, 'cb', 0, np.ones(4), np.ones((2, 2), complex), 1e6)
+
+
+def test_it_is_complete_once_every_user_has_an_estimate():
+    scene = SceneState()
+    for message in (m.RhsConfiguration(1, m.Mode.POSITIONING, 0, 'cb', np.ones((3, 4))),
+                    truth(1, [9, 0, 0]), truth(2, [8, 0, 0]), estimate(1, [9, 1, 0], 1)):
+        scene.add(message, 1.0)
+        assert not scene.complete
+    scene.add(beam(1), 1.0)
+    assert not scene.complete
+    scene.add(estimate(2, [8, 1, 0], 2), 1.0)
+    assert scene.complete
+    assert scene.newest.user == 2
+
+
+def test_it_takes_what_a_network_sends(network):
+    net = network()
+    net.run_cycles(3)
+    scene = SceneState()
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES):
+            scene.add(sent.message, sent.time_s)
+    assert scene.complete
+    assert scene.newest.estimate.cycle_id == 3
+    assert len(scene.users[1].path) == 3
+    assert scene.beam.cycle_id == 3
+
+
+def test_an_error_needs_the_true_position_of_its_cycle():
+    scene = SceneState()
+    scene.add(estimate(1, [9, 3, 4], 5), 0.0)
+    assert math.isnan(scene.users[1].error_m)
+    for message in (truth(1, [9, 0, 0], cycle_id=5), truth(1, [7, 0, 0])):
+        scene.add(message, 0.0)
+        assert scene.users[1].error_m == pytest.approx(5.0)
+    scene.add(truth(1, [7, 0, 0], cycle_id=6), 0.0)
+    assert math.isnan(scene.users[1].error_m)
+    assert scene.users[1].truth.position[0] == 7
+
+
+def test_paths_leave_out_who_stands_still_and_do_not_grow_for_ever():
+    scene = SceneState()
+    for step in (0.0, 0.01, 0.02, 0.5, 0.5):
+        scene.add(truth(1, [9 + step, 0, 0]), 0.0)
+    assert [place[0] for place in scene.users[1].true_path] == [9.0, 9.5]
+    for cycle_id in range(1, 1001):
+        scene.add(estimate(1, [cycle_id, 0, 0], cycle_id), 0.0)
+    assert [place[0] for place in scene.users[1].path] == list(range(801, 1001))
+
+
+def test_who_is_silent_is_forgotten_with_its_beam():
+    scene = SceneState()
+    for user, time_s in ((1, 1.0), (2, 2.0)):
+        scene.add(truth(user, [9, 0, 0]), time_s)
+    scene.add(beam(1), 1.0)
+    assert scene.forget(1.0) == []
+    scene.add(estimate(2, [9, 0, 0], 1), 3.0)
+    assert scene.forget(2.5) == [1]
+    assert list(scene.users) == [2]
+    assert scene.beam is None
+    scene.add(beam(2), 3.0)
+    scene.add(truth(1, [5, 0, 0]), 3.0)
+    assert scene.forget(2.5) == []
+    assert scene.beam.user == 2
+    scene.add(truth(2, [9, 0, 0]), 5.0)
+    scene.add(truth(1, [5, 0, 0]), 5.0)
+    assert scene.forget(4.0) == []
+    assert scene.beam is None
+    assert len(scene.users[1].true_path) == 1

@@ -1,0 +1,126 @@
+"""Markers against plain geometry."""
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from visualization_msgs.msg import Marker
+
+from rhs_isac_ros.link import BeamPattern, beam_pattern, steer
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import markers
+
+STAMP = Time(sec=3)
+# From a table of the chi-square distribution with three degrees of freedom.
+CHI_SQUARE_95 = 7.815
+
+
+def of(vector):
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def rotation(q):
+    """Matrix of a unit quaternion, written out."""
+    return np.array([
+        [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w), 2 * (q.x * q.z + q.y * q.w)],
+        [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2), 2 * (q.y * q.z - q.x * q.w)],
+        [2 * (q.x * q.z - q.y * q.w), 2 * (q.y * q.z + q.x * q.w), 1 - 2 * (q.x**2 + q.y**2)]])
+
+
+def an_estimate(covariance_m2, user=1):
+    return m.PositionEstimate(
+        5, user, 'cb', np.array([9.0, -1.0, 0.5]), covariance_m2, 0.1, 'bayes', 0.01)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_ellipsoid_is_that_of_the_covariance(seed):
+    root = np.random.default_rng(seed).normal(size=(3, 3))
+    marker = markers.estimate(an_estimate(root @ root.T), STAMP)
+    assert marker.type == Marker.SPHERE
+    assert of(marker.pose.position) == pytest.approx([9.0, -1.0, 0.5])
+    turn = rotation(marker.pose.orientation)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    radii = of(marker.scale) / 2
+    assert turn @ np.diag(radii**2) @ turn.T == pytest.approx(
+        CHI_SQUARE_95 * root @ root.T, rel=1e-3, abs=1e-3)
+
+
+def test_a_certain_position_is_drawn_all_the_same():
+    marker = markers.estimate(an_estimate(np.zeros((3, 3))), STAMP)
+    assert of(marker.scale).min() > 0
+
+
+def test_truth_and_estimate_of_a_user_share_a_hue_and_users_do_not():
+    hues = {}
+    for user in (1, 2, 2**32 - 1):
+        position = np.array([user % 7, 0.0, 0.0], float)
+        one = markers.truth(m.GroundTruth(0, user, position, np.zeros(3)), STAMP)
+        other = markers.estimate(an_estimate(np.eye(3), user), STAMP)
+        assert of(one.pose.position) == pytest.approx(position)
+        assert (one.ns, one.id) != (other.ns, other.id)
+        assert (one.color.r, one.color.g, one.color.b) == (
+            other.color.r, other.color.g, other.color.b)
+        assert one.color.a == 1 > other.color.a > 0
+        hues[one.color.r, one.color.g, one.color.b] = one
+    assert len(hues) == 3
+
+
+def test_the_board_shows_its_configuration(small):
+    configuration = np.linspace(0, 1, 2 * small.scenario.n_elements).reshape(2, -1)
+    marker = markers.board(small.scenario, configuration, STAMP)
+    assert np.array([of(point) for point in marker.points]) == pytest.approx(
+        element_positions(small.scenario))
+    assert [color.r for color in marker.colors] == pytest.approx(configuration.mean(axis=0))
+    places = np.unique(element_positions(small.scenario)[:, 1])
+    assert 0 < marker.scale.y == marker.scale.z < np.diff(places).min()
+    unknown = markers.board(small.scenario, None, STAMP)
+    assert len({color.r for color in unknown.colors}) == 1
+
+
+def test_the_region_is_where_the_scenario_says(small):
+    marker = markers.region(small.scenario, STAMP)
+    low, high = small.scenario.roi_bounds_m
+    assert of(marker.pose.position) - of(marker.scale) / 2 == pytest.approx(low)
+    assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
+    assert (marker.header.frame_id, marker.header.stamp) == ('map', STAMP)
+    assert marker.pose.orientation.w == 1
+
+
+def test_the_lobe_has_the_radius_of_the_power_in_decibels():
+    """From 0 dB, at the distance of the pattern, to -20 dB, at the centre."""
+    directions = np.array([[[1.0, 0, 0], [0, 1, 0]], [[0, 0, 1], [0.6, 0.8, 0]]])
+    relative = np.array([[1.0, 0.1], [0.01, 0.0]])
+    points = markers.lobe_m(BeamPattern(directions, relative, 8.0))
+    assert points == pytest.approx(np.array([[[8, 0, 0], [0, 4, 0]], [[0, 0, 0], [0, 0, 0]]]))
+
+
+def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
+    scenario, place = Scenario(), np.array([9.0, 3.0, 0.3])
+    found = beam_pattern(scenario, steer(scenario, place), 10.0)
+    marker = markers.beam(found, 3, STAMP)
+    corners = np.array([of(point) for point in marker.points]).reshape(-1, 3, 3)
+    assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'map')
+    lengths = np.linalg.norm(corners, axis=-1)
+    assert lengths.max() == pytest.approx(10.0)
+    tip = corners.reshape(-1, 3)[lengths.argmax()] / 10.0
+    assert np.degrees(np.arccos(tip @ place / np.linalg.norm(place))) < 8.0
+    assert corners[..., 0].min() >= -1e-9
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum('nu,nu->n', normals, corners.mean(axis=1)) >= -1e-9).all()
+    assert 0 < marker.color.a < 1
+    assert marker.color.r == markers.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
+
+
+def test_a_path_goes_through_its_positions_in_their_order():
+    places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
+    path = markers.path(places, STAMP)
+    assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
+    assert np.array([of(pose.pose.position) for pose in path.poses]) == pytest.approx(places)
+    assert all(pose.header == path.header and pose.pose.orientation.w == 1
+               for pose in path.poses)
+
+
+def test_what_takes_a_marker_away_names_it():
+    marker = markers.gone('truth', 4, STAMP)
+    assert (marker.ns, marker.id, marker.action) == ('truth', 4, Marker.DELETE)

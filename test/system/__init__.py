@@ -1,0 +1,1 @@
+"""Rigs that try a whole network: faults, fuzzing and several hosts."""

@@ -1,0 +1,7 @@
+"""``python -m system.chaos``."""
+
+import sys
+
+from system.chaos.command import main
+
+sys.exit(main())

@@ -1,0 +1,8 @@
+"""The command of ``scripts/hosts``."""
+
+import sys
+
+from system.hosts.command import main
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""The plan of the hosts: addresses, names and commands."""
+
+import ipaddress
+
+import pytest
+
+from rhs_isac_ros.ros.resources import discovery_profile_file
+from system.hosts import plan
+
+
+def test_every_node_has_one_host():
+    nodes = sum(plan.HOSTS.values(), ())
+    assert len(nodes) == len(set(nodes))
+    assert plan.host_of('transmission') == 'positioner'
+    assert plan.host_of('user_12') == 'users'
+    with pytest.raises(ValueError, match="'radio', expected one of"):
+        plan.host_of('radio')
+
+
+def test_nothing_happens_outside_of_namespaces_of_the_run():
+    for command in plan.make(4711):
+        assert command[0] == 'ip'
+        name = command[3] if command[1:3] == ('netns', 'add') else command[2]
+        assert command[1] == '-n' or command[1:3] == ('netns', 'add')
+        assert name.startswith('rhs_isac-4711-')
+        if 'netns' in command[3:]:
+            assert command[-1].startswith('rhs_isac-4711-')
+
+
+def test_hosts_have_addresses_of_their_own_in_one_network():
+    given = [ipaddress.ip_interface(command[5]) for command in plan.make(1)
+             if command[3:5] == ('address', 'add')]
+    assert len(set(given)) == len(plan.HOSTS) + 1
+    (network,) = {address.network for address in given}
+    assert network.subnet_of(ipaddress.ip_network('198.18.0.0/15'))
+
+
+def test_names_of_devices_are_short_and_differ():
+    ports = {plan.port(host) for host in (*plan.HOSTS, plan.OBSERVER)}
+    assert len(ports) == len(plan.HOSTS) + 1
+    assert max(map(len, ports)) <= 15
+
+
+def test_stale_is_what_a_process_that_is_gone_has_made():
+    mine, other = plan.namespace(1, 'users'), plan.namespace(22, 'users')
+    names = [mine, other, 'lab', 'rhs_isac-lab', 'other-22-users']
+    assert plan.stale(names, lambda pid: pid == 1) == [other]
+
+
+def test_the_lease_is_read_from_the_profile(tmp_path):
+    assert plan.lease_s(discovery_profile_file()) == 10.0
+    assert plan.lease_s(None) == 20.0
+    other = tmp_path / 'other.xml'
+    other.write_text('<dds><leaseAnnouncement><sec>1</sec></leaseAnnouncement></dds>')
+    assert plan.lease_s(other) == 20.0

@@ -1,0 +1,220 @@
+"""``scripts/record`` and ``scripts/replay`` on a network in another process."""
+
+import os
+import signal
+import subprocess
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario, plugins
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros.recording import Recorder, read
+from rhs_isac_ros.tools import record
+from rhs_isac_ros.tools.replay import errors_m, load, main
+
+pytest.importorskip('mcap', reason='there is no mcap here')
+CONFIG = Path(__file__).parents[2] / 'config'
+SCRIPTS = CONFIG.parent / 'scripts'
+CYCLES = 4
+
+
+@pytest.fixture(scope='module')
+def run(shared_session, tmp_path_factory):
+    """A recording of some cycles, and what an observer saw of them live."""
+    path = tmp_path_factory.mktemp('recording') / 'run.mcap'
+    recorder = Recorder(path, Scenario.from_yaml(CONFIG / 'quick.yaml'))
+    context = Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    observer, executor = CycleObserver(recorder, context=context), SingleThreadedExecutor(
+        context=context)
+    executor.add_node(observer)
+    while len(observer.log.complete) < CYCLES:
+        executor.spin_once()
+    executor.shutdown()
+    observer.destroy_node()
+    rclpy.shutdown(context=context)
+    recorder.close()
+    return types.SimpleNamespace(path=path, cycles=observer.log.complete)
+
+
+def rows(text):
+    """Median, root mean square and missing fixes, by what they are of."""
+    number, _, *lines = text.splitlines()
+    assert number == f'{CYCLES} cycles'
+    return {line[:12].strip(): line[12:].split() for line in lines}
+
+
+def test_the_cycles_are_those_that_were_seen_live(run):
+    recording = load(run.path)
+    assert [cycle.cycle_id for cycle in recording.cycles] == [
+        cycle.cycle_id for cycle in run.cycles]
+    assert [cycle.error_m for cycle in recording.cycles] == [
+        cycle.error_m for cycle in run.cycles]
+    assert recording.scenario == Scenario.from_yaml(CONFIG / 'quick.yaml')
+    shipped = Codebook.load(CONFIG / 'codebook_quick.yaml')
+    assert list(recording.codebooks) == [shipped.id] == [
+        codebook.id for codebook in recording.codebooks.values()]
+
+
+def test_the_same_estimator_makes_the_same_errors(run, call_script):
+    """To the last digit that is printed; another one does not."""
+    found = rows(call_script(f'{SCRIPTS}/replay {run.path} --estimator bayes --estimator ml'))
+    live = np.array([cycle.error_m for cycle in run.cycles])
+    assert found['bayes'] == found['live bayes'] != found['ml']
+    assert found['live bayes'] == [
+        f'{np.median(live):.6f}', 'm', f'{np.sqrt(np.mean(live**2)):.6f}', 'm', '0']
+
+
+def test_errors_against_the_estimator_itself(run):
+    recording = load(run.path)
+    made = {key: make_estimator('ml', recording.scenario, codebook)
+            for key, codebook in recording.codebooks.items()}
+    expected = []
+    for cycle in run.cycles:
+        fix = made[cycle.signals.codebook_id].estimate(cycle.signals.signals.reshape(2, -1))
+        expected.append(np.sqrt(np.sum((fix.mean - cycle.truth.position)**2)))
+    np.testing.assert_allclose(errors_m(recording.cycles, made), expected, rtol=1e-9)
+
+
+def test_an_estimator_of_another_package_is_asked_too(run, install, capsys):
+    install('guesses', 'from rhs_isac_ros.positioning import BayesEstimator as Mine',
+            {plugins.ESTIMATORS: {'mine': 'Mine'}})
+    assert main([str(run.path), '--estimator', 'mine']) == 0
+    found = rows(capsys.readouterr().out)
+    assert found['mine'] == found['live bayes']
+
+
+def test_another_codebook_is_assumed_with_a_word(run, random_beams, tmp_path, capsys):
+    other = random_beams(Scenario.from_yaml(CONFIG / 'quick.yaml'), np.random.default_rng(0))
+    other.save(tmp_path / 'other.yaml')
+    assert main([str(run.path), '--codebook', str(tmp_path / 'other.yaml')]) == 0
+    out, err = capsys.readouterr()
+    found = rows(out)
+    assert found['bayes'] != found['live bayes']
+    assert err.endswith(f'are read as if with {other.id}\n')
+
+
+@pytest.mark.parametrize('arguments, error', [
+    (['--namespace', '/lab'], 'no complete cycle in the namespace /lab'),
+    (['--codebook', CONFIG / 'codebook.yaml'], 'analog: shape'),
+    (['--codebook', 'nothing.yaml'], 'nothing.yaml'),
+    (['--config', CONFIG / 'table1.yaml'], 'signals'),
+    (['--config', 'nothing.yaml'], 'nothing.yaml: cannot be read'),
+    (['--estimator', 'neural'], 'model'),
+])
+def test_what_does_not_fit_is_named(run, capsys, arguments, error):
+    assert main([str(run.path), *map(str, arguments)]) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith('error: ')
+    assert error in line
+
+
+def estimates_of(path):
+    """Estimates of a recording, by cycle, without the time that they took."""
+    return {message.cycle_id: content(message)
+            for _, message, _ in read(path, ['/position_estimate'])}
+
+
+def content(message):
+    plain = convert.from_ros(m.PositionEstimate, message)
+    return (plain.user, plain.codebook_id, plain.position.tobytes(),
+            plain.covariance_m2.tobytes(), plain.crlb_m2, plain.estimator)
+
+
+@pytest.fixture
+def positioner(shared_session):
+    """A live positioner in a namespace without anything else."""
+    with subprocess.Popen(
+            [SCRIPTS / 'run', 'positioner', '--ros-args', '-r', '__ns:=/again', '-p',
+             f'scenario_file:={CONFIG}/quick.yaml'], stderr=subprocess.DEVNULL) as process:
+        yield process
+        process.send_signal(signal.SIGINT)
+
+
+def test_a_live_positioner_makes_the_recorded_estimates_again(run, shared_session, positioner):
+    """Bit for bit: the codebook comes with the signals."""
+    heard = {}
+    subscription = shared_session.node.create_subscription(
+        convert.ros_type(m.PositionEstimate), '/again/position_estimate',
+        lambda message: heard.update({message.cycle_id: content(message)}), qos.EXCHANGE)
+    assert shared_session.until(lambda: subscription.get_publisher_count() > 0, 60)
+    signals = {message.cycle_id for _, message, _ in read(run.path, ['/received_signals'])}
+    with subprocess.Popen(
+            [SCRIPTS / 'replay', run.path, '--publish', '--rate', '20', '--ros-args', '-r',
+             '__ns:=/again'], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True) as process:
+        everything = shared_session.until(lambda: heard.keys() >= signals, 60)
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (0, f'{len(signals)} messages published\n'), err
+    assert everything
+    shared_session.node.destroy_subscription(subscription)
+    recorded = estimates_of(run.path)
+    both = recorded.keys() & heard.keys()
+    assert both >= {cycle.cycle_id for cycle in run.cycles}
+    assert {cycle: heard[cycle] for cycle in both} == {cycle: recorded[cycle] for cycle in both}
+
+
+def test_what_a_network_says_itself_is_not_published_beside_it(run, shared_session):
+    done = subprocess.run(
+        [SCRIPTS / 'replay', run.path, '--publish'], capture_output=True, text=True, timeout=60,
+        check=False)
+    assert (done.returncode, done.stdout) == (1, '')
+    assert done.stderr.splitlines()[-1] == (
+        'error: received_signals: another node publishes it, expected none')
+
+
+@pytest.mark.parametrize('arguments, error', [
+    (['--namespace', '/lab'], 'no received_signals in the namespace /lab'),
+    (['--codebook', CONFIG / 'codebook.yaml'], 'live nodes would drop them'),
+])
+def test_what_live_nodes_cannot_use_is_named(run, capsys, arguments, error):
+    assert main([str(run.path), '--publish', *map(str, arguments)]) == 2
+    assert error in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('arguments', [['--estimator', 'ml'], ['--rate', '0'],
+                                       ['--topic', 'codebook']])
+def test_options_that_contradict_publishing_are_named(run, capsys, arguments):
+    with pytest.raises(SystemExit):
+        main([str(run.path), '--publish', *arguments])
+    assert 'expected' in (text := capsys.readouterr().err) or 'invalid choice' in text
+
+
+def test_record_takes_down_everything_until_it_is_interrupted(shared_session, tmp_path):
+    path = tmp_path / 'all.mcap'
+    wanted = {'codebook', 'capacity', 'pilot', 'ground_truth', 'position'}
+    with subprocess.Popen(
+            [SCRIPTS / 'record', path, '--config', CONFIG / 'quick.yaml'], env=os.environ,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        missing = set(wanted)
+        while missing:
+            line = process.stderr.readline()
+            assert line, f'it ended without {missing}'
+            missing.discard(line.rpartition('first message of ')[2].strip())
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    messages = list(read(path))
+    assert out == f'{len(messages)} messages in {path}\n'
+    assert {f'/{name}' for name in wanted} <= {topic for topic, _, _ in messages}
+    with pytest.raises(FileNotFoundError):
+        path.with_name('all.mcap.part').stat()
+
+
+def test_record_names_a_wrong_file(tmp_path, capsys):
+    assert record.main([str(tmp_path / 'none' / 'run.mcap')]) == 2
+    assert 'none/run.mcap: cannot be written' in capsys.readouterr().err
+    assert record.main([str(tmp_path / 'run.mcap'), '--config', 'nothing.yaml']) == 2
+    assert 'nothing.yaml: cannot be read' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

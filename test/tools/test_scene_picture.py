@@ -1,0 +1,108 @@
+"""The picture of a scene: what is on it, and that a person can read it."""
+
+import itertools
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.text import Text
+
+from rhs_isac_ros.link import steer
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.scene_state import SceneState
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.tools.ellipses import ellipse_95
+from rhs_isac_ros.tools.scene_picture import compose, draw
+
+PLACES = np.array([[9.0, 2.0, 0.5], [12.0, -3.0, -0.4], [7.0, -1.0, 0.0]])
+COVARIANCE_M2 = np.array([[0.6, 0.2, 0.05], [0.2, 0.3, 0.0], [0.05, 0.0, 0.1]])
+
+
+def a_scene(scenario, n_users):
+    scene, rng = SceneState(), np.random.default_rng(1)
+    for user in range(1, n_users + 1):
+        place = PLACES[user % 3]
+        for step in range(5):
+            scene.add(m.GroundTruth(user, user, place + 0.2 * step, np.zeros(3)), 0.0)
+        for cycle_id in (user, 100 + user):
+            scene.add(m.PositionEstimate(
+                cycle_id, user, 'cb', place + 0.1, COVARIANCE_M2, 0.1, 'bayes', 0.01), 0.0)
+    configuration = rng.uniform(size=(scenario.n_frames, scenario.n_elements))
+    scene.add(m.RhsConfiguration(1, m.Mode.POSITIONING, 1, 'cb', configuration), 0.0)
+    beam = steer(scenario, PLACES[n_users % 3])
+    scene.add(m.Beam(1, n_users, 'cb', 0, beam.analog, beam.digital, 1e6), 0.0)
+    return scene
+
+
+def texts(figure, monkeypatch):
+    """What is written, with its box: ticks beyond an axis have a text, but are not drawn."""
+    found, draw_text = [], Text.draw
+
+    def note(text, renderer):
+        if text.get_visible() and text.get_text().strip():
+            found.append((text.get_text(), text.get_window_extent(renderer)))
+        draw_text(text, renderer)
+    with monkeypatch.context() as patch:
+        patch.setattr(Text, 'draw', note)
+        FigureCanvasAgg(figure).draw()
+    return found
+
+
+def test_no_text_is_cut_off_or_covers_another(monkeypatch):
+    scenario = Scenario()
+    figure = compose(a_scene(scenario, 12), scenario)
+    found = texts(figure, monkeypatch)
+    assert {'x [m]', 'y [m]', 'z [m]', 'user 8', 'and 4 more', 'board'} <= {
+        text for text, _ in found}
+    page = figure.bbox.padded(1)
+    for text, box in found:
+        assert page.contains(*box.min) and page.contains(*box.max), text
+    for (one, box), (other, second) in itertools.combinations(found, 2):
+        assert not box.padded(-1).overlaps(second.padded(-1)), (one, other)
+
+
+def test_both_views_show_region_users_and_ellipses_where_they_are():
+    scenario = Scenario()
+    figure = compose(a_scene(scenario, 3), scenario)
+    views = {axes.get_ylabel(): axes for axes in figure.axes}
+    low, high = scenario.roi_bounds_m
+    for label, plane in (('y [m]', [0, 1]), ('z [m]', [0, 2])):
+        axes = views[label]
+        (region,) = [patch for patch in axes.patches if type(patch) is Rectangle]
+        assert region.get_xy() == pytest.approx(low[plane])
+        assert (region.get_width(), region.get_height()) == pytest.approx(
+            tuple((high - low)[plane]))
+        ellipses = [patch for patch in axes.patches if isinstance(patch, Ellipse)]
+        centres = {tuple(np.round(patch.center, 9)) for patch in ellipses}
+        assert centres == {tuple(np.round(place[plane] + 0.1, 9)) for place in PLACES}
+        wanted = ellipse_95(COVARIANCE_M2[np.ix_(plane, plane)])
+        for patch in ellipses:
+            assert (patch.width, patch.height, patch.angle) == pytest.approx(wanted)
+        dots = {tuple(np.round(line.get_xydata()[0], 9)) for line in axes.lines
+                if line.get_marker() == 'o'}
+        assert dots == {tuple(np.round(place[plane] + 0.8, 9)) for place in PLACES}
+        assert axes.get_aspect() == 1.0
+    board = views['z [cm]'].images[0].get_array()
+    assert board.shape == (10, 10)
+    # The newest cycle is that of user 3, whose true position told for it is another one.
+    assert figure.get_suptitle() == 'cycle 103, user 3'
+
+
+def test_the_board_is_shown_as_a_user_sees_it(small):
+    scene = SceneState()
+    configuration = np.linspace(0, 1, small.scenario.n_elements)[None]
+    scene.add(m.RhsConfiguration(1, m.Mode.TRANSMISSION, 0, 'cb', configuration), 0.0)
+    figure = compose(scene, small.scenario)
+    (axes,) = [axes for axes in figure.axes if axes.images]
+    # Rows grow with z, columns with y, which points to the right of who looks at the board.
+    assert axes.images[0].origin == 'lower'
+    assert np.asarray(axes.images[0].get_array())[0] == pytest.approx(configuration[0, :4])
+    left, right, bottom, top = axes.images[0].get_extent()
+    assert left == bottom == -right == -top < 0
+
+
+def test_a_scene_without_anything_is_drawn_all_the_same(small, tmp_path):
+    draw(SceneState(), small.scenario, tmp_path / 'scene.png')
+    assert (tmp_path / 'scene.png').read_bytes().startswith(b'\x89PNG')
+    assert [path.name for path in tmp_path.iterdir()] == ['scene.png']

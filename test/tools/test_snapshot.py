@@ -1,0 +1,59 @@
+"""``scripts/snapshot`` on a network in another process."""
+
+import struct
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.scene_state import SceneState
+from rhs_isac_ros.tools.snapshot import finish, main
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / 'scripts' / 'snapshot'
+
+
+@pytest.fixture
+def snapshot(tmp_path):
+    """Function that runs the script in an empty directory."""
+    def call(*arguments):
+        return subprocess.run([SCRIPT, *arguments], cwd=tmp_path, capture_output=True, text=True,
+                              timeout=90, check=False)
+    return call
+
+
+def test_it_draws_a_running_network(shared_session, snapshot, tmp_path):
+    done = snapshot('--config', ROOT / 'config' / 'quick.yaml', '--output', 'now.png')
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'now.png\n', '')
+    assert [path.name for path in tmp_path.iterdir()] == ['now.png']
+    content = (tmp_path / 'now.png').read_bytes()
+    width, height = struct.unpack('>II', content[16:24])
+    assert content.startswith(b'\x89PNG') and width > 1000 and height > 800
+
+
+def test_a_network_of_another_scenario_is_named(shared_session, snapshot, tmp_path):
+    done = snapshot()
+    assert (done.returncode, done.stdout) == (1, '')
+    assert 'another scenario? --config FILE' in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_network_it_says_so(capsys):
+    """What comes after the wait; the wait itself is that of every tool."""
+    options = SimpleNamespace(timeout=0.5, output=Path('never.png'))
+    nobody = SimpleNamespace(sightings=SceneState(), misfit='')
+    assert finish(nobody, Scenario(), options) == 1
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.startswith('error: no user was heard of within 0.5 s, in the domain ')
+    assert not options.output.exists()
+
+
+def test_a_place_that_is_not_there_is_named_before_it_waits(capsys):
+    with pytest.raises(SystemExit):
+        main(['--output', 'none/scene.png'])
+    assert 'argument --output: none/scene.png' in capsys.readouterr().err
+    assert main(['--config', 'nothing.yaml']) == 2
+    assert 'nothing.yaml: cannot be read' in capsys.readouterr().err

@@ -1,0 +1,113 @@
+"""``scripts/watch`` on a network in another process, and its view of an overview."""
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.monitoring.overview import Overview
+from rhs_isac_ros.monitoring.role_statistics import Report
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.tools.watch import main
+from rhs_isac_ros.tools.watch_view import render
+
+console = pytest.importorskip('rich.console', reason='there is no rich here')
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / 'scripts' / 'watch'
+
+
+def text_of(overview, now_s, width=80):
+    page = console.Console(width=width, record=True, file=open(os.devnull, 'w'))
+    with page.file:
+        page.print(render(overview, now_s))
+    return page.export_text()
+
+
+def test_the_view_of_nothing_says_so():
+    assert 'waiting for a base station' in text_of(Overview(), 1.0)
+
+
+def test_the_view_tells_faults_and_silence_and_leaves_nothing_out_at_80_columns():
+    overview = Overview()
+    overview.add(m.Beacon(1795288682616, 0), 1.0)
+    overview.add(m.ProtocolState(
+        1795288682616, 12, m.Phase.BEACONING, 'rhs_silent', np.zeros(4), 0.0), 2.0)
+    overview.add(m.Beacon(1795288682617, 0), 3.0)
+    overview.hear('lab/bs', Report(True, 'waiting for positioner', {
+        'phase': 'waiting', 'dropped.late_ack': '3', 'cycles.no_fix': '2'}), 1.0)
+    overview.hear('lab/channel', Report(False, 'no fault', {}), 3.0)
+    text = text_of(overview, 5.0)
+    assert 'beaconing for 2.00 s, cycle 1795288682617' in text
+    assert 'last given up: cycle 1795288682616 of user 12: rhs_silent' in text
+    assert re.search(r'lab/bs +waiting +silent for 4 s +2 no_fix +3 late_ack', text)
+    assert re.search(r'lab/channel +no fault +0 +0', text)
+    assert '…' not in text
+
+
+def test_what_others_send_is_neither_markup_nor_control():
+    overview = Overview()
+    overview.add(m.ProtocolState(
+        1, 2, m.Phase.BEACONING, '\x1b[2J[/red]', np.zeros(4), 0.0), 1.0)
+    overview.hear('a[/b]\x1b[31m', Report(True, '[bold]\n[/x]', {
+        'phase': '[/', 'dropped.[/]\x07': '3', 'dropped.long': '9' * 5000}), 1.0)
+    text = text_of(overview, 2.0, width=120)
+    assert 'of user 2: ?[2J[/red]' in text
+    assert re.search(r'a\[/b\]\?\[31m +\[/ +\[bold\]\?\[/x\] +0 +3 \[/\]\?', text)
+    assert '\x1b' not in text and '\x07' not in text
+
+
+def test_once_prints_a_cycle_and_every_node(network, call_script):
+    text = call_script(f'{SCRIPT} --once')
+    codebook = Codebook.load(ROOT / 'config' / 'codebook_quick.yaml')
+    assert f'codebook {codebook.id}' in text
+    row = r'^ +[12] +(-?\d+\.\d\d +){3}\d+\.\d\d +\d+\.\d\d +\d+\.\d\d +\d+\.\d{3} +\d+\.\d *$'
+    assert re.search(row, text, re.MULTILINE), text
+    for node in ('bs', 'channel', 'optimizer', 'positioner', 'rhs_controller', 'transmission',
+                 'user_1', 'user_2'):
+        assert re.search(f'^ {node} .*(no fault|just now) ', text, re.MULTILINE), text
+
+
+def test_it_draws_over_itself_until_it_is_interrupted(network):
+    ours, theirs = pty.openpty()
+    with subprocess.Popen([SCRIPT], stdin=theirs, stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        text = b''
+        # Two views of a running network.
+        while text.count(b'cycles/s') < 2:
+            text += os.read(ours, 65536)
+        process.send_signal(signal.SIGINT)
+        try:
+            while True:
+                text += os.read(ours, 65536)
+        except OSError:  # closed by the process that has ended
+            os.close(ours)
+        assert process.wait(30) == 0
+    assert b'Traceback' not in text
+    # The terminal is given back.
+    assert text.rstrip().endswith(b'\x1b[?1049l')
+
+
+def test_a_reader_that_leaves_ends_it(network, call_script):
+    assert call_script(f'{{ {SCRIPT}; echo $? >&3; }} 3>&1 >&1 | head -n 1; true')
+
+
+def test_without_a_network_once_says_so():
+    done = subprocess.run(
+        [SCRIPT, '--once', '--timeout', '0.3', '--ros-args', '-r', '__ns:=/nobody'],
+        capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout) == (1, '')
+    assert done.stderr.startswith('error: no complete cycle within 0.3 s, in the domain ')
+
+
+def test_without_the_library_the_error_says_so(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'rich', None)
+    assert main(['--once']) == 1
+    assert capsys.readouterr().err == (
+        'error: watch needs rich, which is not installed (pip install rich)\n')
