@@ -1,4 +1,4 @@
-"""The ament_python package rhs_isac_ros."""
+"""The ament_python package rhs_isac_ros; without ROS, pip installs the library alone."""
 
 from glob import glob
 
@@ -17,7 +17,7 @@ NODES = (
     'user',
     'visualizer',
 )
-# Of the tools for the terminal, those that `ros2` lacks.
+# The terminal tools that have no counterpart in `ros2`.
 TOOLS = ('record', 'replay', 'snapshot', 'watch')
 
 setup(
@@ -30,6 +30,7 @@ setup(
     maintainer_email='maintainers@rhs-isac-ros.org',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -39,16 +40,22 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.*'))),
     ],
     python_requires='>=3.10',
-    # What it runs on is in package.xml: rosdep or requirements.txt install it.
-    install_requires=['setuptools'],
+    # The library needs no more. The nodes need ROS 2 as well, which pip cannot install from here:
+    # rosdep reads package.xml, and scripts/setup reads requirements.txt.
+    install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6'],
+    # Tests and the documentation read this table as a literal.
     extras_require={
-        'docs': ['sphinx'],
-        'experiments': ['dask', 'distributed', 'joblib'],
-        'neural': ['scikit-learn'],
+        'plot': ['matplotlib'],
+        'experiments': ['joblib', 'dask', 'distributed', 'tqdm'],
+        'neural': ['scikit-learn', 'threadpoolctl'],
         'genetic': ['pymoo'],
         'recording': ['mcap'],
         'watch': ['rich'],
-        'test': ['mcap-ros2-support', 'pytest', 'rosbags'],
+        'all': [
+            'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
+            'threadpoolctl', 'pymoo', 'mcap', 'rich'],
+        'docs': ['sphinx'],
+        'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'rosbags'],
     },
     zip_safe=False,
     entry_points={

@@ -7,6 +7,7 @@ in a traceback; here it ends the process as it does later on, with exit code 0.
 import importlib
 import os
 import signal
+import sys
 from collections.abc import Callable
 
 # Executables whose module is in `tools`; those of all others are in `nodes`.
@@ -37,8 +38,14 @@ def __getattr__(name: str) -> Callable[[], int]:
     def main() -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: os._exit(0))
-        module = importlib.import_module(
-            f'rhs_isac_ros.{"tools" if name in _TOOLS else "nodes"}.{name}')
+        try:
+            module = importlib.import_module(
+                f'rhs_isac_ros.{"tools" if name in _TOOLS else "nodes"}.{name}')
+        except ModuleNotFoundError as error:
+            # pip installs the executables with the library, also where there is no ROS.
+            print(f'error: {name} needs ROS 2 Jazzy and rhs_isac_msgs; no module named {error.name}',
+                  file=sys.stderr)
+            return 1
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         return module.main()

@@ -7,9 +7,11 @@ from rhs_isac_ros.codebook.optimize import METHODS, OptimizeResult, optimize
 from rhs_isac_ros.codebook.provenance import Provenance
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import Progress
+from rhs_isac_ros.codebook.shipped import default_codebook_file
 from rhs_isac_ros.codebook.start import random_codebook
 
 __all__ = [
     'METHODS', 'OBJECTIVES', 'SAMPLINGS', 'Codebook', 'CodebookError', 'OptimizeResult',
-    'Progress', 'Provenance', 'directional_codebook', 'optimize', 'random_codebook',
+    'Progress', 'Provenance', 'default_codebook_file', 'directional_codebook', 'optimize',
+    'random_codebook',
 ]

@@ -1,0 +1,114 @@
+"""`pip install .` in a fresh virtual environment gives a library that works without ROS."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGED = (
+    'config', 'launch', 'resource', 'rhs_isac_ros', 'LICENSE', 'package.xml', 'pyproject.toml',
+    'setup.cfg', 'setup.py')
+SECONDS = 240
+
+
+def read_extras():
+    """Extras of setup.py: their requirements by name."""
+    tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
+    (extras,) = [ast.literal_eval(node.value) for node in ast.walk(tree)
+                 if isinstance(node, ast.keyword) and node.arg == 'extras_require']
+    return extras
+
+
+class Installation:
+    """A virtual environment that holds the package, its requirements, and nothing else."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.prefix = folder / 'venv'
+
+    def run(self, program, *arguments):
+        # The caller's environment may name ROS and the clone itself.
+        environment = {name: value for name, value in os.environ.items() if name not in (
+            'PYTHONPATH', 'PYTHONHOME', 'LD_LIBRARY_PATH', 'VIRTUAL_ENV')}
+        return subprocess.run(
+            [self.prefix / 'bin' / program, *arguments], cwd=self.folder, env=environment,
+            capture_output=True, text=True, timeout=SECONDS, check=False)
+
+
+@pytest.fixture(scope='module')
+def installation(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('installation')
+    made = subprocess.run([sys.executable, '-m', 'venv', folder / 'venv'], capture_output=True,
+                          text=True, timeout=SECONDS, check=False)
+    if made.returncode:
+        pytest.skip(f'python -m venv fails: {made.stdout.strip()[:200]}')
+    fresh = Installation(folder)
+    # The build needs setuptools. Its download also shows whether there is an index.
+    probe = fresh.run('pip', 'download', '--quiet', '--no-deps', '--dest', 'index', 'setuptools')
+    if probe.returncode:
+        pytest.skip('pip cannot reach a package index')
+    # A copy, since pip builds inside the source folder.
+    source = folder / 'source'
+    source.mkdir()
+    for name in PACKAGED:
+        path = ROOT / name
+        if path.is_dir():
+            shutil.copytree(path, source / name, ignore=shutil.ignore_patterns('__pycache__'))
+        else:
+            shutil.copy(path, source)
+    done = fresh.run('pip', 'install', '--quiet', './source')
+    assert done.returncode == 0, done.stderr
+    return fresh
+
+
+def test_the_readme_example_runs(installation):
+    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
+    (code,) = re.findall(r'```python\n(.*?)```', readme, re.DOTALL)
+    done = installation.run('python', '-c', code.replace('max_steps=50', 'max_steps=2'))
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) >= 3
+
+
+def test_the_installed_package_is_typed(installation):
+    done = installation.run('python', '-c', 'import rhs_isac_ros; print(rhs_isac_ros.__file__)')
+    package = Path(done.stdout.strip()).parent
+    assert package.is_relative_to(installation.prefix)
+    assert (package / 'py.typed').is_file()
+
+
+def test_scenarios_and_codebooks_are_installed(installation):
+    installed = installation.prefix / 'share' / 'rhs_isac_ros' / 'config'
+    assert {path.name for path in installed.glob('*.yaml')} == {
+        path.name for path in (ROOT / 'config').glob('*.yaml')}
+
+
+@pytest.mark.parametrize(('library', 'arguments'), [
+    ('matplotlib', ('codebook', '--method', 'random', '--plot', 'codebook.png')),
+    ('pymoo', ('codebook', '--method', 'genetic')),
+    ('scikit-learn', ('positioning', '--codebook', 'source/config/codebook.yaml'))])
+def test_a_missing_extra_is_named_in_one_line(installation, library, arguments):
+    module, *options = arguments
+    done = installation.run('python', '-m', f'rhs_isac_ros.{module}', '--quiet', *options)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f'needs {library}, which is not installed' in line
+
+
+@pytest.mark.parametrize('name', ['bs', 'watch'])
+def test_an_executable_without_ros_fails_with_one_line(installation, name):
+    done = installation.run(name)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f'error: {name} needs ROS 2 Jazzy and rhs_isac_msgs')
+
+
+def test_the_extra_all_is_the_union_of_the_optional_features():
+    extras = read_extras()
+    features = extras.keys() - {'all', 'docs', 'test'}
+    assert sorted(extras['all']) == sorted(name for key in features for name in extras[key])
