@@ -13,7 +13,7 @@ copyright = author
 version = release = __version__
 extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'generated', 'mathml']
 
-# Pages must display where there is no network: no fonts, no MathJax from elsewhere.
+# The pages must display offline, so no fonts and no MathJax are loaded from other sites.
 html_theme = 'alabaster'
 html_theme_options = {
     'description': 'Multi-band ISAC with a holographic surface, on ROS 2',
@@ -32,8 +32,8 @@ autodoc_default_options = {'members': True, 'show-inheritance': True}
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
-# What is ours must be there; what is another library's would need its inventory from the network.
-# What begins with an underscore is nobody's business.
+# References into this package must resolve. Those to other libraries would need their inventories
+# from the network, and private names have no page.
 nitpicky = True
 nitpick_ignore_regex = [
     ('py:.*', r'(?!rhs_isac_ros\.).*'),

@@ -42,9 +42,8 @@ def __getattr__(name: str) -> Callable[[], int]:
             module = importlib.import_module(
                 f'rhs_isac_ros.{"tools" if name in _TOOLS else "nodes"}.{name}')
         except ModuleNotFoundError as error:
-            # pip installs the executables with the library, also where there is no ROS.
-            print(f'error: {name} needs ROS 2 Jazzy and rhs_isac_msgs; no module named {error.name}',
-                  file=sys.stderr)
+            # pip also installs the executables on systems without ROS.
+            print(f'error: {name} needs ROS 2 Jazzy and rhs_isac_msgs: {error}', file=sys.stderr)
             return 1
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -1,8 +1,8 @@
-# Puts ROS 2, the messages and rhs_isac_ros into the current shell, bash or zsh, from any directory:
+# Makes ROS 2, the messages and rhs_isac_ros available in the current bash or zsh, from any directory:
 #   . scripts/env.sh
 # shellcheck shell=bash
 
-_rhs_prepend() { # NAME directory: puts the directory first in the path variable, unless it is there
+_rhs_prepend() { # NAME directory: prepends the directory to the path variable unless it is included
   eval "case :\${$1-}: in (*:\"\$2\":*) ;; (*) export $1=\"\$2\${$1:+:\$$1}\" ;; esac"
 }
 
@@ -11,10 +11,10 @@ _rhs_load() { # root shell
   if [ -f "$1/install/.setup" ]; then read -r mode _ <"$1/install/.setup"; fi
   case $mode:${ROS_DISTRO:-} in
     wheels:)
-      # First in PATH even where another environment was activated in between.
+      # First in PATH, even if another environment was activated in between.
       case $PATH: in ("$1/.venv/bin:"*) ;; (*) PATH=$1/.venv/bin:$PATH ;; esac
       export PATH VIRTUAL_ENV="$1/.venv"
-      # The wheels would start every Python twice to set these.
+      # Without these, the wheels restart every Python process to set them.
       export _ROS_WHEELS_BOOTSTRAP_COMPLETE=1
       libraries=$(find "$1/.venv/lib" -maxdepth 3 -name 'ros_*.libs' | sort | tr '\n' ':')
       _rhs_prepend LD_LIBRARY_PATH "$libraries$1/.venv/lib"
@@ -27,11 +27,11 @@ _rhs_load() { # root shell
       . "$1/install/setup.$2"
       ;;
     wheels:* | system:*)
-      echo "env.sh: ROS 2 $ROS_DISTRO is sourced, the build is for another ROS: run scripts/setup" >&2
+      echo "env.sh: ROS 2 $ROS_DISTRO is sourced, but the build uses another ROS: run scripts/setup" >&2
       return 1
       ;;
     *)
-      echo 'env.sh: nothing is built yet: run scripts/setup' >&2
+      echo 'env.sh: the packages have not been built: run scripts/setup' >&2
       return 1
       ;;
   esac
@@ -39,7 +39,7 @@ _rhs_load() { # root shell
 
 _rhs_env() {
   local shell=bash file=${BASH_SOURCE[0]:-} nounset='' code=0
-  # bash cannot parse what BASH_SOURCE is called in zsh.
+  # bash cannot parse the zsh counterpart of BASH_SOURCE.
   if [ -n "${ZSH_VERSION:-}" ]; then shell=zsh && eval 'file=${(%):-%x}'; fi
   # colcon's scripts read unset variables.
   case $- in (*u*) nounset=1 && set +u ;; esac
@@ -48,7 +48,7 @@ _rhs_env() {
   return "$code"
 }
 
-# In an `if`, nothing inside ends a shell that has `set -e`.
+# Inside an `if` condition, a failing command does not end a shell that has `set -e`.
 if _rhs_env; then
   unset -f _rhs_prepend _rhs_load _rhs_env
 else

@@ -1,4 +1,7 @@
-"""Mean squared errors of estimators on the same simulated signals."""
+"""Print the mean squared errors of estimators on the same simulated signals.
+
+Arguments: scenario file, codebook file, names of estimators.
+"""
 
 import sys
 

@@ -7,7 +7,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 
-scenario = Scenario.from_yaml('config/quick.yaml')  # Scenario() is the paper's Table I
+scenario = Scenario.from_yaml('config/quick.yaml')  # Scenario() is Table I of the paper
 codebook = Codebook.load('config/codebook_quick.yaml')
 rng = np.random.default_rng(1)
 positions = scenario.sample_positions(3, rng)  # [N, 3], metres

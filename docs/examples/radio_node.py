@@ -1,4 +1,4 @@
-"""A node in the place of ``channel`` that talks to hardware."""
+"""A node that replaces ``channel`` and drives hardware."""
 
 import collections
 import dataclasses
@@ -12,11 +12,11 @@ from rhs_isac_ros.ros.run import entry
 
 
 class Radio(PlainRole):
-    """Answers each pilot with what the receivers behind the feeds measure.
+    """Answers each pilot with the signals that the receivers at the feeds measure.
 
-    `measure` takes a band, a configuration [N_E] and the pilot; it sets the surface, has the user
-    transmit, and returns the signals at the feeds, complex [N_SB, K] [sqrt(W)], noise and all.
-    `carry` takes data and returns how many of their bits arrived at the other side.
+    `measure` takes a band, a configuration [N_E] and the pilot. It configures the surface, lets
+    the user transmit, and returns the noisy signals at the feeds, complex [N_SB, K] [sqrt(W)].
+    `carry` takes data and returns the number of bits that were received.
     """
 
     def __init__(self, measure, carry):
@@ -27,7 +27,7 @@ class Radio(PlainRole):
         self._waiting = collections.deque(maxlen=256)
 
     def handle(self, event, now_s):
-        """Take a message; return what to send."""
+        """Process a message and return the messages to send."""
         match event:
             case m.RhsConfiguration(mode=m.Mode.POSITIONING):
                 if event.cycle_id != self._cycle_id:
@@ -41,7 +41,7 @@ class Radio(PlainRole):
         return self._answer()
 
     def _answer(self):
-        """Answer the pilots whose configuration is known: topics may overtake each other."""
+        """Answer the pilots whose configuration has arrived; topics have no common order."""
         answers = []
         for _ in range(len(self._waiting)):
             pilot = self._waiting.popleft()
@@ -51,13 +51,13 @@ class Radio(PlainRole):
                 answers.append(Send(m.FeedSignals(
                     pilot.cycle_id, pilot.user, pilot.band, pilot.frame, feeds)))
             else:
-                # Of a cycle that nobody finished, these fall out at the other end.
+                # Pilots of unfinished cycles leave the queue at its other end.
                 self._waiting.append(pilot)
         return answers
 
 
 class RadioNode(RoleNode):
-    """The node; it takes the parameters of ``channel``, of which it needs ``scenario_file``."""
+    """The node; of the parameters of ``channel`` it uses only ``scenario_file``."""
 
     def __init__(self, measure, carry, **node_options):
         super().__init__('channel', (m.FeedSignals, m.Data), 'radio', **node_options)
@@ -65,12 +65,12 @@ class RadioNode(RoleNode):
 
 
 def measure(band, configuration, pilot):
-    """Drive your hardware here."""
+    """Measure with your hardware here."""
     raise NotImplementedError('no radio yet')
 
 
 def carry(data):
-    """Send your data here."""
+    """Transmit your data here."""
     raise NotImplementedError('no radio yet')
 
 

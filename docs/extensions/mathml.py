@@ -1,10 +1,10 @@
-"""Formulas as MathML, which browsers display by themselves: no script, no network, no LaTeX."""
+"""Render formulas as MathML, which browsers display without scripts, network or LaTeX."""
 
 import docutils
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 
-# The second argument said the opposite before.
+# Docutils 0.21 inverted the meaning of the second argument of tex2mathml.
 _BLOCK_IS_TRUE = docutils.__version_info__ >= (0, 21)
 
 

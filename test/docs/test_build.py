@@ -1,4 +1,4 @@
-"""The documentation builds without a warning, and displays without a network."""
+"""The documentation builds without a warning and displays without a network."""
 
 import os
 import re
@@ -8,25 +8,26 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip('sphinx', reason='there is no Sphinx here')
-pytest.importorskip('rclpy', reason='pages of the interfaces need ROS')
+pytest.importorskip('sphinx', reason='Sphinx is not installed')
+pytest.importorskip('rclpy', reason='the pages of the interfaces need ROS')
 
 from rhs_isac_ros.protocol import diagram  # noqa: E402
 from rhs_isac_ros.ros import parameters, topics  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
-PAGES = ('index', 'tutorial', 'model', 'protocol', 'interfaces', 'extending', 'installing')
+DOCS = ROOT / 'docs'
+PAGES = sorted(path.stem for path in DOCS.glob('*.rst'))
 
 
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
-    """Folder of the pages; as scripts/docs builds them."""
+    """Folder of the pages, built as scripts/docs builds them."""
     folder = tmp_path_factory.mktemp('docs')
     done = subprocess.run(
         [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-E', '-q', '-b', 'html',
-         '-d', folder / 'doctrees', ROOT / 'docs', folder / 'html'],
+         '-d', folder / 'doctrees', DOCS, folder / 'html'],
         capture_output=True, text=True, timeout=240, check=False,
-        # A proxy that nobody is: what reads from the network fails.
+        # A proxy that does not exist: reading from the network fails.
         env={**os.environ, 'http_proxy': 'http://127.0.0.1:9', 'https_proxy': 'http://127.0.0.1:9',
              'OPENBLAS_NUM_THREADS': '1'})
     assert done.returncode == 0, done.stderr
@@ -38,7 +39,15 @@ def page(site, name):
     return (site / f'{name}.html').read_text(encoding='utf-8')
 
 
-def test_nothing_comes_from_elsewhere(site):
+def text_of(site, name):
+    return re.sub(r'<[^>]+>', '', page(site, name))
+
+
+def contains(text, name):
+    return re.search(rf'(?<![\w/]){re.escape(name)}(?![\w/])', text)
+
+
+def test_pages_load_nothing_from_other_sites(site):
     for path in site.rglob('*.html'):
         text = path.read_text(encoding='utf-8')
         loaded = re.findall(r'<(?:script|img|iframe)[^>]*\ssrc="([^"]*)"', text)
@@ -54,7 +63,7 @@ def test_formulas_are_mathml(site):
     assert '\\frac' not in text
 
 
-def test_diagrams_are_those_of_the_tables(site):
+def test_diagrams_are_drawn_from_the_transition_tables(site):
     text = page(site, 'protocol')
     for role in diagram.ROLES:
         assert diagram.svg(role) in text
@@ -62,25 +71,66 @@ def test_diagrams_are_those_of_the_tables(site):
     assert 'protocol_state served' in text
 
 
-def test_interfaces_name_every_topic_and_parameter(site):
-    text = re.sub(r'<[^>]+>', '', page(site, 'interfaces'))
-    names = {*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS,
-             topics.MARKERS}
-    names |= {parameter.name for group in parameters.NODES.values() for parameter in group}
-    for name in names:
-        assert re.search(rf'(?<![\w/]){re.escape(name)}(?![\w/])', text), name
+def test_interfaces_name_every_topic_and_message_field(site):
+    text = text_of(site, 'interfaces')
+    for name in {*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS,
+                 topics.MARKERS}:
+        assert contains(text, name), name
     for message in (ROOT / 'msg_defs' / 'msg').glob('*.msg'):
         for line in message.read_text(encoding='utf-8').splitlines()[3:]:
             assert re.sub(r'\s+', ' ', line.split('#')[0]).strip() in re.sub(r'\s+', ' ', text)
 
 
+def test_the_table_of_topics_has_every_topic_with_its_type():
+    source = (DOCS / 'interfaces.rst').read_text(encoding='utf-8')
+    types = dict(re.findall(r'^   "``([\w/<>]+)``", "``([\w/]+)``"', source, re.MULTILINE))
+    assert {topics.NAMES[kind]: kind.__name__ for kind in topics.NAMES}.items() <= types.items()
+    assert {topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS} <= types.keys()
+    for name in (topics.PATH, topics.TRUE_PATH):
+        assert types[name.format(user='<n>')] == 'nav_msgs/Path'
+
+
+def test_parameters_name_every_parameter(site):
+    text = text_of(site, 'parameters')
+    for group in parameters.NODES.values():
+        for parameter in group:
+            assert contains(text, parameter.name), parameter.name
+
+
+def test_diagnostics_have_every_kind_of_key(site):
+    text = text_of(site, 'interfaces')
+    for kind in ('parameter', 'pending', 'failed', 'cycles', 'retries', 'dropped', 'beacons',
+                 'received', 'sent'):
+        assert f'{kind}.&lt;' in text, kind
+
+
+def test_the_installation_page_lists_every_extra():
+    import test_installation
+    source = (DOCS / 'installing.rst').read_text(encoding='utf-8')
+    rows = dict(re.findall(r'^   \* - ``(\w+)``\n     - (.*)$', source, re.MULTILINE))
+    extras = test_installation.read_extras()
+    assert rows.keys() == extras.keys()
+    for name, libraries in extras.items():
+        assert rows[name] in (', '.join(libraries), 'all of the above')
+
+
 @pytest.mark.parametrize('name', PAGES)
-def test_commands_on_the_pages_are_there(name):
-    text = (ROOT / 'docs' / f'{name}.rst').read_text(encoding='utf-8')
+def test_commands_on_the_pages_exist(name):
+    text = (DOCS / f'{name}.rst').read_text(encoding='utf-8')
     for command in re.findall(r'scripts/([a-z.]+[a-z])', text):
         assert (ROOT / 'scripts' / command).is_file(), command
     for module in re.findall(r'python -m (rhs_isac_ros[\w.]*)', text):
         place = ROOT.joinpath(*module.split('.'))
         assert place.with_suffix('.py').is_file() or (place / '__main__.py').is_file(), module
-    for executable in re.findall(r'scripts/run (\w+)', text):
-        assert (ROOT / 'rhs_isac_ros' / 'nodes' / f'{executable}.py').is_file(), executable
+    for executable in re.findall(r'(?:scripts/run|ros2 run rhs_isac_ros) (\w+)', text):
+        folders = [ROOT / 'rhs_isac_ros' / folder for folder in ('nodes', 'tools')]
+        assert any((folder / f'{executable}.py').is_file() for folder in folders), executable
+    for kind, benchmark in re.findall(r'scripts/(benchmark|reproduce) (\w+)', text):
+        folder = {'benchmark': 'benchmarks', 'reproduce': 'figures'}[kind]
+        assert (ROOT / 'scripts' / folder / f'{benchmark}.py').is_file(), benchmark
+
+
+@pytest.mark.parametrize('name', PAGES)
+def test_every_page_is_in_the_table_of_contents(name):
+    index = (DOCS / 'index.rst').read_text(encoding='utf-8')
+    assert name == 'index' or re.search(rf'^   {name}$', index, re.MULTILINE)

@@ -1,1 +1,1 @@
-"""What a laboratory adds to rhs_isac_ros, without changing it."""
+"""Plug-ins of a laboratory for rhs_isac_ros."""

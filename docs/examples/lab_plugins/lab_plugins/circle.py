@@ -1,12 +1,12 @@
-"""A user that goes round a circle."""
+"""A mobility: users that move on a circle."""
 
 import numpy as np
 
 
 class Circle:
-    """A circle of 2 m radius around the centre of the region, at a steady speed.
+    """A circle of 2 m radius around the centre of the region, at constant speed.
 
-    With a `start`, it begins at the point of the circle in that direction.
+    With a `start`, the user begins at the point of the circle in that direction.
     """
 
     RADIUS_M = 2.0
@@ -21,10 +21,10 @@ class Circle:
         self._begin_s = None
 
     def state(self, now_s):
-        """Return position [m] and velocity [m/s]; the clock has no epoch."""
+        """Return position [m] and velocity [m/s]; the epoch of the clock is arbitrary."""
         if self._begin_s is None:
             self._begin_s = now_s
         angle = self._angle + self._rate * (now_s - self._begin_s)
-        outward = np.array([np.cos(angle), np.sin(angle), 0.0])
-        along = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        return self._center + self.RADIUS_M * outward, self.RADIUS_M * self._rate * along
+        radial = np.array([np.cos(angle), np.sin(angle), 0.0])
+        tangential = np.array([-np.sin(angle), np.cos(angle), 0.0])
+        return self._center + self.RADIUS_M * radial, self.RADIUS_M * self._rate * tangential

@@ -1,4 +1,4 @@
-"""An estimator that weighs a fixed set of positions: slow and coarse, but fifteen lines."""
+"""An estimator that weights a fixed set of positions: slow and coarse, but short."""
 
 import numpy as np
 from scipy.stats import qmc
@@ -8,7 +8,7 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
 class GridEstimator:
-    """Mean and covariance of the posterior over 2^14 even points of the region of interest."""
+    """Mean and covariance of the posterior over 2^14 Sobol points of the region of interest."""
 
     name = 'grid'
 
@@ -16,20 +16,20 @@ class GridEstimator:
         self._scenario, self._codebook = scenario, codebook
         low, high = scenario.roi_bounds_m
         self._points = low + (high - low) * qmc.Sobol(3, seed=0).random_base2(log2_points)
-        # Multipath and noise are white after this, so that distances of signals are likelihoods.
+        # Whitening turns squared distances between signals into negative log-likelihoods.
         self._model = WhitenedModel(scenario, codebook)
         self._means = self._model.mean(self._points).reshape(len(self._points), -1)
 
     def estimate(self, received):
-        """Check the signals, locate every one of them, and give the answer their form."""
+        """Estimate the positions of received signals [..., N_B, N_SB F]."""
         return estimate_each(self._scenario, self._codebook, received, self._locate)
 
     def _locate(self, batch):
         for whitened in self._model.whiten(batch):
-            misfit = np.sum(np.abs(whitened.ravel() - self._means)**2, axis=1)
-            weights = np.exp(misfit.min() - misfit)
+            distance2 = np.sum(np.abs(whitened.ravel() - self._means)**2, axis=1)
+            weights = np.exp(distance2.min() - distance2)
             weights /= weights.sum()
             mean = weights @ self._points
             offsets = self._points - mean
-            # Mean, covariance, and the reason why there is no position: none.
+            # The third value would be the reason for returning no position.
             yield mean, (weights[:, None] * offsets).T @ offsets + 1e-6 * np.eye(3), ''

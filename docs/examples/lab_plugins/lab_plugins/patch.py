@@ -1,4 +1,4 @@
-"""The pattern of a patch antenna: 6 dBi ahead, and nothing behind."""
+"""The gain pattern of a patch antenna: 6 dBi on boresight, no backward radiation."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ def amplitude(angles):
 
 
 def slope(angles):
-    """Return its derivative. Left out, it is computed by differences."""
+    """Return the derivative. This function is optional: differences replace it."""
     return np.where(np.cos(angles) > 0, -2 * np.sin(angles), 0.0)
 
 
