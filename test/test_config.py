@@ -1,4 +1,4 @@
-"""The scenarios and codebooks that the package ships."""
+"""The scenarios and codebooks in config/."""
 
 import dataclasses
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 
 CONFIG = Path(__file__).parents[1] / 'config'
@@ -20,14 +20,14 @@ def test_every_file_is_a_scenario_or_a_codebook():
     assert {path.stem for path in CONFIG.glob('*.yaml')} == {*SCENARIOS, *CODEBOOKS}
 
 
-def test_table1_is_the_default_and_leaves_nothing_out():
+def test_table1_equals_the_default_and_has_every_field():
     assert Scenario.from_yaml(CONFIG / 'table1.yaml') == Scenario()
     content = yaml.safe_load((CONFIG / 'table1.yaml').read_text(encoding='utf-8'))
     assert list(content) == list(FIELDS)
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
-def test_every_line_tells_its_unit(name):
+def test_every_line_states_its_unit(name):
     text = (CONFIG / f'{name}.yaml').read_text(encoding='utf-8')
     lines = re.findall(r'^(\w+): (.*?) +# (.*)$', text, re.MULTILINE)
     assert [field for field, _, _ in lines] == list(yaml.safe_load(text))
@@ -36,7 +36,7 @@ def test_every_line_tells_its_unit(name):
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
-def test_numbers_are_numbers_to_yaml_too(name):
+def test_yaml_reads_all_values_as_numbers(name):
     content = yaml.safe_load((CONFIG / f'{name}.yaml').read_text(encoding='utf-8'))
     for value in content.values():
         for number in value if isinstance(value, list) else [value]:
@@ -57,3 +57,8 @@ def test_codebooks_fit_their_scenarios(name):
     scenario = name.removeprefix('codebook').removeprefix('_')
     file = CONFIG / f'{scenario if scenario in SCENARIOS else "table1"}.yaml'
     Codebook.load(CONFIG / f'{name}.yaml').check(Scenario.from_yaml(file))
+
+
+def test_the_default_codebook_is_found_in_a_clone():
+    default = Codebook.load(default_codebook_file())
+    assert default.id == Codebook.load(CONFIG / 'codebook.yaml').id

@@ -1,4 +1,4 @@
-"""Docstrings: every public name of every layer has one, in NumPy's style."""
+"""Every public name of every layer has a docstring in NumPy style."""
 
 import ast
 import re
@@ -30,7 +30,7 @@ def decorators(node: ast.FunctionDef) -> set[str]:
 
 
 def public_functions() -> dict[str, tuple[ast.FunctionDef, bool]]:
-    """Functions and methods by their place; and whether the first argument is the object's."""
+    """Functions and methods by location, and whether their first argument is self or cls."""
     found = {}
     for path, module in modules().items():
         scopes = [(path, module)]
@@ -49,7 +49,7 @@ MODULES, FUNCTIONS = modules(), public_functions()
 
 
 def section(docstring: str, title: str) -> str:
-    """Text of a section, empty if there is none."""
+    """Text of a section; empty if the section is missing."""
     parts = re.split(r'^(\w+)\n-+$', docstring, flags=re.MULTILINE)
     return dict(zip(parts[1::2], parts[2::2], strict=True)).get(title, '')
 
@@ -72,7 +72,7 @@ def test_modules_and_classes_have_docstrings(path):
 
 
 @pytest.mark.parametrize('place', FUNCTIONS)
-def test_docstrings_have_a_summary_and_name_no_parameter_that_is_gone(place):
+def test_docstrings_have_a_summary_and_describe_existing_parameters_in_order(place):
     node, bound = FUNCTIONS[place]
     docstring = ast.get_docstring(node) or ''
     assert docstring.partition('\n')[0].endswith('.'), 'no summary line'

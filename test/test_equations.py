@@ -1,4 +1,4 @@
-"""Every equation and proposition of the paper is implemented in one place that says so."""
+"""Every equation and proposition of the paper is implemented by exactly one function or class."""
 
 import ast
 import re
@@ -9,11 +9,11 @@ import pytest
 import rhs_isac_ros
 
 ROOT = Path(rhs_isac_ros.__file__).parent
-WANTED = [f'Eq. ({number})' for number in range(1, 18)] + ['Proposition 2', 'Proposition 3']
+EXPECTED = [f'Eq. ({number})' for number in range(1, 18)] + ['Proposition 2', 'Proposition 3']
 
 
 def claims() -> dict[str, list[str]]:
-    """Places by what the first line of their docstring says they implement."""
+    """Functions and classes by the equation that their docstring names."""
     found = {}
     for path in sorted(ROOT.rglob('*.py')):
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
@@ -29,10 +29,10 @@ def claims() -> dict[str, list[str]]:
 CLAIMS = claims()
 
 
-@pytest.mark.parametrize('wanted', WANTED)
-def test_is_implemented_once(wanted):
-    assert len(CLAIMS.get(wanted, [])) == 1, CLAIMS.get(wanted)
+@pytest.mark.parametrize('expected', EXPECTED)
+def test_each_is_implemented_once(expected):
+    assert len(CLAIMS.get(expected, [])) == 1, CLAIMS.get(expected)
 
 
-def test_nothing_unknown_is_claimed():
-    assert set(CLAIMS) <= {*WANTED, 'Proposition 1', 'Algorithm 1'}
+def test_no_docstring_names_an_unknown_equation():
+    assert set(CLAIMS) <= {*EXPECTED, 'Proposition 1', 'Algorithm 1'}

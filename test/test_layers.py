@@ -1,4 +1,4 @@
-"""The layers of the package: who may import whom."""
+"""The layers of the package and the imports that they permit."""
 
 import ast
 import os
@@ -15,15 +15,15 @@ LAYERS = (
     'monitoring', 'ros', 'nodes', 'tools')
 ROS_LAYERS = ('ros', 'nodes', 'tools')
 PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)
-# All that the pure layers may import besides the standard library and their own.
+# The libraries that the pure layers may import at module level.
 LIBRARIES = {'numpy', 'scipy', 'yaml'}
-# What they may import inside functions that say so where it is missing: only pictures, the
-# genetic algorithm, the training of networks and experiments need these.
+# The libraries that they may import inside functions, which raise an error if one is missing. Only
+# pictures, the genetic algorithm, the training of networks and experiments need these.
 OPTIONAL = {
     'distributed', 'joblib', 'matplotlib', 'pymoo', 'sklearn', 'threadpoolctl', 'tqdm'}
 ROOT = Path(rhs_isac_ros.__file__).parent
 MODULES = sorted(ROOT.rglob('*.py'))
-MOST_LINES = 299
+MAX_LINES = 299
 
 
 def module_name(path: Path) -> str:
@@ -38,14 +38,14 @@ def outside_functions(tree: ast.AST):
 
 
 def imported(path: Path, walk=ast.walk) -> set[str]:
-    """Full names of all that a module imports, anywhere in it or where `walk` leads."""
+    """Full names of the imports of a module among the nodes that `walk` visits."""
     names = set()
     for node in walk(ast.parse(path.read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}: relative import'
-            # From the package itself, what is imported may be a layer.
+            # An import from the package itself may be a layer.
             names.add(node.module)
             names.update(f'{node.module}.{alias.name}' for alias in node.names)
     return names
@@ -62,7 +62,7 @@ def layer_of(name: str) -> str | None:
     return parts[1] if parts[1] in LAYERS else None
 
 
-def test_the_package_is_made_of_its_layers():
+def test_the_package_consists_of_its_layers():
     folders = {path.name for path in ROOT.iterdir()
                if path.is_dir() and any(path.rglob('*.py'))}
     assert folders <= set(LAYERS)
@@ -71,7 +71,7 @@ def test_the_package_is_made_of_its_layers():
 
 
 @pytest.mark.parametrize('path', MODULES, ids=module_name)
-def test_imports_go_down(path):
+def test_modules_import_no_higher_layer(path):
     own = layer_of(module_name(path))
     allowed = () if own is None else LAYERS[:LAYERS.index(own) + 1]
     above = {name for name in imported(path) if (layer_of(name) or own) != own
@@ -83,14 +83,14 @@ def test_imports_go_down(path):
     'path', [path for path in MODULES if layer_of(module_name(path)) not in ROS_LAYERS],
     ids=module_name)
 def test_pure_layers_import_no_ros(path):
-    """Nor anything else that a plain Python with three libraries lacks."""
+    """Outside functions, they import only the standard library and three other libraries."""
     always = set(sys.stdlib_module_names) | LIBRARIES | {'rhs_isac_ros'}
     assert roots(imported(path, outside_functions)) <= always
     assert roots(imported(path)) <= always | OPTIONAL
 
 
-def test_pure_layers_work_where_there_is_no_ros():
-    """In a fresh interpreter that refuses whatever is not needed."""
+def test_pure_layers_can_be_imported_without_ros():
+    """In a fresh interpreter that refuses ROS and the optional libraries."""
     names = [module_name(path).removesuffix('.__init__') for path in MODULES
              if layer_of(module_name(path)) in PURE_LAYERS]
     refused = ('rclpy', 'launch', 'launch_ros', 'tf2_ros', *sorted(OPTIONAL))
@@ -122,4 +122,4 @@ except ImportError:
 
 @pytest.mark.parametrize('path', MODULES, ids=module_name)
 def test_modules_are_short(path):
-    assert len(path.read_text(encoding='utf-8').splitlines()) <= MOST_LINES
+    assert len(path.read_text(encoding='utf-8').splitlines()) <= MAX_LINES

@@ -1,4 +1,4 @@
-"""package.xml names all that the package imports, so that rosdep can install it."""
+"""package.xml lists every imported package, so that rosdep can install them."""
 
 import ast
 import functools
@@ -10,8 +10,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 TREE = ElementTree.parse(ROOT / 'package.xml').getroot()
-# Keys of libraries in rosdistro's rosdep/python.yaml, by what is imported; a ROS package is its
-# own key. threadpoolctl comes with scikit-learn.
+# Keys in rosdistro's rosdep/python.yaml by the name of the import; a ROS package is its own key.
+# threadpoolctl has no key: the system's scikit-learn depends on it.
 KEYS = {
     'docutils': 'python3-sphinx', 'hypothesis': 'python3-hypothesis', 'joblib': 'python3-joblib',
     'matplotlib': 'python3-matplotlib', 'numpy': 'python3-numpy', 'psutil': 'python3-psutil',
@@ -19,20 +19,20 @@ KEYS = {
     'sklearn': 'python3-sklearn', 'sphinx': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn',
     'tqdm': 'python3-tqdm', 'yaml': 'python3-yaml',
 }
-# What rosdep does not know, by what is imported; setup.py has an extra with it.
+# Libraries without a key, by the name of the import: their requirement in an extra of setup.py.
 PIP_ONLY = {
     'distributed': 'distributed', 'jax': None, 'mcap': 'mcap', 'mcap_ros2': 'mcap-ros2-support',
     'pymoo': 'pymoo', 'rosbags': 'rosbags',
 }
-# The repository's own.
+# Modules of the repository.
 OWN = {
     'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest', 'in_memory_network',
-    'node_processes', 'system'}
+    'node_processes', 'system', 'test_installation'}
 
 
 @functools.cache
 def imported(folder):
-    """Roots of the names that the modules of a folder import, and one module of each."""
+    """Top-level packages that the modules of a folder import, each with one importing module."""
     found = {}
     for path in sorted((ROOT / folder).rglob('*.py')):
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
@@ -68,17 +68,17 @@ def test_every_import_has_a_key_or_is_an_extra(folder, kinds):
     for name, path in imported(folder).items():
         if name in PIP_ONLY:
             if PIP_ONLY[name] and PIP_ONLY[name] not in extras():
-                missing[name] = f'{path}: not among the extras of setup.py'
+                missing[name] = f'{path}: not in any extra of setup.py'
         elif KEYS.get(name, name) not in there:
             missing[name] = f'{path}: no {KEYS.get(name, name)} in package.xml'
     assert not missing
 
 
-def test_no_key_is_there_for_nothing():
+def test_every_key_is_used():
     folders = ('rhs_isac_ros', 'launch', 'scripts', 'test', 'docs')
     used = {KEYS.get(name, name) for folder in folders
             for name in imported(folder)}
-    # launch reads .xml files through a plug-in.
+    # launch reads .xml files with a plug-in.
     assert keys(*RUN, 'test_depend', 'doc_depend') <= used | {'launch_xml'}
 
 

@@ -1,4 +1,4 @@
-"""The examples of the documentation, as a reader has them."""
+"""The examples of the documentation run as described."""
 
 import dataclasses
 import runpy
@@ -21,10 +21,10 @@ EXAMPLES = Path(__file__).parents[2] / 'docs' / 'examples'
 
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
-    """Folder with the example package, installed by pip."""
+    """Folder into which pip has installed the example package."""
     folder = tmp_path_factory.mktemp('site')
     source = folder / 'source'
-    # pip builds inside of the source.
+    # A copy, since pip builds inside the source folder.
     shutil.copytree(EXAMPLES / 'lab_plugins', source, ignore=shutil.ignore_patterns(
         'build', '*.egg-info', '__pycache__'))
     done = subprocess.run(
@@ -32,7 +32,7 @@ def site(tmp_path_factory):
          '--no-index', '--disable-pip-version-check', '--target', folder / 'site', source],
         capture_output=True, text=True, timeout=240, check=False)
     if 'No module named pip' in done.stderr:
-        pytest.skip('there is no pip here')
+        pytest.skip('pip is not installed')
     assert done.returncode == 0, done.stderr
     return folder / 'site'
 
@@ -44,7 +44,7 @@ def installed(site, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
 
 
-def test_all_are_found():
+def test_the_plugins_are_found():
     assert 'grid' in plugins.names(plugins.ESTIMATORS)
     assert 'circle' in plugins.names(plugins.MOBILITIES)
     assert 'patch' in plugins.names(plugins.GAIN_PATTERNS)
@@ -66,12 +66,12 @@ def test_the_estimator_locates_users():
         assert np.linalg.eigvalsh(estimate.covariance).min() > 0
         errors[name] = np.mean(np.sum((estimate.mean - positions)**2, axis=1))
         np.testing.assert_array_equal(estimator.estimate(received[0]).mean, estimate.mean[0])
-    # A guess of the centre would be off by 0.25 m^2 on average.
+    # The centre of the region has a mean squared error of 0.25 m^2.
     assert errors['grid'] < 0.1
     assert errors['grid'] < 2 * errors['bayes']
 
 
-def test_the_mobility_goes_round_at_its_speed():
+def test_the_mobility_moves_on_the_circle_at_its_speed():
     scenario = Scenario()
     for start in (None, (10.0, 1.0, 0.0)):
         user = mobility.make_plugin('circle', scenario, 1.5, np.random.default_rng(0), start)
@@ -85,7 +85,7 @@ def test_the_mobility_goes_round_at_its_speed():
         np.testing.assert_allclose(user.state(100.0 + 4 * np.pi / 1.5)[0], begin, atol=1e-9)
 
 
-def test_the_pattern_is_that_of_a_patch(tmp_path, small):
+def test_the_gain_pattern_is_a_patch(tmp_path, small):
     (tmp_path / 'my.yaml').write_text('element_gain: patch\nuser_gain: 1.0\n')
     scenario = dataclasses.replace(
         small.scenario, element_gain=Scenario.from_yaml(tmp_path / 'my.yaml').element_gain)
@@ -94,13 +94,13 @@ def test_the_pattern_is_that_of_a_patch(tmp_path, small):
         shape = los_and_derivative(scenario, place, 0)[0] / los_and_derivative(
             small.scenario, place, 0)[0]
         np.testing.assert_allclose(shape, gain, rtol=0.03)
-    # The slope that the example brings is the one that differences find.
+    # The slope of the example equals the numerical derivative.
     bare = dataclasses.replace(scenario, element_gain=scenario.element_gain.amplitude)
     np.testing.assert_allclose(crlb(bare, small.codebook, aside),
                                crlb(scenario, small.codebook, aside), rtol=1e-8)
 
 
-def test_the_scenario_of_the_tutorial_is_one():
+def test_the_scenario_of_the_tutorial_is_valid():
     scenario = Scenario.from_yaml(EXAMPLES / 'office.yaml')
     assert scenario.n_elements == 64
     assert scenario.center_frequencies_hz == (5.2e9, 5.8e9)
@@ -115,7 +115,7 @@ def test_estimators_are_compared(tmp_path, monkeypatch, capsys):
     script = EXAMPLES / 'compare_estimators.py'
     monkeypatch.setattr(sys, 'argv', [
         str(script), str(tmp_path / 'my.yaml'), str(tmp_path / 'codebook.yaml'), 'ml'])
-    # Fewer show that it runs.
+    # Fifty positions suffice to run the script.
     exec(script.read_text(encoding='utf-8').replace('1000', '50'), {})
     name, error, unit = capsys.readouterr().out.split()
     assert (name, unit) == ('ml', 'm^2')

@@ -1,4 +1,4 @@
-"""The page of the model links every formula to the one function that implements it."""
+"""The model page links each formula to the function that implements it."""
 
 import ast
 import re
@@ -12,7 +12,7 @@ CLAIM = re.compile(r'(?:Implements )?(Eq\. \(\d+\)|Proposition \d+|Algorithm \d+
 
 
 def claims() -> dict[str, str]:
-    """Full names of what says that it implements something, by what that is."""
+    """Full names of functions and classes by the equation that their docstring names."""
     found = {}
     for path in sorted(ROOT.rglob('*.py')):
         module = '.'.join(('rhs_isac_ros', *path.relative_to(ROOT).with_suffix('').parts))
@@ -25,7 +25,7 @@ def claims() -> dict[str, str]:
 
 
 def links() -> dict[str, list[str]]:
-    """What the sections of the page link to after `Implemented by`, by their titles."""
+    """Links after `Implemented by` in each section of the page, by equation."""
     found = {}
     parts = re.split(r'^(\S.*)\n[-^=]{3,}$', PAGE, flags=re.MULTILINE)
     for title, text in zip(parts[1::2], parts[2::2], strict=True):
@@ -36,7 +36,7 @@ def links() -> dict[str, list[str]]:
     return found
 
 
-def test_each_formula_is_linked_to_its_function_and_to_no_other():
+def test_each_formula_links_to_its_function_only():
     assert links() == {claim: [place] for claim, place in claims().items()}
     assert len(claims()) == 20
 
