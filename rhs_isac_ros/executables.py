@@ -47,5 +47,6 @@ def __getattr__(name: str) -> Callable[[], int]:
             return 1
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        return module.main()
+        code: int = module.main()
+        return code
     return main
