@@ -13,7 +13,7 @@ import yaml
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, Provenance, command, directional_codebook
 from rhs_isac_ros.codebook.__main__ import main
-from rhs_isac_ros.codebook.optimize import INTERRUPTED, _Keeper
+from rhs_isac_ros.codebook.optimize import INTERRUPTED, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario, streams
 
@@ -103,7 +103,7 @@ def test_resume_prefers_what_a_stopped_run_left(call, files, monkeypatch):
     """A run that is killed leaves OUTPUT.part, and the last good file as it was."""
     assert call('--steps', 5) == 0
     good = (files / 'codebook.yaml').read_bytes()
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
 
     class KilledError(BaseException):
         """What no code of ours sees."""
@@ -207,7 +207,7 @@ def test_a_full_disk_loses_neither_the_last_file_nor_the_result(
     rescue = tmp_path_factory.mktemp('rescue')
     monkeypatch.setattr('tempfile.tempdir', str(rescue))
     full_disk(monkeypatch, files / 'codebook.yaml')
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     fails_with(call, capsys, ['codebook.yaml', 'No space left', str(rescue)], '--steps', 4)
     assert (files / 'codebook.yaml').read_bytes() == good
     (saved,) = rescue.glob('*/codebook.yaml')
@@ -215,7 +215,7 @@ def test_a_full_disk_loses_neither_the_last_file_nor_the_result(
 
 
 def test_a_full_disk_on_the_way_is_a_warning(call, files, capsys, monkeypatch):
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     save = Codebook.save
 
     def save_or_not(codebook, target):

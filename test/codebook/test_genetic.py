@@ -7,13 +7,15 @@ import pytest
 
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.genetic import minimize_genetic
+from rhs_isac_ros.model.optional import MissingLibraryError
 
 
 def test_without_pymoo_the_error_says_what_is_missing(scenario, monkeypatch):
     for name in [name for name in sys.modules if name.partition('.')[0] == 'pymoo']:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'pymoo', None)
-    with pytest.raises(ValueError, match="^method: 'genetic' needs pymoo, which is not installed"):
+    words = r"^method: 'genetic' needs pymoo, .* \(pip install 'rhs_isac_ros\[genetic\]'\)$"
+    with pytest.raises(MissingLibraryError, match=words):
         optimize(scenario, method='genetic', n_positions=4, max_steps=1)
 
 

@@ -39,7 +39,7 @@ def test_average_bound_errs_by_less_than_a_thousandth(table1, shipped):
 def test_ambiguity_is_the_plain_confusion_of_pairs(
         scenario, plain, random_beams, seed, monkeypatch):
     """|p - p'|^2 Q(sqrt(q / 2)), with five others for each position."""
-    monkeypatch.setattr(objective, '_PAIRS_A_POSITION', 5)
+    monkeypatch.setattr(objective, '_PAIRS_PER_POSITION', 5)
     rng = np.random.default_rng(seed)
     codebook, positions = random_beams(scenario, rng), scenario.sample_positions(4, rng)
     value = ambiguity(scenario, positions, np.random.default_rng(seed)).value(codebook)

@@ -20,7 +20,7 @@ from rhs_isac_ros.codebook import (
     optimize,
     random_codebook,
 )
-from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _Keeper
+from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -233,7 +233,7 @@ def test_an_interrupt_while_progress_is_shown_gives_the_best_so_far(scenario, po
 
 
 def test_keep_is_called_with_the_results_so_far(scenario, positions, monkeypatch):
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     kept, seen = [], []
     result = optimize(scenario, positions, seed=3, max_steps=6, progress=seen.append,
                       keep=kept.append)
@@ -261,7 +261,7 @@ def test_keep_is_not_called_all_the_time(scenario, positions):
 
 
 def test_keeping_does_not_change_the_result(scenario, positions, run, monkeypatch):
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     result = optimize(
         scenario, positions, seed=3, max_steps=STEPS, keep=lambda partial: None)
     assert result.codebook.id == run[0].codebook.id

@@ -9,13 +9,14 @@ from rhs_isac_ros.codebook import Progress, directional_codebook, plot
 from rhs_isac_ros.codebook.directional import focal_points
 from rhs_isac_ros.codebook.plot import beam_powers, draw_optimisation
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.optional import MissingLibraryError
 
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    monkeypatch.setattr(plot, '_ROI_POINTS', 6)
+    monkeypatch.setattr(plot, '_N_MAP_POINTS', 6)
 
 
 @pytest.mark.parametrize('n_bands', [1, 2, 4])
@@ -36,7 +37,7 @@ def test_an_unknown_format_is_an_error(scenario, tmp_path):
 
 def test_without_matplotlib_the_error_says_so(scenario, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
-    with pytest.raises(ValueError, match='^plot: needs matplotlib'):
+    with pytest.raises(MissingLibraryError, match='^plot needs matplotlib, .*rhs_isac_ros.plot'):
         draw_optimisation(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.png')
 
 
