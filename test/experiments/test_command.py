@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rhs_isac_ros.experiments import JobError, parse_options, positive, run_command
+from rhs_isac_ros.experiments import JobError, parse_options, positive_int, run_command
 
 
 def parse(*arguments):
@@ -24,7 +24,7 @@ def test_quick_and_trials_change_the_number_of_trials():
 
 def test_an_experiment_may_have_options_of_its_own():
     options = parse_options('About.', 'fig0', 30, 3, ['--more', '4'],
-                            lambda parser: parser.add_argument('--more', type=positive))
+                            lambda parser: parser.add_argument('--more', type=positive_int))
     assert options.more == 4
 
 

@@ -86,7 +86,7 @@ def test_losses_are_those_of_the_estimates(fig4):
     truth, _ = fig4.simulate_pairs(
         fig4.Scenario(), fig4.directional_codebook(fig4.Scenario()), 2, fig4.TEST_SEED, 3)
     still = np.zeros((2, 3, 3)).tolist()
-    losses = fig4.lose(3, {
+    losses = fig4.capacity_losses(3, {
         'right': {'means': truth.tolist(), 'covariances': still},
         'wrong': {'means': (truth + [0, 2, 0]).tolist(), 'covariances': still}})
     assert np.allclose(losses['right'], 0)
