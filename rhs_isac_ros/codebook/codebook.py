@@ -91,13 +91,7 @@ class Codebook:
         return f'cb{digest.hexdigest()[:16]}'
 
     def check(self, scenario: Scenario) -> None:
-        """Check that the codebook fits a scenario.
-
-        Raises
-        ------
-        CodebookError
-            If a size differs or a frame's power is not P_max.
-        """
+        """Raise CodebookError if a size differs from the scenario or a frame's power from P_max."""
         try:
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
             check_shape('digital', self.digital, 'N_B N_SB F K', scenario)
@@ -124,12 +118,9 @@ class Codebook:
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
-        """Make a codebook from the parameters that `to_parameters` returns.
+        """Create a codebook from the parameters that `to_parameters` returns.
 
-        Parameters
-        ----------
-        parameters
-            Values by name. ``codebook.id`` may be empty or missing; otherwise it must match.
+        ``codebook.id`` may be empty or missing.
 
         Raises
         ------
@@ -161,10 +152,7 @@ class Codebook:
     def save(self, path: str | Path) -> None:
         """Write the codebook as a ROS 2 parameter file, replacing an old one atomically.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written; an old one is kept.
+        Raise OSError if the file cannot be written; an old one is then kept.
         """
         values = {name.partition('.')[2]: value for name, value in self.to_parameters().items()}
         content = {PARAMETER_NODE: {'ros__parameters': {'codebook': values}}}

@@ -17,12 +17,7 @@ def directional_codebook(
     points below and above mid-height: beams that were all symmetric in height could not
     distinguish up from down. The configuration follows the holographic principle. The weights of
     each sub-band are the matched filter of the resulting feed signals, with equal power in all
-    sub-bands.
-
-    Parameters
-    ----------
-    rng
-        Unused: the codebook is deterministic.
+    sub-bands. The codebook is deterministic; `rng` is unused.
 
     Raises
     ------

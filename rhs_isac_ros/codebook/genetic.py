@@ -13,12 +13,8 @@ def minimize_genetic(search: Search) -> str:
     """Minimise with pymoo's genetic algorithm, one step a generation.
 
     Only the direction of a combining vector matters, so its unscaled parts are searched in
-    [-1, 1]. The first generation contains the start. Returns the reason for stopping.
-
-    Raises
-    ------
-    MissingLibraryError
-        If pymoo is not installed.
+    [-1, 1]. The first generation contains the start. Returns the reason for stopping; raises
+    MissingLibraryError if pymoo is not installed.
     """
     with optional_import("method: 'genetic'", extra='genetic'):
         from pymoo.algorithms.soo.nonconvex.ga import GA

@@ -19,14 +19,10 @@ def minimize_interior_point(
 
     Parameters
     ----------
-    search
-        The objective and its bounds.
     start
         Initial values of all variables, float64 [n].
     free
         Mask of the variables to change, bool [n].
-    max_steps
-        Limit of update steps.
 
     Returns
     -------

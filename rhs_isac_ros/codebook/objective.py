@@ -18,19 +18,9 @@ _PAIRS_PER_POSITION = 128
 
 def average_bound(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
-    """Implements Eq. (17). Objective of P1 [m^2] on sampled positions.
+    """Implements Eq. (17). Objective of P1 [m^2] on sampled positions, float64 [N_sam, 3] [m].
 
-    Parameters
-    ----------
-    positions
-        Samples of the user's position, float64 [N_sam, 3] [m].
-    rng
-        Unused; every objective takes a generator.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is empty or not a finite [N, 3] array.
+    Raise ValueError if `positions` is empty or not a finite [N, 3] array. `rng` is unused.
     """
     return AverageCrlb(scenario, positions, ROW_TOLERANCE)
 
@@ -39,17 +29,8 @@ def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
     """Objective [m^2]: mean cost of confusing sampled positions with similar-looking ones.
 
-    Parameters
-    ----------
-    positions
-        Samples of the user's position, float64 [N_sam, 3] [m].
-    rng
-        Draws the positions that they may be confused with.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is empty or not a finite [N, 3] array.
+    The positions are float64 [N_sam, 3] [m]; `rng` draws those that they may be confused with.
+    Raise ValueError if `positions` is empty or not a finite [N, 3] array.
     """
     firsts = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
     return PairwiseErrorCost(

@@ -28,15 +28,10 @@ INTERRUPTED = 'interrupted'
 
 
 class Method(NamedTuple):
-    """An optimisation method.
+    """An optimisation method with its default limit of update steps.
 
-    Attributes
-    ----------
-    minimize
-        Callable that takes a `Search` and returns the reason for stopping; None if the start is
-        the result.
-    steps
-        Default limit of update steps.
+    `minimize` takes a `Search` and returns the reason for stopping; it is None if the start is
+    the result.
     """
 
     minimize: Callable[[Search], str] | None

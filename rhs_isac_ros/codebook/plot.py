@@ -54,19 +54,10 @@ def draw_optimisation(
 
 def beam_powers(
         scenario: Scenario, codebook: Codebook, band: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power of every frame's beam over azimuth, in the middle sub-band.
+    """Return the power of every frame's beam over azimuth, in the middle sub-band of a band.
 
-    Parameters
-    ----------
-    band
-        Index of the band, from 0.
-
-    Returns
-    -------
-    azimuths : numpy.ndarray
-        Float64 [361] [rad], at the height and distance of the centre of the region of interest.
-    powers : numpy.ndarray
-        Power that a user there would receive, float64 [F, 361] [W].
+    The azimuths are float64 [361] [rad], at the height and distance of the centre of the region
+    of interest; the powers that a user there would receive are float64 [F, 361] [W].
     """
     azimuths = np.linspace(-np.pi / 2, np.pi / 2, _N_AZIMUTHS)
     x, y, z = scenario.roi_center_m

@@ -13,11 +13,6 @@ class Problem:
     Solvers work on one real vector: the configurations, followed by the real and the imaginary
     parts of unscaled combining vectors. Scaling these to P_max eliminates the power constraint;
     the solver enforces the bounds of the configurations.
-
-    Parameters
-    ----------
-    objective
-        Callable that takes a codebook and returns its value and gradients, with a method `value`.
     """
 
     def __init__(self, scenario: Scenario, objective: Average) -> None:

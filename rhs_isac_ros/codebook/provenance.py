@@ -16,8 +16,8 @@ class Provenance:
 
     Attributes
     ----------
-    method, objective, seed, sampling, positions
-        Arguments of `optimize`; `positions` is their number.
+    positions
+        Number of positions.
     scenario
         Fields of the scenario that differ from Table I.
     version
@@ -51,12 +51,9 @@ class Provenance:
                               sort_keys=False, width=10**9).strip()
 
     def resumed(self, codebook: Codebook) -> 'Provenance':
-        """Return the provenance of an earlier result, after checking that it can be resumed.
+        """Return the provenance of an earlier result, to resume it.
 
-        Raises
-        ------
-        ValueError
-            If the codebook is not the result of an optimisation with the same arguments.
+        Raise ValueError unless it is the result of an optimisation with the same arguments.
         """
         earlier = Provenance.parse(codebook.provenance)
         if earlier is None:

@@ -42,23 +42,13 @@ SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarra
 
 def confusable(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """For each position, draw another one whose signals look similar.
+    """For each position in the region of interest, draw another one whose signals look similar.
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
     wavelengths in every band, so range lags are drawn with a density proportional to
     exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For a fraction of the positions the lag is 0: these
     pairs differ in direction only. Across the line of sight, the displacement ranges from well
-    below the beam width up to the side lobes.
-
-    Parameters
-    ----------
-    positions
-        Positions in the region of interest, float64 [N, 3] [m].
-
-    Returns
-    -------
-    numpy.ndarray
-        Positions in the region, float64 [N, 3] [m].
+    below the beam width up to the side lobes. Positions are float64 [N, 3] [m].
     """
     low, high = scenario.roi_bounds_m
     lags, cumulative = _lag_distribution(scenario)

@@ -40,16 +40,12 @@ class Search:
 
     Parameters
     ----------
-    problem
-        Evaluates the objective.
     start
         First point, float64 [n].
     max_steps
         Limit of update steps; each method defines what a step is.
     max_evaluations
         Limit of evaluations; None for no limit.
-    rng
-        Generator for methods that are random.
     progress
         Called after each step.
     done
@@ -85,12 +81,8 @@ class Search:
     def begin(self) -> float:
         """Evaluate the start [m^2] and record it as the first entry of the history.
 
-        An evaluation of the same point by an earlier search is not counted again.
-
-        Raises
-        ------
-        BudgetSpent
-            If no evaluation is left.
+        An evaluation of the same point by an earlier search is not counted again. Raise
+        BudgetSpent if no evaluation is left.
         """
         if self._evaluations:
             self._evaluations -= 1
@@ -104,26 +96,14 @@ class Search:
             self.on_step()
 
     def value(self, variables: np.ndarray) -> float:
-        """Evaluate the objective [m^2] at a point, float64 [n].
-
-        Raises
-        ------
-        BudgetSpent
-            If no evaluation is left.
-        """
+        """Evaluate the objective [m^2] at a point, float64 [n], or raise BudgetSpent."""
         self._count()
         value = self._problem.value(variables)
         self._keep_best(value, variables)
         return value
 
     def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate the objective [m^2] and its gradient, float64 [n].
-
-        Raises
-        ------
-        BudgetSpent
-            If no evaluation is left.
-        """
+        """Evaluate the objective [m^2] and its gradient, float64 [n], or raise BudgetSpent."""
         # A method begins by evaluating the point at which the previous one ended.
         if self._last is None or not np.array_equal(self._last[0], variables):
             self._count()

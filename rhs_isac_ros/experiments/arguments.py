@@ -4,13 +4,7 @@ import argparse
 
 
 def positive_int(text: str) -> int:
-    """Parse an integer of at least 1.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        If the text is anything else.
-    """
+    """Parse an integer of at least 1, or raise argparse.ArgumentTypeError."""
     try:
         number = int(text)
     except ValueError:

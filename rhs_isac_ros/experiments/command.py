@@ -21,16 +21,12 @@ def parse_options(
 
     Parameters
     ----------
-    description
-        Description of the experiment, for ``--help``.
     name
         Name of the experiment and of its results folder.
     trials, quick_trials
         Number of trials, and the number with ``--quick``.
-    arguments
-        Command line; by default that of the process.
     add
-        Callable that adds the experiment's own options.
+        Callable that adds the experiment's own options to a parser.
 
     Returns
     -------
@@ -63,10 +59,7 @@ def parse_options(
 def run_command(experiment: Callable[[], None]) -> int:
     """Run an experiment and print the error that ended it early, if any.
 
-    Returns
-    -------
-    int
-        Exit code: 0, 1 after an error, 130 after Ctrl-C.
+    Return the exit code: 0, 1 after an error, 130 after Ctrl-C.
     """
     try:
         experiment()

@@ -18,12 +18,8 @@ class JobError(Exception):
 class Job:
     """A call of the function of an experiment.
 
-    Attributes
-    ----------
-    name
-        Name of the result file without suffix, unique in its folder.
-    arguments
-        Keyword arguments of the function, JSON serialisable.
+    `name` is the name of the result file without suffix, unique in its folder; `arguments` are
+    keyword arguments of the function, JSON serialisable.
     """
 
     name: str
@@ -31,16 +27,9 @@ class Job:
 
 
 class Outcome(NamedTuple):
-    """Result or error of a job; can be pickled.
+    """Result of a job as JSON, or its error as text; the other is empty.
 
-    Attributes
-    ----------
-    text
-        The result as JSON; empty after an error.
-    error
-        The error as text; empty after success.
-    version
-        Version of this package in the process that ran the job.
+    `version` is that of this package in the process that ran the job.
     """
 
     job: Job
@@ -52,12 +41,8 @@ class Outcome(NamedTuple):
 def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> Outcome:
     """Run a job in the current process.
 
+    The function takes the job's arguments and returns a mapping that JSON can serialise.
     Exceptions are returned as text, because not all of them can be pickled.
-
-    Parameters
-    ----------
-    function
-        Callable that takes the job's arguments and returns a mapping that JSON can serialise.
     """
     try:
         return Outcome(job, text=json.dumps(function(**job.arguments)))

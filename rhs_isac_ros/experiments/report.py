@@ -18,14 +18,9 @@ def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
 
 
 def plus_minus(mean: float, std: float, digits: int = 3) -> str:
-    """Format a mean and its standard deviation to the same decimal place.
+    """Format a mean, to some significant digits, and its deviation to the same decimal place.
 
-    Parameters
-    ----------
-    std
-        Omitted from the text if NaN.
-    digits
-        Significant digits of the mean.
+    A deviation of NaN is omitted.
     """
     if not np.isfinite(mean):
         return str(mean)

@@ -11,13 +11,7 @@ from rhs_isac_ros.model.files import write_whole
 
 
 class ResultStore:
-    """Stores each result in a JSON file, so that later runs can reuse it.
-
-    Parameters
-    ----------
-    folder
-        Where to store them; created if it does not exist.
-    """
+    """Stores each result in a JSON file of a folder, which it creates, for later runs to reuse."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -45,13 +39,7 @@ class ResultStore:
         return result
 
     def write(self, job: Job, result: Mapping[str, Any]) -> None:
-        """Store the result of a job, replacing an old one atomically.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
+        """Store the result of a job, replacing an old one atomically, or raise OSError."""
         record = {**_settings(job), 'result': result}
         write_whole(self.path(job), json.dumps(record, indent=1) + '\n')
 

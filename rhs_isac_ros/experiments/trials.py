@@ -16,10 +16,10 @@ from rhs_isac_ros.model.optional import optional_import
 def run_jobs(
         function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path,
         n_jobs: int = -1, dask: str | None = None) -> list[dict[str, Any]]:
-    """Run the jobs that have no stored result, with a progress bar.
+    """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
     Each result is stored as soon as it is available. After an interruption or an error, the same
-    call resumes the experiment.
+    call resumes the experiment. A progress bar is shown on a terminal.
 
     Parameters
     ----------
@@ -31,11 +31,6 @@ def run_jobs(
         Number of parallel jobs on this machine; -1 for one per core.
     dask
         Address of the scheduler of a Dask cluster to use instead.
-
-    Returns
-    -------
-    list of dict
-        Results in the order of the jobs, decoded from JSON.
 
     Raises
     ------

@@ -18,17 +18,10 @@ _TIMEOUT_S = 30
 def outcomes_here(
         function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], n_jobs: int
 ) -> Generator[Outcome, None, None]:
-    """Run jobs in single-threaded processes on this machine.
+    """Run jobs in single-threaded processes on this machine; yield each outcome when it is ready.
 
-    Parameters
-    ----------
-    n_jobs
-        Number of parallel jobs; -1 for one per core, 1 to run them in this process.
-
-    Yields
-    ------
-    Outcome
-        The outcome of each job as it finishes. Closing the generator ends the processes.
+    There are `n_jobs` processes; -1 stands for one per core, and 1 for none but this process.
+    Closing the generator ends them.
 
     Raises
     ------
@@ -63,20 +56,11 @@ def outcomes_here(
 def outcomes_on_cluster(
         function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], address: str
 ) -> Generator[Outcome, None, None]:
-    """Run jobs on a Dask cluster.
+    """Run jobs on a Dask cluster; yield each outcome when it is ready.
 
-    This uses `distributed` directly. Through joblib, jobs for a cluster with a single thread run
-    in this process instead, and the run never ends if a worker dies.
-
-    Parameters
-    ----------
-    address
-        Address of the scheduler.
-
-    Yields
-    ------
-    Outcome
-        The outcome of each job as it finishes. Closing the generator cancels pending jobs.
+    The address is that of the scheduler. Closing the generator cancels pending jobs. This uses
+    `distributed` directly: through joblib, jobs for a cluster with a single thread run in this
+    process instead, and the run never ends if a worker dies.
 
     Raises
     ------
