@@ -91,7 +91,7 @@ class Codebook:
         return f'cb{digest.hexdigest()[:16]}'
 
     def check(self, scenario: Scenario) -> None:
-        """Raise CodebookError if a size differs from the scenario or a frame's power from P_max."""
+        """Raise CodebookError if a size, or the power of a frame, differs from the scenario's."""
         try:
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
             check_shape('digital', self.digital, 'N_B N_SB F K', scenario)
@@ -134,9 +134,11 @@ class Codebook:
                 f'codebook.shape: {shape!r}, expected [N_B, N_SB, F, K, N_E], all positive')
         n_bands, n_subbands, n_frames, n_feeds, n_elements = shape
         digital_shape = (n_bands, n_subbands, n_frames, n_feeds)
+        # Compares the sizes before memory is allocated for a shape that may be absurdly large.
+        real = _array(parameters, 'digital_re', digital_shape)
+        imag = _array(parameters, 'digital_im', digital_shape)
         digital = np.empty(digital_shape, complex)
-        digital.real = _array(parameters, 'digital_re', digital_shape)
-        digital.imag = _array(parameters, 'digital_im', digital_shape)
+        digital.real, digital.imag = real, imag
         average = parameters.get('codebook.average_crlb', math.nan)
         if not isinstance(average, int | float):
             raise CodebookError(f'codebook.average_crlb: {average!r}, expected a number')

@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--output', type=Path, default=Path('codebook.yaml'),
         help='file to write; an old one is replaced at the end')
     add('--scenario', type=Path,
-        help="YAML file of the scenario (default: the paper's Table I)")
+        help="YAML file of the scenario; the paper's Table I if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES), default='crlb',
         help='the average bound, or the ambiguity between distant positions, which a local '
@@ -47,10 +47,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
     add('--positions', type=int, default=DEFAULT_POSITIONS, help='number of samples')
-    add('--steps', type=int, help="limit of update steps (default: the method's)")
-    add('--evaluations', type=int, help='limit of evaluations (default: none)')
+    add('--steps', type=int, help="limit of update steps; the method's own if omitted")
+    add('--evaluations', type=int, help='limit of evaluations; none if omitted')
     add('--seed', type=int, default=0, help='seed of the samples, the start and the method')
-    add('--start', help=f'{" or ".join(STARTS)} (default: random), or a codebook file')
+    add('--start', help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
     add('--resume', action='store_true',
         help='continue from OUTPUT.part, which an unfinished run leaves, or from OUTPUT')
     add('--plot', type=Path, help='picture to draw, with convergence, bound and beam patterns')

@@ -164,6 +164,7 @@ MALFORMED = [
     ('codebook.shape', None, 'codebook.shape'),
     ('codebook.shape', [1, 3, 2, 2], 'codebook.shape: [1, 3, 2, 2], expected [N_B, N_SB, F'),
     ('codebook.shape', [1, 3, 2, 2, 0], 'codebook.shape: [1, 3, 2, 2, 0], expected'),
+    ('codebook.shape', [2**20] * 5, 'values, expected 1208925819614629174706176 = '),
     ('codebook.shape', [1, 3, 2, 2, -16], 'codebook.shape: [1, 3, 2, 2, -16], expected'),
     ('codebook.shape', 5, 'codebook.shape'),
     ('codebook.shape', [1, 3, 2, 2, 9], 'codebook.analog: 32 values, expected 18 = 1 x 2 x 9'),
