@@ -8,18 +8,7 @@ from rhs_isac_ros.codebook.command import ERRORS, add_options, run
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
-
-    Parameters
-    ----------
-    arguments
-        Command line; by default the process's.
-
-    Returns
-    -------
-    int
-        Exit code: 0, also after Ctrl-C; 2 if an argument or a file is wrong.
-    """
+    """Run the command; return 0, also after Ctrl-C, or 2 if an argument or a file is invalid."""
     parser = argparse.ArgumentParser(
         prog='python -m rhs_isac_ros.codebook', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)

@@ -1,38 +1,31 @@
-"""The paper's algorithm: analog and digital beamforming in turn."""
+"""The paper's algorithm: optimise analog and digital beamforming alternately."""
 
 import numpy as np
 
 from rhs_isac_ros.codebook.interior_point import minimize_interior_point
 from rhs_isac_ros.codebook.search import Search
 
-# N_itr of Table I; its N_us is 50, with the default number of steps.
+# N_itr of Table I. With the default number of steps, each sub-problem has N_us = 50 of them.
 _ITERATIONS = 4
 
 
 def minimize_alternating(search: Search) -> str:
-    """Implements Algorithm 1. Solve sP1 and sP2 in turn until neither changes its variables.
+    """Implements Algorithm 1. Solve sP1 and sP2 alternately until neither changes its variables.
 
-    Parameters
-    ----------
-    search
-        What to minimise; its steps are shared evenly among the 2 N_itr sub-problems.
-
-    Returns
-    -------
-    str
-        Why the method stopped.
+    The 2 N_itr sub-problems share the steps of the search evenly. Returns the reason for
+    stopping.
     """
     steps = max(search.max_steps // (2 * _ITERATIONS), 1)
-    left = search.max_steps
+    remaining = search.max_steps
     analog = np.arange(len(search.start)) < search.n_analog
     variables = search.start
     for iteration in range(_ITERATIONS):
-        before = variables
-        for chosen in (analog, ~analog):
-            if left < steps:
+        previous = variables
+        for free in (analog, ~analog):
+            if remaining < steps:
                 return 'max_steps reached'
-            variables = minimize_interior_point(search, variables, chosen, steps)
-            left -= steps
-        if np.array_equal(before, variables):
+            variables = minimize_interior_point(search, variables, free, steps)
+            remaining -= steps
+        if np.array_equal(previous, variables):
             return f'iteration {iteration + 1} changed nothing'
     return f'{_ITERATIONS} iterations of 2 x {steps} steps'

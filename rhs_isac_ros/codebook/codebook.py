@@ -1,4 +1,4 @@
-"""The codebook: what the surface and the base station apply in a positioning phase."""
+"""The codebook: the beamforming of the surface and the base station while positioning."""
 
 import dataclasses
 import functools
@@ -15,10 +15,12 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.shapes import check_shape
 
-# Node that owns the parameters of a codebook file, in any namespace.
+# The node whose parameters a codebook file holds, in any namespace.
 PARAMETER_NODE = '/**/optimizer'
-# The power constraint holds to this relative accuracy.
+# Relative tolerance of the power constraint.
 _POWER_TOLERANCE = 1e-6
+# The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
+_YAML_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class CodebookError(ValueError):
@@ -36,15 +38,15 @@ class Codebook:
     digital
         Combining vectors S, complex128 [N_B, N_SB, F, K] [sqrt(W)].
     average_crlb_m2
-        Average bound that was measured for it [m^2]; NaN if none was.
+        Measured average bound [m^2]; NaN if unknown.
     provenance
-        How it was made, for people.
+        How the codebook was made; see `Provenance`.
 
     Raises
     ------
     CodebookError
-        If an array has the wrong number of dimensions, sizes that contradict each other, entries
-        that are not finite, or configurations outside [0, 1].
+        If an array has the wrong number of dimensions or entries that are not finite, the sizes
+        of the arrays disagree, or a configuration is outside [0, 1].
     """
 
     analog: np.ndarray
@@ -82,25 +84,14 @@ class Codebook:
 
     @functools.cached_property
     def id(self) -> str:
-        """Hash of the content: ``cb``, so that YAML takes it for no number, and 16 hex digits."""
+        """Hash of the content: 16 hex digits after ``cb``, so that YAML never parses a number."""
         digest = hashlib.sha256(repr(self.shape).encode())
         digest.update(self.analog.astype('<f8').tobytes())
         digest.update(self.digital.astype('<c16').tobytes())
         return f'cb{digest.hexdigest()[:16]}'
 
     def check(self, scenario: Scenario) -> None:
-        """Check that the codebook fits a scenario.
-
-        Parameters
-        ----------
-        scenario
-            The scenario.
-
-        Raises
-        ------
-        CodebookError
-            If a size differs or a frame's power is not P_max.
-        """
+        """Raise CodebookError if a size, or the power of a frame, differs from the scenario's."""
         try:
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
             check_shape('digital', self.digital, 'N_B N_SB F K', scenario)
@@ -114,13 +105,7 @@ class Codebook:
                 f'{scenario.max_power_w:g} W')
 
     def to_parameters(self) -> dict[str, Any]:
-        """Return the codebook as ROS parameters.
-
-        Returns
-        -------
-        dict
-            Values by names that begin with ``codebook.``: plain strings, floats and lists.
-        """
+        """Return ROS parameters by name, ``codebook.*``: plain strings, floats and lists."""
         return {
             'codebook.id': self.id,
             'codebook.shape': list(self.shape),
@@ -133,34 +118,15 @@ class Codebook:
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
-        """Make a codebook from the parameters that `to_parameters` returns.
+        """Create a codebook from the parameters that `to_parameters` returns.
 
-        Parameters
-        ----------
-        parameters
-            Values by name. ``codebook.id`` may be empty or missing; if given it must match.
-
-        Returns
-        -------
-        Codebook
-            The codebook.
+        ``codebook.id`` may be empty or missing.
 
         Raises
         ------
         CodebookError
-            If a parameter is missing or malformed, or the id is not that of the content.
+            If a parameter is missing or malformed, or the id does not match the content.
         """
-        def array(name: str, expected: tuple[int, ...]) -> np.ndarray:
-            try:
-                values = np.asarray(parameters.get(f'codebook.{name}', ()), dtype=float)
-            except (TypeError, ValueError) as error:
-                raise CodebookError(f'codebook.{name}: {error}, expected numbers') from None
-            if values.size != math.prod(expected):
-                raise CodebookError(
-                    f'codebook.{name}: {values.size} values, expected {math.prod(expected)} = '
-                    f'{" x ".join(map(str, expected))} by codebook.shape')
-            return values.reshape(expected)
-
         shape = parameters.get('codebook.shape')
         if not isinstance(shape, Sequence) or len(shape) != 5 or not all(
                 isinstance(size, int) and size > 0 for size in shape):
@@ -168,33 +134,27 @@ class Codebook:
                 f'codebook.shape: {shape!r}, expected [N_B, N_SB, F, K, N_E], all positive')
         n_bands, n_subbands, n_frames, n_feeds, n_elements = shape
         digital_shape = (n_bands, n_subbands, n_frames, n_feeds)
-        real, imag = array('digital_re', digital_shape), array('digital_im', digital_shape)
+        # Compares the sizes before memory is allocated for a shape that may be absurdly large.
+        real = _array(parameters, 'digital_re', digital_shape)
+        imag = _array(parameters, 'digital_im', digital_shape)
         digital = np.empty(digital_shape, complex)
         digital.real, digital.imag = real, imag
         average = parameters.get('codebook.average_crlb', math.nan)
         if not isinstance(average, int | float):
             raise CodebookError(f'codebook.average_crlb: {average!r}, expected a number')
         codebook = cls(
-            array('analog', (n_bands, n_frames, n_elements)), digital, float(average),
-            str(parameters.get('codebook.provenance', '')))
-        wanted = parameters.get('codebook.id', '')
-        if wanted and wanted != codebook.id:
+            _array(parameters, 'analog', (n_bands, n_frames, n_elements)), digital,
+            float(average), str(parameters.get('codebook.provenance', '')))
+        claimed_id = parameters.get('codebook.id', '')
+        if claimed_id and claimed_id != codebook.id:
             raise CodebookError(
-                f'codebook.id: {wanted!r}, expected {codebook.id!r}, the hash of the content')
+                f'codebook.id: {claimed_id!r}, expected {codebook.id!r}, the hash of the content')
         return codebook
 
     def save(self, path: str | Path) -> None:
-        """Write the codebook as a ROS 2 parameter file; an old file is replaced at the end.
+        """Write the codebook as a ROS 2 parameter file, replacing an old one atomically.
 
-        Parameters
-        ----------
-        path
-            The file.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written; the old one is kept.
+        Raise OSError if the file cannot be written; an old one is then kept.
         """
         values = {name.partition('.')[2]: value for name, value in self.to_parameters().items()}
         content = {PARAMETER_NODE: {'ros__parameters': {'codebook': values}}}
@@ -205,24 +165,14 @@ class Codebook:
     def load(cls, path: str | Path) -> 'Codebook':
         """Read a codebook from a ROS 2 parameter file.
 
-        Parameters
-        ----------
-        path
-            The file.
-
-        Returns
-        -------
-        Codebook
-            The codebook.
-
         Raises
         ------
         CodebookError
-            If the file cannot be read or holds no valid codebook.
+            If the file cannot be read or contains no valid codebook.
         """
         try:
             content = yaml.load(Path(path).read_text(encoding='utf-8'), _YAML_LOADER)
-        # YAML's own errors, and what it raises for bytes and dates that are none.
+        # PyYAML raises ValueError for invalid UTF-8 and impossible dates.
         except (OSError, ValueError, yaml.YAMLError) as error:
             reason = ' '.join(str(error).split())
             raise CodebookError(f'{path}: cannot be read: {reason}') from error
@@ -237,5 +187,14 @@ class Codebook:
         raise CodebookError(f'{path}: expected ros__parameters with a mapping named codebook')
 
 
-# The loader in C reads a codebook ten times faster; it is not in every build of PyYAML.
-_YAML_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a parameter's list as a float64 array of a shape, or raise CodebookError."""
+    try:
+        values = np.asarray(parameters.get(f'codebook.{name}', ()), dtype=float)
+    except (TypeError, ValueError) as error:
+        raise CodebookError(f'codebook.{name}: {error}, expected numbers') from None
+    if values.size != math.prod(shape):
+        raise CodebookError(
+            f'codebook.{name}: {values.size} values, expected {math.prod(shape)} = '
+            f'{" x ".join(map(str, shape))} by codebook.shape')
+    return values.reshape(shape)

@@ -1,9 +1,8 @@
-"""The optimiser as a command: options, progress, files."""
+"""The optimiser as a command: options, progress and files."""
 
 import argparse
 import contextlib
 import dataclasses
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -16,79 +15,70 @@ from rhs_isac_ros.codebook.optimize import (
     DEFAULT_POSITIONS,
     INTERRUPTED,
     METHODS,
-    STARTS,
     OptimizeResult,
     optimize,
 )
 from rhs_isac_ros.codebook.plot import draw_optimisation
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import Progress
+from rhs_isac_ros.codebook.start import STARTS
 from rhs_isac_ros.model import Scenario, ScenarioError, streams
+from rhs_isac_ros.model.files import check_writable
+from rhs_isac_ros.model.optional import MissingLibraryError
 
-# Positions on which the average bound of the result is measured; none of them is a sample.
-HELD_OUT_POSITIONS = 2000
-# What goes wrong for reasons that the user can mend, and that the message tells.
 __all__ = ['ERRORS', 'HELD_OUT_POSITIONS', 'INTERRUPTED', 'add_options', 'run']
-ERRORS = (ScenarioError, CodebookError, ValueError, OSError)
+# Positions for the average bound of the result, drawn independently of the samples.
+HELD_OUT_POSITIONS = 2000
+# Errors that the user can correct; their messages say how.
+ERRORS = (ScenarioError, CodebookError, MissingLibraryError, ValueError, OSError)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of an optimisation to a parser.
-
-    Parameters
-    ----------
-    parser
-        The parser.
-    """
+    """Add the options of an optimisation to a parser."""
     add = parser.add_argument
     add('--output', type=Path, default=Path('codebook.yaml'),
-        help='file to write; it is replaced at the end')
+        help='file to write; an old one is replaced at the end')
     add('--scenario', type=Path,
-        help="YAML file of the scenario; the paper's Table I if none is given")
+        help="YAML file of the scenario; the paper's Table I if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES), default='crlb',
-        help='the average bound, or confusions over distances that a bound does not see')
+        help='the average bound, or the ambiguity between distant positions, which a local '
+             'bound ignores')
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
-        help='how to sample the region of interest')
-    add('--positions', type=int, default=DEFAULT_POSITIONS, help='how many samples')
-    add('--steps', type=int, help="limit of update steps (default: the method's)")
-    add('--evaluations', type=int, help='limit of evaluations (default: none)')
-    add('--seed', type=int, default=0, help='seeds samples, start and method')
-    add('--start', help=f'{" or ".join(STARTS)} (default: random), or a codebook file')
+        help='how the region of interest is sampled')
+    add('--positions', type=int, default=DEFAULT_POSITIONS, help='number of samples')
+    add('--steps', type=int, help="limit of update steps; the method's own if omitted")
+    add('--evaluations', type=int, help='limit of evaluations; none if omitted')
+    add('--seed', type=int, default=0, help='seed of the samples, the start and the method')
+    add('--start', help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
     add('--resume', action='store_true',
-        help='go on from OUTPUT.part, which a stopped run leaves, or from OUTPUT')
-    add('--plot', type=Path, help='picture to draw: convergence, bound and beam patterns')
+        help='continue from OUTPUT.part, which an unfinished run leaves, or from OUTPUT')
+    add('--plot', type=Path, help='picture to draw, with convergence, bound and beam patterns')
     add('--quiet', action='store_true', help='show no progress')
 
 
 def run(options: argparse.Namespace) -> tuple[Codebook, str]:
-    """Optimise as the options say, write the file, and say so.
+    """Optimise according to the options of `add_options`, write the file and print a summary.
 
-    Ctrl-C ends the search; what is written then is the best codebook so far.
-
-    Parameters
-    ----------
-    options
-        What a parser with `add_options` returns.
+    Ctrl-C ends the search; the best codebook found so far is then written.
 
     Returns
     -------
     codebook : Codebook
-        The codebook that was written.
+        The codebook in the file.
     reason : str
         Why the search stopped.
 
     Raises
     ------
-    ScenarioError, CodebookError, ValueError, OSError
-        If an option or a file is wrong; what was at the place of the output is still there.
+    ScenarioError, CodebookError, MissingLibraryError, ValueError, OSError
+        If an option or a file is invalid, or a library is missing; an old output file is kept.
     """
     output, partial = options.output, options.output.with_name(options.output.name + '.part')
     for path in filter(None, (output, options.plot)):
-        if not os.access(path.parent, os.W_OK):
-            raise OSError(f'{path}: expected a file in a directory that can be written')
+        check_writable(path)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
-    with _bar(options) as show:
+    with _progress_bar(options) as show:
         result = optimize(
             scenario, method=options.method, objective=options.objective,
             sampling=options.sampling, n_positions=options.positions, seed=options.seed,
@@ -96,7 +86,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
             resume=Codebook.load(partial if partial.exists() else output)
             if options.resume else None,
             max_steps=options.steps, max_evaluations=options.evaluations, progress=show,
-            keep=lambda result: _keep(result, partial))
+            keep=lambda result: _save_partial(result, partial))
     held_out = scenario.sample_positions(
         HELD_OUT_POSITIONS, streams.generator(options.seed, streams.HELD_OUT))
     bounds = crlb(scenario, result.codebook, held_out)
@@ -119,8 +109,8 @@ def _start(name: str | None, scenario: Scenario, seed: int) -> Codebook | None:
     return Codebook.load(name)
 
 
-def _keep(result: OptimizeResult, partial: Path) -> None:
-    """Write what there is so far; a full disk now may have room at the end."""
+def _save_partial(result: OptimizeResult, partial: Path) -> None:
+    """Save an unfinished result; on failure only warn, as the final write may still succeed."""
     try:
         result.codebook.save(partial)
     except OSError as error:
@@ -128,7 +118,7 @@ def _keep(result: OptimizeResult, partial: Path) -> None:
 
 
 def _save(codebook: Codebook, output: Path) -> None:
-    """Write the result, elsewhere if its place does not take it: it may have cost hours."""
+    """Save the result, which may have taken hours; on failure, in a temporary directory."""
     try:
         codebook.save(output)
     except OSError as error:
@@ -138,15 +128,15 @@ def _save(codebook: Codebook, output: Path) -> None:
 
 
 @contextlib.contextmanager
-def _bar(options: argparse.Namespace) -> Iterator[Callable[[Progress], None] | None]:
-    """Function that shows progress: a bar with value, step and time left."""
+def _progress_bar(options: argparse.Namespace) -> Iterator[Callable[[Progress], None] | None]:
+    """Provide a callback that shows a bar with objective, step and time left."""
     if options.quiet:
         yield None
         return
     try:
         from tqdm import tqdm
     except ImportError:
-        yield _print
+        yield _print_progress
         return
     total = options.steps or METHODS[options.method].steps
     with tqdm(total=total, unit='step', disable=None if sys.stderr.isatty() else False,
@@ -157,7 +147,7 @@ def _bar(options: argparse.Namespace) -> Iterator[Callable[[Progress], None] | N
         yield show
 
 
-def _print(progress: Progress) -> None:
+def _print_progress(progress: Progress) -> None:
     if progress.step % 50 == 0:
         print(f'step {progress.step}: {progress.value_m2:.5f} m^2 after '
               f'{progress.elapsed_s:.0f} s', file=sys.stderr)

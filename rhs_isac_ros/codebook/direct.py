@@ -1,4 +1,4 @@
-"""A benchmark of the paper: the interior point method on both variables at once."""
+"""A benchmark of the paper: the interior point method on all variables at once."""
 
 import numpy as np
 
@@ -7,18 +7,7 @@ from rhs_isac_ros.codebook.search import Search
 
 
 def minimize_direct(search: Search) -> str:
-    """Minimise over analog and digital beamforming together.
-
-    Parameters
-    ----------
-    search
-        What to minimise.
-
-    Returns
-    -------
-    str
-        Why the method stopped.
-    """
+    """Minimise over analog and digital beamforming jointly; return the reason for stopping."""
     minimize_interior_point(
         search, search.start, np.ones(len(search.start), bool), search.max_steps)
     return f'{search.max_steps} steps at most'

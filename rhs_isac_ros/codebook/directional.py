@@ -1,4 +1,4 @@
-"""Focused beams that scan the region of interest: a benchmark of the paper."""
+"""A benchmark of the paper: focused beams that scan the region of interest."""
 
 import numpy as np
 
@@ -12,29 +12,17 @@ def directional_codebook(
         scenario: Scenario, rng: np.random.Generator | None = None) -> Codebook:
     """Focus each of the N_B F frames on a point of its own: the paper's `Directional`.
 
-    The points lie side by side across the middle of the region of interest; bands and frames take
-    turns, so that each band scans the whole width. Every other frame of a band looks above the
-    middle, and the ones between below: beams that are all symmetric in height could not tell up
-    from down. The configuration follows the
-    holographic principle; the weights of each sub-band are the matched filter of what then
-    arrives at the feeds, with the same power in all sub-bands.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    rng
-        Not needed: nothing is random.
-
-    Returns
-    -------
-    Codebook
-        The codebook.
+    The focal points are spread across the width of the region of interest. Consecutive points
+    belong to different bands, so that each band scans the whole width. Frames alternate between
+    points below and above mid-height: beams that were all symmetric in height could not
+    distinguish up from down. The configuration follows the holographic principle. The weights of
+    each sub-band are the matched filter of the resulting feed signals, with equal power in all
+    sub-bands. The codebook is deterministic; `rng` is unused.
 
     Raises
     ------
     ValueError
-        If a gain pattern of the scenario is blind where a beam is to focus.
+        If a gain pattern of the scenario is zero at a focal point.
     """
     sizes = scenario.sizes
     analog = np.empty([sizes[s] for s in ('N_B', 'F', 'N_E')])
@@ -47,7 +35,7 @@ def directional_codebook(
             if not los.any():
                 raise ValueError(
                     f'element_gain, user_gain: no gain at {points[frame, band].tolist()} m, '
-                    f'expected some where frame {frame} of band {band} is to focus')
+                    f'expected a positive one at the focal point of frame {frame}, band {band}')
             digital[band, :, frame] = np.conj(feeds) / np.linalg.norm(
                 feeds, axis=1, keepdims=True)
     return Codebook(analog, digital * np.sqrt(scenario.max_power_w / sizes['N_SB']),
@@ -55,23 +43,12 @@ def directional_codebook(
 
 
 def focal_points(scenario: Scenario) -> np.ndarray:
-    """Where the beams focus.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    numpy.ndarray
-        Points, float64 [F, N_B, 3] [m].
-    """
+    """Return the focal points of the beams, float64 [F, N_B, 3] [m]."""
     n_frames, n_bands = scenario.n_frames, scenario.n_bands
     low, high = scenario.roi_bounds_m
     points = np.tile((low + high) / 2, (n_frames, n_bands, 1))
-    places = (np.arange(n_frames * n_bands) + 0.5) / (n_frames * n_bands)
-    points[..., 1] = (low[1] + (high[1] - low[1]) * places).reshape(n_frames, n_bands)
+    fractions = (np.arange(n_frames * n_bands) + 0.5) / (n_frames * n_bands)
+    points[..., 1] = (low[1] + (high[1] - low[1]) * fractions).reshape(n_frames, n_bands)
     points[..., 2] = low[2] + (high[2] - low[2]) * np.where(
         np.arange(n_frames) % 2, 0.75, 0.25)[:, None]
     return points

@@ -3,62 +3,31 @@
 import numpy as np
 
 from rhs_isac_ros.codebook.search import Search
+from rhs_isac_ros.model.optional import optional_import
 
-# As in the standard implementation that the paper takes: for more than five variables.
+# The default of the implementation that the paper uses, for more than five variables.
 _POPULATION = 200
 
 
 def minimize_genetic(search: Search) -> str:
-    """Minimise by pymoo's genetic algorithm; a step is a generation.
+    """Minimise with pymoo's genetic algorithm, one step a generation.
 
-    Combining vectors count by their direction only, so their unscaled parts are searched from
-    -1 to 1. The start is a member of the first generation.
-
-    Parameters
-    ----------
-    search
-        What to minimise.
-
-    Returns
-    -------
-    str
-        Why the method stopped.
-
-    Raises
-    ------
-    ValueError
-        If pymoo is not installed.
+    Only the direction of a combining vector matters, so its unscaled parts are searched in
+    [-1, 1]. The first generation contains the start. Returns the reason for stopping; raises
+    MissingLibraryError if pymoo is not installed.
     """
-    try:
+    with optional_import("method: 'genetic'", extra='genetic'):
         from pymoo.algorithms.soo.nonconvex.ga import GA
-        from pymoo.core.callback import Callback
-        from pymoo.core.problem import ElementwiseProblem
         from pymoo.optimize import minimize
-    except ImportError:
-        raise ValueError(
-            "method: 'genetic' needs pymoo, which is not installed (pip install pymoo)") from None
+        from pymoo.problems.functional import FunctionalProblem
 
-    class Whole(ElementwiseProblem):
-        """The objective as pymoo wants it."""
-
-        def __init__(self) -> None:
-            low = np.where(np.arange(len(search.start)) < search.n_analog, 0.0, -1.0)
-            super().__init__(n_var=len(search.start), n_obj=1, xl=low, xu=1.0)
-
-        def _evaluate(self, x: np.ndarray, out: dict, *args: object, **kwargs: object) -> None:
-            out['F'] = search.value(x)
-
-    class Generation(Callback):
-        """Counts a generation as a step."""
-
-        def notify(self, algorithm: object) -> None:
-            search.on_step()
-
-    problem = Whole()
+    n_variables = len(search.start)
+    low = np.where(np.arange(n_variables) < search.n_analog, 0.0, -1.0)
+    problem = FunctionalProblem(n_variables, search.value, xl=low, xu=1.0)
     first = problem.xl + (problem.xu - problem.xl) * search.rng.uniform(
-        size=(_POPULATION, problem.n_var))
+        size=(_POPULATION, n_variables))
     first[0] = np.clip(search.start, problem.xl, problem.xu)
     seed = int(search.rng.integers(2**31))
     minimize(problem, GA(pop_size=_POPULATION, sampling=first), ('n_gen', search.max_steps),
-             callback=Generation(), seed=seed)
+             callback=lambda _: search.on_step(), seed=seed)
     return f'{search.max_steps} generations'

@@ -1,4 +1,4 @@
-"""The interior point method of the paper, on some of the variables."""
+"""The interior point method of the paper, on a subset of the variables."""
 
 import warnings
 
@@ -6,69 +6,65 @@ import numpy as np
 
 from rhs_isac_ros.codebook.search import Search
 
-# Weight of the barrier at the start; the objective there is 1.
+# Initial weight of the barrier; the objective is scaled to 1 at the start.
 _BARRIER = 1e-3
-_SMALLEST_STEP = 1e-9
+_MIN_STEP = 1e-9
 
 
 def minimize_interior_point(
-        search: Search, start: np.ndarray, chosen: np.ndarray, max_steps: int) -> np.ndarray:
-    """Minimise over chosen variables: barrier, trust region, conjugate gradients, BFGS Hessian.
+        search: Search, start: np.ndarray, free: np.ndarray, max_steps: int) -> np.ndarray:
+    """Minimise over the free variables: barrier, trust region, conjugate gradients, BFGS Hessian.
 
     SciPy's `trust-constr` is the algorithm of Byrd, Hribar and Nocedal that the paper cites.
 
     Parameters
     ----------
-    search
-        What to minimise.
     start
-        Values of all variables, float64 [n].
-    chosen
-        Which of them to change, bool [n].
-    max_steps
-        Limit of update steps.
+        Initial values of all variables, float64 [n].
+    free
+        Mask of the variables to change, bool [n].
 
     Returns
     -------
     numpy.ndarray
-        Float64 [n]: the best values that were met, `start` included.
+        The best point evaluated, `start` included, float64 [n].
     """
-    # Here: a slow import, and most that use a codebook do not optimise one.
-    from scipy.optimize import BFGS, Bounds, minimize
+    # A slow import, which loading a codebook does not need.
+    from scipy.optimize import BFGS, Bounds, OptimizeResult, minimize
 
     best = search.value_and_gradient(start)[0], np.array(start)
     scale = best[0]
 
-    def function(values: np.ndarray) -> tuple[float, np.ndarray]:
+    def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal best
         variables = np.array(start)
-        variables[chosen] = values
+        variables[free] = values
         value, gradient = search.value_and_gradient(variables)
         if value < best[0]:
             best = value, variables
-        return value / scale, gradient[chosen] / scale
+        return value / scale, gradient[free] / scale
 
     steps = evaluations = 0
 
-    def on_iteration(_: np.ndarray, state: object) -> bool:
-        """Count iterations that moved; SciPy also reports its start and each new barrier."""
+    def on_iteration(_: np.ndarray, state: OptimizeResult) -> bool:
+        """Count the iterations that moved; SciPy also reports the start and each new barrier."""
         nonlocal steps, evaluations
         if steps < max_steps and state.nfev > max(evaluations, 1):
             steps, evaluations = steps + 1, state.nfev
             search.on_step()
         return steps >= max_steps
 
-    low, high = np.array(search.bounds, dtype=float).T[:, chosen]
+    low, high = np.array(search.bounds, dtype=float).T[:, free]
     bounded = not np.isnan(low).all()
     bounds = Bounds(np.nan_to_num(low, nan=-np.inf), np.nan_to_num(high, nan=np.inf))
     with warnings.catch_warnings():
-        # A step that changes nothing leaves the Hessian as it is; SciPy says so each time.
+        # SciPy warns whenever a step leaves the gradient, and so the Hessian, unchanged.
         warnings.filterwarnings('ignore', 'delta_grad == 0.0', UserWarning)
         minimize(
-            function, start[chosen], jac=True, hess=BFGS(), method='trust-constr',
+            objective, start[free], jac=True, hess=BFGS(), method='trust-constr',
             bounds=bounds if bounded else None,
             callback=on_iteration,
             options={'maxiter': 2 * max_steps + 50, 'initial_barrier_parameter': _BARRIER,
                      'initial_barrier_tolerance': _BARRIER, 'sparse_jacobian': True,
-                     'gtol': 1e-10, 'xtol': _SMALLEST_STEP})
+                     'gtol': 1e-10, 'xtol': _MIN_STEP})
     return best[1]

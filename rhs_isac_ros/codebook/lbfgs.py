@@ -1,25 +1,14 @@
-"""Bound-constrained quasi-Newton over both variables at once."""
+"""Bound-constrained quasi-Newton optimisation of all variables at once."""
 
 from rhs_isac_ros.codebook.search import Search
 
-# Corrections that approximate the Hessian; more pay off here, an evaluation being dear.
+# Corrections that approximate the Hessian. An evaluation is expensive, so more of them pay off.
 _MEMORY = 30
 
 
 def minimize_lbfgs(search: Search) -> str:
-    """Minimise by L-BFGS-B.
-
-    Parameters
-    ----------
-    search
-        What to minimise, from where, and for how long.
-
-    Returns
-    -------
-    str
-        Why the method stopped.
-    """
-    # Here: a slow import, and most that use a codebook do not optimise one.
+    """Minimise with L-BFGS-B; return the reason for stopping."""
+    # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
 
     result = minimize(

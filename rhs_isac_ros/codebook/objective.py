@@ -1,4 +1,4 @@
-"""What a codebook can be optimised for."""
+"""Objectives of the codebook optimisation."""
 
 from collections.abc import Callable, Mapping
 
@@ -9,65 +9,33 @@ from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.codebook.sampling import confusable
 from rhs_isac_ros.model import Scenario
 
-# Relative error of the rows of an objective: the value then errs by less than a thousandth, far
-# less than the sampling does, and gradients belong to that value.
+# Relative error of an objective's rows. The error of its value is then below 0.1 %, far less than
+# the sampling error, and the gradient is exact for that value.
 ROW_TOLERANCE = 3e-5
-# Confusable positions for each sampled one: rare close pairs make most of the mean.
-_PAIRS_A_POSITION = 128
+# Confusable positions for each sampled one. Few, close pairs dominate the mean.
+_PAIRS_PER_POSITION = 128
 
 
 def average_bound(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
-    """Implements Eq. (17). Objective of P1 on sampled positions.
+    """Implements Eq. (17). Objective of P1 [m^2] on sampled positions, float64 [N_sam, 3] [m].
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    positions
-        Samples of the user's position, float64 [N_sam, 3] [m].
-    rng
-        Not needed here.
-
-    Returns
-    -------
-    Average
-        A function of the codebook: value [m^2] and gradients.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is empty or not a finite [N, 3] array.
+    Raise ValueError if `positions` is empty or not a finite [N, 3] array. `rng` is unused.
     """
     return AverageCrlb(scenario, positions, ROW_TOLERANCE)
 
 
 def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
-    """Mean confusion of sampled positions with others that look alike.
+    """Objective [m^2]: mean cost of confusing sampled positions with similar-looking ones.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    positions
-        Samples of the user's position, float64 [N_sam, 3] [m].
-    rng
-        Draws the others.
-
-    Returns
-    -------
-    Average
-        A function of the codebook: value [m^2] and gradients.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is empty or not a finite [N, 3] array.
+    The positions are float64 [N_sam, 3] [m]; `rng` draws those that they may be confused with.
+    Raise ValueError if `positions` is empty or not a finite [N, 3] array.
     """
-    firsts = np.repeat(positions, _PAIRS_A_POSITION, axis=0)
+    firsts = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
     return PairwiseErrorCost(
         scenario, firsts, confusable(scenario, firsts, rng), tolerance=ROW_TOLERANCE)
 
 
-OBJECTIVES: Mapping[str, Callable] = {'ambiguity': ambiguity, 'crlb': average_bound}
+OBJECTIVES: Mapping[str, Callable[[Scenario, np.ndarray, np.random.Generator], Average]] = {
+    'ambiguity': ambiguity, 'crlb': average_bound}

@@ -1,4 +1,4 @@
-"""The one entry to all optimisers, with what they share: sampling, start, loop and provenance."""
+"""Optimisation of a codebook by any method: sampling, start, limits and provenance."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -10,7 +10,6 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook.alternating import minimize_alternating
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.direct import minimize_direct
-from rhs_isac_ros.codebook.directional import directional_codebook
 from rhs_isac_ros.codebook.genetic import minimize_genetic
 from rhs_isac_ros.codebook.lbfgs import minimize_lbfgs
 from rhs_isac_ros.codebook.objective import OBJECTIVES
@@ -18,34 +17,27 @@ from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.codebook.provenance import Provenance
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import BudgetSpent, Progress, Search
-from rhs_isac_ros.codebook.start import random_codebook
+from rhs_isac_ros.codebook.start import STARTS, random_codebook
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.los import checked_positions
 
-# Of Sobol; these give what 1200 independent ones do.
+# Sobol points; as good as 1200 independent positions.
 DEFAULT_POSITIONS = 256
-# Why a search stopped that Ctrl-C ended.
+# Reason for stopping after Ctrl-C.
 INTERRUPTED = 'interrupted'
 
 
 class Method(NamedTuple):
-    """A way to optimise.
+    """An optimisation method with its default limit of update steps.
 
-    Attributes
-    ----------
-    minimize
-        Takes a `Search` and returns why it stopped; None if the start is the result.
-    steps
-        Default limit of update steps.
+    `minimize` takes a `Search` and returns the reason for stopping; it is None if the start is
+    the result.
     """
 
     minimize: Callable[[Search], str] | None
     steps: int
 
 
-# Codebooks that need no optimisation: the methods start from the first one.
-STARTS: Mapping[str, Callable] = {
-    'random': random_codebook, 'directional': directional_codebook}
 METHODS: Mapping[str, Method] = {
     'alternating': Method(minimize_alternating, 400),
     'direct': Method(minimize_direct, 400),
@@ -63,11 +55,11 @@ class OptimizeResult:
     Attributes
     ----------
     codebook
-        The best codebook met; its `average_crlb_m2` is over the sampled positions.
+        The best codebook evaluated; its `average_crlb_m2` is over the sampled positions.
     history
-        Progress after each step, the start being step 0.
+        Progress after each step; step 0 is the start.
     reason
-        Why it stopped.
+        Why the search stopped.
     """
 
     codebook: Codebook
@@ -82,52 +74,46 @@ def optimize(
         max_steps: int | None = None, max_evaluations: int | None = None,
         progress: Callable[[Progress], None] | None = None,
         keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
-    """Find a codebook that locates users well.
+    """Find a codebook that minimises an objective.
 
-    KeyboardInterrupt ends the search, and the best codebook so far is the result.
+    On KeyboardInterrupt, the search ends and the best codebook so far is returned.
 
     Parameters
     ----------
-    scenario
-        The scenario.
     positions
         Samples of the user's position, float64 [N_sam, 3] [m]; by default drawn by `sampling`.
     method
         One of `METHODS`.
     objective
-        One of `OBJECTIVES`: ``crlb``, the average bound, or ``ambiguity``, which counts
-        confusions over distances that a local bound does not see.
+        One of `OBJECTIVES`: ``crlb``, the average bound, or ``ambiguity``, which penalises
+        confusion between distant positions, which a local bound ignores.
     sampling
         One of `SAMPLINGS`: ``sobol``, or ``monte_carlo`` as in the paper.
     n_positions
-        How many samples to draw if none are given.
+        Number of samples if `positions` is not given.
     seed
-        Seeds the samples, the start and the method.
+        Seed of the samples, the start and the method.
     start
         Codebook to start from; by default the paper's, with random configurations.
     resume
-        Result of an earlier call with the same arguments, to go on from: its steps and
-        evaluations count.
+        Result of an earlier call with the same arguments, to continue from; its steps and
+        evaluations count towards the limits.
     max_steps
-        Limit of update steps; by default the method's.
+        Limit of update steps; by default that of the method.
     max_evaluations
         Limit of evaluations of the objective; by default none.
     progress
         Called after each step.
     keep
-        Called now and then with the result so far.
-
-    Returns
-    -------
-    OptimizeResult
-        The best codebook, the history and why the search stopped.
+        Called at most every ten seconds with the result so far.
 
     Raises
     ------
     ValueError
         If a name is unknown, a number or the positions are out of range, `resume` was made with
-        other arguments, the method needs a library that is missing, or no signals determine the
-        positions.
+        other arguments, or the signals do not determine the positions.
+    MissingLibraryError
+        If the method needs a library that is not installed.
     CodebookError
         If `start` does not fit the scenario.
     """
@@ -135,9 +121,10 @@ def optimize(
                                ('sampling', sampling, SAMPLINGS)):
         if value not in known:
             raise ValueError(f'{name}: {value!r}, expected one of {sorted(known)}')
-    limits = {'n_positions': n_positions, 'max_evaluations': max_evaluations,
-              'max_steps': METHODS[method].steps or 1 if max_steps is None else max_steps}
-    for name, limit in limits.items():
+    if max_steps is None:
+        max_steps = METHODS[method].steps or 1
+    for name, limit in (('n_positions', n_positions), ('max_evaluations', max_evaluations),
+                        ('max_steps', max_steps)):
         if limit is not None and limit < 1:
             raise ValueError(f'{name}: {limit}, expected at least 1')
     if positions is None:
@@ -147,10 +134,10 @@ def optimize(
         positions, sampling = checked_positions(positions), 'given'
         if not len(positions):
             raise ValueError('positions: none, expected at least one')
-    made = Provenance(
+    provenance = Provenance(
         method=method, objective=objective, seed=int(seed), sampling=sampling,
         positions=len(positions), scenario=scenario.changes())
-    done = made.resumed(resume) if resume else made
+    done = provenance.resumed(resume) if resume else provenance
     first = resume or start or STARTS.get(method, random_codebook)(
         scenario, streams.generator(seed, streams.START))
     first.check(scenario)
@@ -160,15 +147,15 @@ def optimize(
     def result(reason: str) -> OptimizeResult:
         best = problem.unpack(search.best)
         bound = float(crlb(scenario, best, positions).mean())
-        text = made.of_result(search.history[-1], reason)
+        text = provenance.of_result(search.history[-1], reason)
         return OptimizeResult(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
             tuple(search.history), reason)
 
     search = Search(
-        problem, problem.pack(first), limits['max_steps'], max_evaluations,
+        problem, problem.pack(first), max_steps, max_evaluations,
         streams.generator(seed, streams.METHOD),
-        _Keeper(progress, lambda: keep(result('not finished'))) if keep else progress,
+        _PeriodicCall(progress, lambda: keep(result('not finished'))) if keep else progress,
         (done.steps, done.evaluations))
     return result(_run(search, METHODS[method].minimize))
 
@@ -192,18 +179,18 @@ def _run(search: Search, minimize: Callable[[Search], str] | None) -> str:
         return INTERRUPTED
 
 
-class _Keeper:
-    """Calls a function after steps, at most so often that it takes little of the time."""
+class _PeriodicCall:
+    """Progress callback that also calls `keep`, but at most once a period."""
 
     _PERIOD_S = 10.0
 
     def __init__(self, progress: Callable[[Progress], None] | None,
                  keep: Callable[[], None]) -> None:
-        self._progress, self._keep, self._kept_s = progress, keep, 0.0
+        self._progress, self._keep, self._last_s = progress, keep, 0.0
 
     def __call__(self, entry: Progress) -> None:
         if self._progress:
             self._progress(entry)
-        if entry.elapsed_s >= self._kept_s + self._PERIOD_S:
-            self._kept_s = entry.elapsed_s
+        if entry.elapsed_s >= self._last_s + self._PERIOD_S:
+            self._last_s = entry.elapsed_s
             self._keep()

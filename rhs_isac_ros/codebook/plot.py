@@ -1,4 +1,4 @@
-"""A picture of an optimisation and of the codebook that it found."""
+"""A picture of an optimisation and of the resulting codebook."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,10 +11,12 @@ from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.model.surface import radiation_matrix
 
-_ROI_POINTS = 60
-_ANGLES = 361
+# Points of the map of the bound along each axis, and of a beam over azimuth.
+_N_MAP_POINTS = 60
+_N_AZIMUTHS = 361
 
 
 def draw_optimisation(
@@ -22,32 +24,23 @@ def draw_optimisation(
         path: str | Path) -> None:
     """Draw convergence, the bound over the region of interest, and the beam patterns.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        The codebook.
-    history
-        Progress of the optimisation.
-    path
-        The picture; its ending tells the format.
+    The suffix of `path` determines the file format.
 
     Raises
     ------
+    MissingLibraryError
+        If matplotlib is not installed.
     ValueError
-        If matplotlib is not installed, or does not know the format.
+        If matplotlib does not support the file format.
     OSError
         If the file cannot be written.
     """
-    try:
+    with optional_import('plot', extra='plot'):
         from matplotlib.figure import Figure
-    except ImportError:
-        raise ValueError(
-            'plot: needs matplotlib, which is not installed (pip install matplotlib)') from None
+
     rows = -(-scenario.n_bands // 3)
     figure = Figure(figsize=(11, 4.2 + 3 * rows), layout='constrained')
-    above, below = figure.subfigures(2, 1, height_ratios=(4.2, 3 * rows))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(4.2, 3 * rows))[:, 0]
     left, right = above.subplots(1, 2)
     _draw_convergence(left, history)
     _draw_bound(right, scenario, codebook)
@@ -61,33 +54,20 @@ def draw_optimisation(
 
 def beam_powers(
         scenario: Scenario, codebook: Codebook, band: int) -> tuple[np.ndarray, np.ndarray]:
-    """Power of every frame's beam over azimuth, in the middle sub-band.
+    """Return the power of every frame's beam over azimuth, in the middle sub-band of a band.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        The codebook.
-    band
-        Index of the band, from 0.
-
-    Returns
-    -------
-    azimuths : numpy.ndarray
-        Float64 [361] [rad], at the height and distance of the centre of the region of interest.
-    powers : numpy.ndarray
-        Received power for a user there, float64 [F, 361] [W].
+    The azimuths are float64 [361] [rad], at the height and distance of the centre of the region
+    of interest; the powers that a user there would receive are float64 [F, 361] [W].
     """
-    azimuths = np.linspace(-np.pi / 2, np.pi / 2, _ANGLES)
+    azimuths = np.linspace(-np.pi / 2, np.pi / 2, _N_AZIMUTHS)
     x, y, z = scenario.roi_center_m
     distance = np.hypot(x, y)
     circle = np.stack([distance * np.cos(azimuths), distance * np.sin(azimuths),
-                       np.full(_ANGLES, z)], axis=1)
+                       np.full(_N_AZIMUTHS, z)], axis=1)
     middle = scenario.n_subbands // 2
-    patterns = radiation_matrix(scenario, codebook)[band]
-    patterns = patterns.reshape(scenario.n_subbands, scenario.n_frames, -1)[middle]
-    signals = los_gain(scenario, circle, band)[:, middle] @ patterns.T
+    radiation = radiation_matrix(scenario, codebook)[band]
+    radiation = radiation.reshape(scenario.n_subbands, scenario.n_frames, -1)[middle]
+    signals = los_gain(scenario, circle, band)[:, middle] @ radiation.T
     return azimuths, np.abs(signals.T)**2
 
 
@@ -99,7 +79,7 @@ def _draw_convergence(axis: Any, history: Sequence[Progress]) -> None:
 
 def _draw_bound(axis: Any, scenario: Scenario, codebook: Codebook) -> None:
     low, high = scenario.roi_bounds_m
-    x, y = np.linspace(low[0], high[0], _ROI_POINTS), np.linspace(low[1], high[1], _ROI_POINTS)
+    x, y = np.linspace(low[0], high[0], _N_MAP_POINTS), np.linspace(low[1], high[1], _N_MAP_POINTS)
     grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), scenario.roi_center_m[2])], -1)
     bound = np.sqrt(crlb(scenario, codebook, grid.reshape(-1, 3))).reshape(len(y), len(x))
     image = axis.pcolormesh(x, y, np.where(np.isfinite(bound), bound, np.nan), shading='gouraud')

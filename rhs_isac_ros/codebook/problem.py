@@ -1,4 +1,4 @@
-"""The optimisation problem: its objective, its constraints and its variables."""
+"""The optimisation problem: objective, constraints and variables."""
 
 import numpy as np
 
@@ -10,16 +10,9 @@ from rhs_isac_ros.model import Scenario
 class Problem:
     """Implements Eq. (16). Problem P1: average bound, fixed power, configurations in [0, 1].
 
-    Solvers see one real vector, the configurations followed by the real and the imaginary parts
-    of unscaled combining vectors. Scaling these to P_max takes the power constraint out of the
-    problem; the box of the configurations stays with the solver.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    objective
-        Function of a codebook that returns value and gradients, and its `value` alone.
+    Solvers work on one real vector: the configurations, followed by the real and the imaginary
+    parts of unscaled combining vectors. Scaling these to P_max eliminates the power constraint;
+    the solver enforces the bounds of the configurations.
     """
 
     def __init__(self, scenario: Scenario, objective: Average) -> None:
@@ -32,83 +25,37 @@ class Problem:
 
     @property
     def bounds(self) -> list[tuple[float, float] | tuple[None, None]]:
-        """Bounds of every variable, in SciPy's form."""
+        """Bounds of each variable, in SciPy's format."""
         n_digital = 2 * int(np.prod(self._digital_shape))
         return [(0.0, 1.0)] * self.n_analog + [(None, None)] * n_digital
 
     def pack(self, codebook: Codebook) -> np.ndarray:
-        """Return the variables of a codebook.
-
-        Parameters
-        ----------
-        codebook
-            A codebook of the scenario.
-
-        Returns
-        -------
-        numpy.ndarray
-            Float64 [N_B F N_E + 2 N_B N_SB F K].
-        """
+        """Return the variables of a codebook, float64 [N_B F N_E + 2 N_B N_SB F K]."""
         digital = codebook.digital / np.sqrt(self.scenario.max_power_w)
         return np.concatenate(
             [codebook.analog.ravel(), digital.real.ravel(), digital.imag.ravel()])
 
     def unpack(self, variables: np.ndarray) -> Codebook:
-        """Return the codebook of some variables.
-
-        Parameters
-        ----------
-        variables
-            Float64 vector as `pack` returns it.
-
-        Returns
-        -------
-        Codebook
-            The codebook, which meets both constraints.
-        """
+        """Return the codebook of such variables; it satisfies both constraints."""
         analog, raw, norm = self._split(variables)
         return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
 
     def value(self, variables: np.ndarray) -> float:
-        """Evaluate the objective alone.
-
-        Parameters
-        ----------
-        variables
-            Float64 vector as `pack` returns it.
-
-        Returns
-        -------
-        float
-            The objective [m^2].
-        """
+        """Return the objective [m^2] for variables as `pack` returns them."""
         return self.objective.value(self.unpack(variables))
 
     def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate the objective and its gradient by the variables.
-
-        Parameters
-        ----------
-        variables
-            Float64 vector as `pack` returns it.
-
-        Returns
-        -------
-        value : float
-            The objective [m^2].
-        gradient : numpy.ndarray
-            Float64, as long as `variables`.
-        """
+        """Return the objective [m^2] and its gradient, float64, shaped like `variables`."""
         _, raw, norm = self._split(variables)
         value, by_analog, by_digital = self.objective(self.unpack(variables))
-        # d(raw / norm): what points along raw does not count.
-        along = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
-        by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * along / norm**2)
+        # d(raw / norm) has no component along raw.
+        radial = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
+        by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * radial / norm**2)
         return value, np.concatenate(
             [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
 
     def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Configurations, unscaled combining vectors, and their norm in every band and frame."""
+        """Return configurations, unscaled combining vectors, and the norm of each frame's."""
         analog = np.clip(variables[:self.n_analog], 0.0, 1.0).reshape(self._analog_shape)
         real, imag = np.split(variables[self.n_analog:], 2)
         raw = (real + 1j * imag).reshape(self._digital_shape)

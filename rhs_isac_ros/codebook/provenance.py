@@ -1,4 +1,4 @@
-"""How a codebook was made, in a form that people and programs read."""
+"""The provenance of a codebook, as text that both people and programs can read."""
 
 import dataclasses
 from typing import Any
@@ -12,22 +12,22 @@ from rhs_isac_ros.codebook.search import Progress
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """What an optimisation was asked for, and how far it came.
+    """The arguments of an optimisation and the progress it made.
 
     Attributes
     ----------
-    method, objective, seed, sampling, positions
-        Arguments of `optimize`; positions counts them.
+    positions
+        Number of positions.
     scenario
         Fields of the scenario that differ from Table I.
     version
         Version of this package.
     steps, evaluations
-        How many of them were done.
+        Totals, including those of the runs that it resumed.
     value_m2
         The objective [m^2].
     reason
-        Why it stopped.
+        Why the search stopped.
     """
 
     method: str
@@ -43,69 +43,32 @@ class Provenance:
     reason: str = ''
 
     def of_result(self, end: Progress, reason: str) -> str:
-        """Return the text for a codebook.
-
-        Parameters
-        ----------
-        end
-            The last progress.
-        reason
-            Why the optimisation stopped.
-
-        Returns
-        -------
-        str
-            One line of YAML.
-        """
-        whole = dataclasses.replace(
+        """Return one line of YAML that describes a result, for `Codebook.provenance`."""
+        result = dataclasses.replace(
             self, steps=end.step, evaluations=end.evaluations, value_m2=float(end.value_m2),
             reason=reason)
-        return yaml.safe_dump(dataclasses.asdict(whole), default_flow_style=True,
+        return yaml.safe_dump(dataclasses.asdict(result), default_flow_style=True,
                               sort_keys=False, width=10**9).strip()
 
     def resumed(self, codebook: Codebook) -> 'Provenance':
-        """Return what an earlier optimisation with the same arguments has done.
+        """Return the provenance of an earlier result, to resume it.
 
-        Parameters
-        ----------
-        codebook
-            Its result.
-
-        Returns
-        -------
-        Provenance
-            That of the codebook.
-
-        Raises
-        ------
-        ValueError
-            If the codebook is no such result.
+        Raise ValueError unless it is the result of an optimisation with the same arguments.
         """
         earlier = Provenance.parse(codebook.provenance)
         if earlier is None:
             raise ValueError(
                 f'resume: provenance {codebook.provenance!r}, expected that of an optimisation')
         for name in ('method', 'objective', 'seed', 'sampling', 'positions', 'scenario'):
-            wanted, there = getattr(self, name), getattr(earlier, name)
-            if wanted != there:
+            given, expected = getattr(self, name), getattr(earlier, name)
+            if given != expected:
                 raise ValueError(
-                    f'{name}: {wanted!r}, expected {there!r} as in the codebook to resume from')
+                    f'{name}: {given!r}, expected {expected!r} as in the codebook to resume from')
         return earlier
 
     @classmethod
     def parse(cls, text: str) -> 'Provenance | None':
-        """Read a codebook's text.
-
-        Parameters
-        ----------
-        text
-            What `of_result` returned, or anything else.
-
-        Returns
-        -------
-        Provenance or None
-            None if the text is something else.
-        """
+        """Parse the text that `of_result` returns; return None for any other text."""
         try:
             return cls(**yaml.safe_load(text))
         except (yaml.YAMLError, TypeError, ValueError, RecursionError):

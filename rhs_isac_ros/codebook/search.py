@@ -1,4 +1,4 @@
-"""What a method sees of an optimisation, and what is remembered of it."""
+"""The interface between a problem and an optimisation method: evaluation, budget and history."""
 
 import dataclasses
 import time
@@ -11,7 +11,7 @@ from rhs_isac_ros.codebook.problem import Problem
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """State of an optimisation after a step.
+    """Progress of an optimisation after a step.
 
     Attributes
     ----------
@@ -32,37 +32,35 @@ class Progress:
 
 
 class BudgetSpent(Exception):
-    """No evaluation is left; it passes through a method to who set the budget."""
+    """No evaluation is left; methods let it propagate."""
 
 
 class Search:
-    """The objective as a method sees it; remembers the best point and the history.
+    """Objective that a method minimises; counts evaluations and keeps the best point.
 
     Parameters
     ----------
-    problem
-        The problem.
     start
         First point, float64 [n].
     max_steps
-        Limit of update steps; what a step is, the method says.
+        Limit of update steps; each method defines what a step is.
     max_evaluations
         Limit of evaluations; None for no limit.
-    rng
-        Source of randomness for methods that need one.
     progress
         Called after each step.
     done
-        Steps and evaluations of an earlier search that this one goes on from; limits count them.
+        Steps and evaluations of the search that this one resumes; they count towards the limits.
 
     Attributes
     ----------
+    max_steps
+        Update steps that remain.
     value_m2
-        Lowest objective met [m^2].
+        Lowest objective evaluated [m^2].
     best
-        Where it was met, float64 [n].
+        Point with that objective, float64 [n].
     history
-        Progress after each step; the first entry is the start.
+        Progress after each step, beginning with the start.
     """
 
     def __init__(
@@ -81,17 +79,10 @@ class Search:
         self._last: tuple[np.ndarray, float, np.ndarray] | None = None
 
     def begin(self) -> float:
-        """Evaluate the start and note it; what an earlier search evaluated does not count again.
+        """Evaluate the start [m^2] and record it as the first entry of the history.
 
-        Returns
-        -------
-        float
-            The objective [m^2].
-
-        Raises
-        ------
-        BudgetSpent
-            If no evaluation is left.
+        An evaluation of the same point by an earlier search is not counted again. Raise
+        BudgetSpent if no evaluation is left.
         """
         if self._evaluations:
             self._evaluations -= 1
@@ -100,61 +91,29 @@ class Search:
         return value
 
     def finish(self) -> None:
-        """LogMessage what was reached since the last step, if there is anything."""
+        """Record a last step if there were evaluations since the previous one."""
         if self._evaluations > self.history[-1].evaluations:
             self.on_step()
 
     def value(self, variables: np.ndarray) -> float:
-        """Evaluate the objective.
-
-        Parameters
-        ----------
-        variables
-            Float64 [n].
-
-        Returns
-        -------
-        float
-            The objective [m^2].
-
-        Raises
-        ------
-        BudgetSpent
-            If no evaluation is left.
-        """
+        """Evaluate the objective [m^2] at a point, float64 [n], or raise BudgetSpent."""
         self._count()
         value = self._problem.value(variables)
-        self._remember(value, variables)
+        self._keep_best(value, variables)
         return value
 
     def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate the objective and its gradient.
-
-        Parameters
-        ----------
-        variables
-            Float64 [n].
-
-        Returns
-        -------
-        tuple
-            The objective [m^2], and its gradient, float64 [n].
-
-        Raises
-        ------
-        BudgetSpent
-            If no evaluation is left.
-        """
-        # Methods evaluate anew where the one before them, or the start, has been.
+        """Evaluate the objective [m^2] and its gradient, float64 [n], or raise BudgetSpent."""
+        # A method begins by evaluating the point at which the previous one ended.
         if self._last is None or not np.array_equal(self._last[0], variables):
             self._count()
             value, gradient = self._problem.value_and_gradient(variables)
-            self._remember(value, variables)
+            self._keep_best(value, variables)
             self._last = np.array(variables), value, gradient
         return self._last[1:]
 
     def on_step(self) -> None:
-        """LogMessage that a step is done."""
+        """Record a step; methods call this after each of theirs."""
         elapsed = time.perf_counter() - self._begin
         step = self._first_step + len(self.history)
         entry = Progress(step, self._evaluations, self.value_m2, elapsed)
@@ -167,6 +126,6 @@ class Search:
             raise BudgetSpent
         self._evaluations += 1
 
-    def _remember(self, value: float, variables: np.ndarray) -> None:
+    def _keep_best(self, value: float, variables: np.ndarray) -> None:
         if value < self.value_m2:
             self.value_m2, self.best = value, np.array(variables)

@@ -1,28 +1,25 @@
-"""Codebooks that need no optimisation."""
+"""Codebooks to start an optimisation from."""
+
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.codebook.directional import directional_codebook
 from rhs_isac_ros.model import Scenario
 
 
 def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
-    """Uniform configurations and equal combining weights: the paper's `Random` and starting point.
+    """Draw random configurations: the paper's `Random`, and where its optimisation starts.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    rng
-        Source of randomness.
-
-    Returns
-    -------
-    Codebook
-        Analog uniform in [0, 1]; digital sqrt(P_max / (K N_SB)) throughout.
+    C is uniform in [0, 1]; every entry of S is sqrt(P_max / (K N_SB)).
     """
     sizes = scenario.sizes
     analog = rng.uniform(size=(sizes['N_B'], sizes['F'], sizes['N_E']))
     weight = np.sqrt(scenario.max_power_w / (sizes['K'] * sizes['N_SB']))
     digital = np.full((sizes['N_B'], sizes['N_SB'], sizes['F'], sizes['K']), weight, complex)
     return Codebook(analog, digital, provenance='random')
+
+
+STARTS: Mapping[str, Callable[[Scenario, np.random.Generator], Codebook]] = {
+    'random': random_codebook, 'directional': directional_codebook}

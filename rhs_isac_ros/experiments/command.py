@@ -1,14 +1,15 @@
-"""What the commands of all experiments share: options, and how they end."""
+"""The command line of an experiment: common options and exit codes."""
 
 import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from rhs_isac_ros.experiments.arguments import positive_int
 from rhs_isac_ros.experiments.jobs import JobError
-from rhs_isac_ros.experiments.libraries import MissingLibraryError
+from rhs_isac_ros.model.optional import MissingLibraryError
 
-# As a shell reports a command that Ctrl-C ended.
+# Exit code that shells report after Ctrl-C.
 _INTERRUPTED = 130
 
 
@@ -16,60 +17,49 @@ def parse_options(
         description: str, name: str, trials: int, quick_trials: int,
         arguments: Sequence[str] | None = None,
         add: Callable[[argparse.ArgumentParser], None] | None = None) -> argparse.Namespace:
-    """Read the command line of an experiment.
+    """Parse the command line of an experiment.
 
     Parameters
     ----------
-    description
-        What the experiment is.
     name
-        Its name, and that of its folder.
+        Name of the experiment and of its results folder.
     trials, quick_trials
-        How many trials there are, and how many with ``--quick``.
-    arguments
-        Command line; by default the process's.
+        Number of trials, and the number with ``--quick``.
     add
-        Adds options that only this experiment has.
+        Callable that adds the experiment's own options to a parser.
 
     Returns
     -------
     argparse.Namespace
-        ``trials``, ``quick``, ``jobs``, ``dask`` and ``output``, and what `add` adds.
+        ``trials``, ``quick``, ``jobs``, ``dask``, ``output``, and the experiment's own options.
     """
     parser = argparse.ArgumentParser(
         prog=f'scripts/reproduce {name}', description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     count = parser.add_mutually_exclusive_group()
     count.add_argument('--quick', action='store_true', help=f'{quick_trials} trials only')
-    count.add_argument('--trials', type=positive, metavar='N',
-                       help=f'how many trials (default: {trials})')
+    count.add_argument('--trials', type=positive_int, metavar='N',
+                       help=f'number of trials (default: {trials})')
     if add:
         add(parser)
-    parser.add_argument('--jobs', type=positive, default=-1, metavar='N',
-                        help='how many at a time (default: one on each core)')
+    parser.add_argument('--jobs', type=positive_int, default=-1, metavar='N',
+                        help='number of parallel jobs (default: one per core)')
     parser.add_argument('--dask', metavar='ADDRESS',
                         help='scheduler of a Dask cluster to use instead of this machine; '
-                             'each worker needs this package, and one thread for true times')
+                             'its workers need this package, and a single thread each for '
+                             'accurate times')
     parser.add_argument('--output', type=Path, default=Path('results', name), metavar='DIR',
-                        help='folder of the results (default: %(default)s); a run goes on from '
-                             'what is there')
+                        help='folder of the results (default: %(default)s); jobs that have '
+                             'results there are not repeated')
     options = parser.parse_args(arguments)
     options.trials = quick_trials if options.quick else options.trials or trials
     return options
 
 
 def run_command(experiment: Callable[[], None]) -> int:
-    """Run an experiment, and tell people what ended it early.
+    """Run an experiment and print the error that ended it early, if any.
 
-    Parameters
-    ----------
-    experiment
-        The experiment.
-
-    Returns
-    -------
-    int
-        Exit code: 0, 1 after an error, 130 after Ctrl-C.
+    Return the exit code: 0, 1 after an error, 130 after Ctrl-C.
     """
     try:
         experiment()
@@ -81,27 +71,3 @@ def run_command(experiment: Callable[[], None]) -> int:
               file=sys.stderr)
         return 1
     return 0
-
-
-def positive(text: str) -> int:
-    """Read a whole number above 0 from a command line.
-
-    Parameters
-    ----------
-    text
-        The argument.
-
-    Returns
-    -------
-    int
-        Its value.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError, ValueError
-        If it is something else.
-    """
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f'{text}, expected at least 1')
-    return number

@@ -1,4 +1,4 @@
-"""A job: one independent piece of an experiment."""
+"""Jobs: the independent parts of an experiment."""
 
 import dataclasses
 import json
@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from rhs_isac_ros import __version__
+from rhs_isac_ros.model.optional import MissingLibraryError
 
 
 class JobError(Exception):
@@ -15,14 +16,10 @@ class JobError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """What to compute, and what to call it.
+    """A call of the function of an experiment.
 
-    Attributes
-    ----------
-    name
-        Names the file of the result: unique among the jobs of a folder, and fit for a file name.
-    arguments
-        Keyword arguments of the experiment's function; plain values that JSON can hold.
+    `name` is the name of the result file without suffix, unique in its folder; `arguments` are
+    keyword arguments of the function, JSON serialisable.
     """
 
     name: str
@@ -30,18 +27,9 @@ class Job:
 
 
 class Outcome(NamedTuple):
-    """What became of a job, in a form that any process can send to any other.
+    """Result of a job as JSON, or its error as text; the other is empty.
 
-    Attributes
-    ----------
-    job
-        The job.
-    text
-        Its result as JSON; empty if it failed.
-    error
-        Why it failed; empty if it did not.
-    version
-        Version of this package where it ran.
+    `version` is that of this package in the process that ran the job.
     """
 
     job: Job
@@ -51,23 +39,14 @@ class Outcome(NamedTuple):
 
 
 def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> Outcome:
-    """Do a job, wherever this is called.
+    """Run a job in the current process.
 
-    Exceptions become text: not every one survives the way to another process.
-
-    Parameters
-    ----------
-    function
-        Takes the job's arguments, and returns values by names that JSON can hold.
-    job
-        The job.
-
-    Returns
-    -------
-    Outcome
-        The result, or the traceback of what went wrong.
+    The function takes the job's arguments and returns a mapping that JSON can serialise.
+    Exceptions are returned as text, because not all of them can be pickled.
     """
     try:
         return Outcome(job, text=json.dumps(function(**job.arguments)))
+    except MissingLibraryError as error:
+        return Outcome(job, error=str(error))
     except Exception:
         return Outcome(job, error=traceback.format_exc())

@@ -1,4 +1,4 @@
-"""Figures over trials, as people read them."""
+"""Statistics of trials as text."""
 
 from collections.abc import Sequence
 
@@ -8,16 +8,8 @@ import numpy as np
 def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
     """Return mean and standard deviation of a sample.
 
-    Parameters
-    ----------
-    values
-        The sample.
-
-    Returns
-    -------
-    tuple of float
-        The mean, infinite if a value is; and the deviation, NaN where there is none: of one
-        value, or around an infinite mean.
+    The mean is infinite if a value is. The deviation is NaN if it is undefined: for a single
+    value, or an infinite mean.
     """
     mean = float(np.mean(values))
     if len(values) < 2 or not np.isfinite(mean):
@@ -26,19 +18,9 @@ def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
 
 
 def plus_minus(mean: float, std: float, digits: int = 3) -> str:
-    """Write a mean and its standard deviation.
+    """Format a mean, to some significant digits, and its deviation to the same decimal place.
 
-    Parameters
-    ----------
-    mean, std
-        What to write; a deviation of NaN is left out.
-    digits
-        Significant digits of the mean.
-
-    Returns
-    -------
-    str
-        Both, to the same decimal place.
+    A deviation of NaN is omitted.
     """
     if not np.isfinite(mean):
         return str(mean)
@@ -48,19 +30,9 @@ def plus_minus(mean: float, std: float, digits: int = 3) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Lay out a table that is legible as it is, too.
+    """Format a Markdown table with aligned columns, the first to the left, others to the right.
 
-    Parameters
-    ----------
-    header
-        Titles of the columns.
-    rows
-        Entries, each row as long as the header.
-
-    Returns
-    -------
-    str
-        Lines of Markdown; the columns after the first are flush right.
+    Each row is as long as the header.
     """
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]

@@ -1,4 +1,4 @@
-"""How sure a comparison is, by resampling."""
+"""Bootstrap intervals of comparisons."""
 
 from collections.abc import Callable
 
@@ -11,33 +11,33 @@ _INTERVAL = (2.5, 97.5)
 def reduction(
         ours: np.ndarray, theirs: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray],
         paired: bool = True) -> tuple[float, float, float]:
-    """How far a statistic lies below another, with its 95 % interval.
+    """Return the relative reduction of a statistic and its 95 % interval.
 
-    The interval is the percentile bootstrap's, with a fixed seed.
+    The interval is that of the percentile bootstrap, with a fixed seed.
 
     Parameters
     ----------
     ours, theirs
-        Samples, float64 [N]; entry by entry of the same case if they are paired.
+        Samples, float64 [N]; if paired, equal indices belong to the same case.
     statistic
-        Function of samples, float64 [..., N], that returns float64 [...].
+        Callable that takes samples, float64 [..., N], and returns float64 [...].
     paired
-        Whether cases are drawn together.
+        Whether to resample both with the same indices.
 
     Returns
     -------
     tuple of float
-        The reduction and the ends of its interval [%]; NaN or infinite where theirs is 0.
+        Reduction and the ends of its interval [%]; NaN or infinite where theirs is 0.
 
     Raises
     ------
     ValueError
-        If a sample is empty, or paired ones differ in length.
+        If a sample is empty, or paired samples differ in length.
     """
     ours, theirs = np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)
     if not len(ours) or not len(theirs) or (paired and len(ours) != len(theirs)):
-        raise ValueError(f'ours, theirs: {len(ours)} and {len(theirs)} values, expected some, '
-                         'and as many of both if they are paired')
+        raise ValueError(f'ours, theirs: {len(ours)} and {len(theirs)} values, expected at '
+                         'least one each, and equally many if paired')
     rng = np.random.default_rng(0)
     picks = rng.integers(len(ours), size=(_RESAMPLES, len(ours)))
     others = picks if paired else rng.integers(len(theirs), size=(_RESAMPLES, len(theirs)))

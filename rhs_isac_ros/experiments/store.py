@@ -1,4 +1,4 @@
-"""A folder with the result of each finished job."""
+"""Results of finished jobs, in a folder."""
 
 import json
 from collections.abc import Mapping
@@ -11,46 +11,21 @@ from rhs_isac_ros.model.files import write_whole
 
 
 class ResultStore:
-    """Keeps results between runs, each in a small file of JSON.
-
-    Parameters
-    ----------
-    folder
-        Where; it is made if it is not there.
-    """
+    """Stores each result in a JSON file of a folder, which it creates, for later runs to reuse."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
 
     def path(self, job: Job) -> Path:
-        """Return where the result of a job is kept.
-
-        Parameters
-        ----------
-        job
-            The job.
-
-        Returns
-        -------
-        Path
-            The file; it need not be there.
-        """
+        """Return the file of a job's result, which may not exist yet."""
         return self._folder / f'{job.name}.json'
 
     def read(self, job: Job) -> dict[str, Any] | None:
-        """Return the result of a job if it is known.
+        """Return the stored result of a job.
 
-        Parameters
-        ----------
-        job
-            The job.
-
-        Returns
-        -------
-        dict or None
-            None if there is no file, if it is damaged, or if it is of other arguments or of
-            another version of this package.
+        The result is None if there is no file, the file is damaged, or it was written for other
+        arguments or by another version of this package.
         """
         try:
             record = json.loads(self.path(job).read_bytes())
@@ -58,28 +33,19 @@ class ResultStore:
             return None
         if not isinstance(record, dict) or not isinstance(record.get('result'), dict):
             return None
-        same = all(record.get(key) == value for key, value in self._settings(job).items())
-        return record['result'] if same else None
+        if any(record.get(key) != value for key, value in _settings(job).items()):
+            return None
+        result: dict[str, Any] = record['result']
+        return result
 
     def write(self, job: Job, result: Mapping[str, Any]) -> None:
-        """Keep the result of a job; one that is there is replaced.
-
-        Parameters
-        ----------
-        job
-            The job.
-        result
-            What it returned.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
-        record = {**self._settings(job), 'result': result}
+        """Store the result of a job, replacing an old one atomically, or raise OSError."""
+        record = {**_settings(job), 'result': result}
         write_whole(self.path(job), json.dumps(record, indent=1) + '\n')
 
-    @staticmethod
-    def _settings(job: Job) -> dict[str, Any]:
-        """What must agree, as JSON returns it: a list for a tuple."""
-        return json.loads(json.dumps({'version': __version__, 'arguments': dict(job.arguments)}))
+
+def _settings(job: Job) -> dict[str, Any]:
+    """Return version and arguments as they are read back from JSON, which has no tuples."""
+    settings = {'version': __version__, 'arguments': dict(job.arguments)}
+    decoded: dict[str, Any] = json.loads(json.dumps(settings))
+    return decoded

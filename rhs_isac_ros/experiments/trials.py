@@ -1,4 +1,4 @@
-"""Running the jobs of an experiment so that nothing finished is ever done twice."""
+"""Running the jobs of an experiment; finished jobs are never repeated."""
 
 import contextlib
 import json
@@ -8,36 +8,29 @@ from typing import Any
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.experiments.jobs import Job, JobError, Outcome
-from rhs_isac_ros.experiments.libraries import needed_for
 from rhs_isac_ros.experiments.store import ResultStore
 from rhs_isac_ros.experiments.workers import outcomes_here, outcomes_on_cluster
+from rhs_isac_ros.model.optional import optional_import
 
 
 def run_jobs(
         function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path,
         n_jobs: int = -1, dask: str | None = None) -> list[dict[str, Any]]:
-    """Do the jobs whose results are not known yet, and show how far it is.
+    """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
-    Each result is kept as soon as it is there: after an interruption or an error, the same call
-    goes on where this one ended.
+    Each result is stored as soon as it is available. After an interruption or an error, the same
+    call resumes the experiment. A progress bar is shown on a terminal.
 
     Parameters
     ----------
     function
-        Takes the arguments of a job, and returns values by names that JSON can hold.
-    jobs
-        The jobs.
+        Callable that takes the arguments of a job and returns a dict that JSON can serialise.
     folder
-        Where the results are kept.
+        Folder of the stored results.
     n_jobs
-        How many at a time on this machine; -1 for one on each core.
+        Number of parallel jobs on this machine; -1 for one per core.
     dask
         Address of the scheduler of a Dask cluster to use instead.
-
-    Returns
-    -------
-    list of dict
-        Results in the order of the jobs, as JSON returns them.
 
     Raises
     ------
@@ -46,25 +39,25 @@ def run_jobs(
     JobError
         If a job fails, or its worker has another version of this package.
     ConnectionError
-        If the cluster does not answer.
+        If the cluster does not respond.
     OSError
-        If a result cannot be read or kept.
+        If a result cannot be read or stored.
     MissingLibraryError
-        If a library is missing.
+        If a library is not installed.
     """
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two of the same name, expected each name once')
-    with needed_for('showing progress'):
+    with optional_import('showing progress', extra='experiments'):
         from tqdm import tqdm
 
     store = ResultStore(folder)
     known = {job.name: result for job in jobs if (result := store.read(job)) is not None}
-    left = [job for job in jobs if job.name not in known]
-    # Without a terminal, no bar.
+    pending = [job for job in jobs if job.name not in known]
+    # None disables the bar if stderr is not a terminal.
     with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None) as bar:
-        if left:
-            outcomes = (outcomes_on_cluster(function, left, dask) if dask
-                        else outcomes_here(function, left, n_jobs))
+        if pending:
+            outcomes = (outcomes_on_cluster(function, pending, dask) if dask
+                        else outcomes_here(function, pending, n_jobs))
             with contextlib.closing(outcomes):
                 for outcome in outcomes:
                     known[outcome.job.name] = result = _result(outcome)
@@ -74,10 +67,11 @@ def run_jobs(
 
 
 def _result(outcome: Outcome) -> dict[str, Any]:
-    """The result of a job, or JobError if there is none that counts."""
+    """Return the result of a job, or raise JobError if it failed or ran in another version."""
     if outcome.error:
         raise JobError(f'job {outcome.job.name} failed: {outcome.error.strip()}')
     if outcome.version != __version__:
         raise JobError(f'job {outcome.job.name}: its worker has rhs_isac_ros {outcome.version}, '
                        f'expected {__version__} as here')
-    return json.loads(outcome.text)
+    result: dict[str, Any] = json.loads(outcome.text)
+    return result

@@ -1,44 +1,36 @@
-"""Where jobs run: on the cores of this machine or on a Dask cluster."""
+"""Running jobs on the cores of this machine or on a Dask cluster."""
 
 import contextlib
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
+from typing import Any
 
 from rhs_isac_ros.experiments.jobs import Job, JobError, Outcome, attempt
-from rhs_isac_ros.experiments.libraries import needed_for
+from rhs_isac_ros.model.optional import optional_import
 
-# How long to wait for a cluster, and for a worker of it.
-_PATIENCE_S = 30
+# Timeout for the scheduler of a cluster, and for its first worker.
+_TIMEOUT_S = 30
 
 
-def outcomes_here(function: Callable, jobs: Sequence[Job], n_jobs: int) -> Iterator[Outcome]:
-    """Do jobs in processes of this machine, with one thread each.
+def outcomes_here(
+        function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], n_jobs: int
+) -> Generator[Outcome, None, None]:
+    """Run jobs in single-threaded processes on this machine; yield each outcome when it is ready.
 
-    Parameters
-    ----------
-    function
-        What does a job.
-    jobs
-        The jobs.
-    n_jobs
-        How many at a time; -1 for one on each core. One runs in this process.
-
-    Yields
-    ------
-    Outcome
-        Of each job, as it ends. Closing the iterator ends the processes.
+    There are `n_jobs` processes; -1 stands for one per core, and 1 for none but this process.
+    Closing the generator ends them.
 
     Raises
     ------
     JobError
         If a process dies.
     MissingLibraryError
-        If joblib is missing.
+        If joblib is not installed.
     """
-    with needed_for('running jobs'):
+    with optional_import('running jobs', extra='experiments'):
         import joblib
 
     outcomes = None
@@ -48,74 +40,64 @@ def outcomes_here(function: Callable, jobs: Sequence[Job], n_jobs: int) -> Itera
             outcomes = joblib.Parallel(
                 n_jobs=n_jobs, batch_size=1, return_as='generator_unordered')(
                     joblib.delayed(attempt)(function, job) for job in jobs)
-        # `yield from` would close it before `finally` does.
+        # `yield from` would close the generator outside the filter for warnings below.
         while outcome := next(outcomes, None):
             yield outcome
     except BrokenExecutor as error:
-        raise JobError(f'a process died, perhaps for lack of memory: {error}') from error
+        raise JobError(f'a process died, possibly out of memory: {error}') from error
     finally:
         if outcomes:
             with warnings.catch_warnings():
-                # Closed early, it warns that jobs are lost; whoever closes it knows.
+                # Joblib warns about lost jobs; here they are abandoned deliberately.
                 warnings.simplefilter('ignore', UserWarning)
                 outcomes.close()
 
 
 def outcomes_on_cluster(
-        function: Callable, jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
-    """Do jobs on a Dask cluster.
+        function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], address: str
+) -> Generator[Outcome, None, None]:
+    """Run jobs on a Dask cluster; yield each outcome when it is ready.
 
-    This is distributed's own interface: through joblib, jobs of a cluster with a single thread
-    run here instead, and a worker that dies leaves the run waiting for ever.
-
-    Parameters
-    ----------
-    function
-        What does a job.
-    jobs
-        The jobs.
-    address
-        Address of the scheduler.
-
-    Yields
-    ------
-    Outcome
-        Of each job, as it ends. Closing the iterator takes back the jobs that have not begun.
+    The address is that of the scheduler. Closing the generator cancels pending jobs. This uses
+    `distributed` directly: through joblib, jobs for a cluster with a single thread run in this
+    process instead, and the run never ends if a worker dies.
 
     Raises
     ------
     ConnectionError
         If there is no scheduler, or no worker.
     MissingLibraryError
-        If distributed is missing.
+        If distributed is not installed.
     """
-    with needed_for('running jobs on a Dask cluster'):
+    with optional_import('running jobs on a Dask cluster', extra='experiments'):
         from distributed import Client, as_completed
 
     with contextlib.ExitStack() as stack:
         try:
-            client = stack.enter_context(
-                Client(address, timeout=_PATIENCE_S, set_as_default=False))
-            client.wait_for_workers(1, timeout=_PATIENCE_S)
+            client = stack.enter_context(Client(  # type: ignore[no-untyped-call]
+                address, timeout=_TIMEOUT_S, set_as_default=False))
+            client.wait_for_workers(1, timeout=_TIMEOUT_S)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConnectionError(f'Dask cluster {address}: {error}') from error
         jobs_by_future = {
             client.submit(attempt, function, job, pure=False): job for job in jobs}
-        for future in as_completed(list(jobs_by_future), loop=client.loop):
+        for future in as_completed(  # type: ignore[no-untyped-call]
+                list(jobs_by_future), loop=client.loop):
             try:
                 yield future.result()
-            except Exception as error:  # the job killed its worker, or never reached one
+            except Exception as error:  # the job killed its worker or could not be sent to one
                 yield Outcome(jobs_by_future[future], error=f'{type(error).__name__}: {error}')
 
 
 @contextlib.contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach.
+    """Ignore SIGINT inside the block, so that processes started there ignore it, too.
 
-    A terminal sends it to every process, and a new one inherits what is ignored. It is for this
-    process alone to end the others. Blocking it would lose none, but joblib unblocks it.
+    A terminal sends SIGINT to the whole process group, but only this process may end the
+    workers. Ignored signals are inherited. Blocking the signal instead would not lose one that
+    arrives inside the block, but joblib unblocks it.
     """
-    # Only the main thread may choose, and only there does Ctrl-C end anything.
+    # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -35,3 +35,9 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     except BaseException:
         os.unlink(aside)
         raise
+
+
+def check_writable(path: Path) -> None:
+    """Raise OSError unless the directory of a file exists and can be written."""
+    if not os.access(path.parent, os.W_OK):
+        raise OSError(f'{path}: expected a file in a directory that can be written')

@@ -1,13 +1,14 @@
-"""Positioning error with codebooks that were made in different ways.
+"""Positioning error with different codebooks.
 
-Problem: the average Cramer-Rao bound is local. Two bands repeat themselves every so many metres of
-range, and a codebook with a low bound may still leave these ranges alike. Which codebook locates
-users best? All face the same positions, multipath and noise, and the posterior mean of each.
+Problem: the average Cramer-Rao bound is a local measure. The phases of two bands repeat
+periodically in range, and a codebook with a low bound may leave such ranges indistinguishable.
+Which codebook locates users best? All are evaluated with the same positions, multipath and noise,
+and with the posterior mean as the estimator.
 """
 
 import os
 
-# One thread, as in the positioner node. This must come before NumPy is loaded.
+# One thread, as in the positioner node. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
@@ -18,6 +19,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
+from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import reduction
 from rhs_isac_ros.model import Scenario, simulate_received, streams
 from rhs_isac_ros.positioning import make_estimator
@@ -27,14 +29,15 @@ BATCH = 50
 
 
 def main() -> None:
-    """Locate, compare, and print the figures."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--positions', type=int, default=1000)
-    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--positions', type=positive_int, default=1000,
+                        help='number of positions')
+    parser.add_argument('--seed', type=int, default=1, help='seed of all random numbers')
     parser.add_argument('--codebook', type=Path, action='append', default=[],
-                        help='one more codebook to compare; may be repeated')
-    parser.add_argument('--json', type=Path, help='file for the figures')
+                        help='another codebook to compare; may be repeated')
+    parser.add_argument('--json', type=Path, help='JSON file for the figures')
     options = parser.parse_args()
     scenario = Scenario()
     codebooks = {
@@ -48,11 +51,12 @@ def main() -> None:
         errors[name], in_range[name] = squared_errors(
             scenario, codebook, options.positions, options.seed)
     print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
-    print('| codebook | mean squared error [m^2] | standard error | of it in range | median | '
+    print('| codebook | mean squared error [m^2] | standard error | part in range | median | '
           'average CRLB [m^2] |\n|---|---|---|---|---|---|')
     figures = {}
     for name, codebook in codebooks.items():
-        bound = crlb(scenario, codebook, places(scenario, options.positions, options.seed)).mean()
+        positions = draw_positions(scenario, options.positions, options.seed)
+        bound = crlb(scenario, codebook, positions).mean()
         figures[name] = {
             'id': codebook.id, 'mse_m2': errors[name].mean(),
             'standard_error_m2': errors[name].std() / np.sqrt(options.positions),
@@ -62,25 +66,26 @@ def main() -> None:
               '{median_m2:.3f} | {average_crlb_m2:.4f} |'.format(name, **figures[name]))
     print()
     for rival in ('crlb', 'directional', 'random'):
-        less, low, high = reduction(
+        percent, low, high = reduction(
             errors['ambiguity'], errors[rival], lambda values: values.mean(axis=-1))
-        figures[f'reduction_{rival}_percent'] = less
-        print(f'ambiguity is {less:.1f} % below {rival} (95 % interval {low:.1f} to {high:.1f})')
+        figures[f'reduction_{rival}_percent'] = percent
+        print(f'ambiguity is {percent:.1f} % below {rival} '
+              f'(95 % interval {low:.1f} to {high:.1f})')
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
 
 
-def places(scenario: Scenario, n: int, seed: int) -> np.ndarray:
-    """Draw the positions, the same for all codebooks."""
+def draw_positions(scenario: Scenario, n: int, seed: int) -> np.ndarray:
+    """Draw the positions; they are the same for all codebooks."""
     return scenario.sample_positions(n, np.random.default_rng(seed))
 
 
 def squared_errors(
         scenario: Scenario, codebook: Codebook, n: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Squared error of the posterior mean at every position, and its part in range [m^2]."""
-    positions = places(scenario, n, seed)
-    # The same draws of multipath and noise, whatever the codebook makes of them.
+    """Return the squared error of the posterior mean at each position, and its part in range."""
+    positions = draw_positions(scenario, n, seed)
+    # The draws of multipath and noise do not depend on the codebook.
     received = simulate_received(scenario, codebook, positions, np.random.default_rng(seed + 1))
     estimator = make_estimator('bayes', scenario, codebook)
     means = np.concatenate([estimator.estimate(received[start:start + BATCH]).mean

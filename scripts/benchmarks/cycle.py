@@ -1,9 +1,9 @@
-"""Wall time of a protocol cycle, beside the time of its messages alone.
+"""Duration of a protocol cycle, compared with that of its messages alone.
 
-Problem: a cycle is a chain of messages, each of which waits for the one before, with the
-computations of the nodes in between. What does the network add to bare rclpy? The floor is the
-same number of hops, as ping-pong of a bare publisher and subscription between two processes, in
-the same run and with the same executor.
+Problem: a cycle is a chain of messages, each sent in response to the previous one, with the
+computations of the nodes in between. How much time does the network add to bare rclpy? The floor
+is the same number of hops, measured in the same run and with the same executor as ping-pong of a
+bare publisher and subscription between two processes.
 """
 
 import argparse
@@ -17,6 +17,7 @@ import numpy as np
 import rclpy
 from parts.hops import hops_of, ping_pong
 
+from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.observer import CycleObserver
@@ -25,17 +26,17 @@ from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
 from rhs_isac_ros.tools.demo import start_network, watch
 
-# Between cycles, so that the report of one does not compete with the next for the cores.
+# Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
 
 
 def main() -> int:
-    """Measure and print."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--users', type=int, default=2)
-    parser.add_argument('--cycles', type=int, default=300)
-    parser.add_argument('--json', type=Path, help='file for the figures')
+    parser.add_argument('--users', type=positive_int, default=2, help='number of users')
+    parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
+    parser.add_argument('--json', type=Path, help='JSON file for the figures')
     options = parser.parse_args()
     os.environ.update(private_domain())
     scenario = Scenario()
@@ -49,7 +50,7 @@ def main() -> int:
     finally:
         rclpy.try_shutdown()
     hop_s = np.median(np.concatenate([before_s, after_s])) / 2
-    # The first cycles still warm up.
+    # Discard the first cycles as warm-up.
     cycles = cycles[10:]
     cycle_s = np.median([record.ended_s - record.began_s for record in cycles])
     figures = {
@@ -61,7 +62,7 @@ def main() -> int:
             [r.durations_s().get(phase, np.nan) for r in cycles]) for phase in m.Phase},
     }
     print(f'cycle     {figures["cycle_ms"]:7.2f} ms  from beacon to end, median of {len(cycles)}, '
-          f'{options.users} users, every node a process')
+          f'{options.users} users, one process per node')
     print(f'floor     {figures["floor_ms"]:7.2f} ms  {hops} hops of {figures["hop_us"]:.0f} us')
     print(f'ratio     {figures["ratio"]:7.2f}')
     print(f'estimator {figures["estimator_ms"]:7.2f} ms')
@@ -73,7 +74,7 @@ def main() -> int:
 
 
 def run_cycles(scenario: Scenario, users: int, cycles: int) -> list:
-    """Run the network and return its complete cycles."""
+    """Run the network and return the records of its complete cycles."""
     observer = CycleObserver()
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:

@@ -1,10 +1,10 @@
 """Speed of the codebook optimiser.
 
-Problem: minimise the average Cramer-Rao bound over sampled positions. (a) What do one value and
-its gradient cost, beside automatic differentiation of the same objective, and beside the matrix
-products that they cannot do without? (b) How long until the average bound on positions that were
-not sampled is 0.0415 m^2, and who gets there? (c) How do time and memory grow with the numbers of
-positions, elements and bands?
+Problem: minimise the average Cramer-Rao bound over sampled positions. (a) What does an evaluation
+of the value and its gradient cost, compared with automatic differentiation of the same objective,
+and with the matrix products that are unavoidable? (b) How long does each method take to reach an
+average bound of 0.0415 m^2 on held-out positions? (c) How do time and memory grow with the numbers
+of positions, elements and bands?
 """
 
 import argparse
@@ -28,7 +28,9 @@ from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.codebook.sampling import monte_carlo, sobol
 from rhs_isac_ros.codebook.search import BudgetSpent, Search
+from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.optional import optional_import
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
 TARGET_M2 = 0.0415
@@ -36,18 +38,20 @@ HELD_OUT = 2000
 
 
 def main() -> None:
-    """Measure, print and draw."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--threads', type=int, default=1, help='cores and threads for everybody')
-    parser.add_argument('--limit', type=float, default=120.0, help='seconds for each rival in (b)')
-    parser.add_argument('--parts', default='abc', help='which parts to run')
-    parser.add_argument('--json', type=Path, help='file for the figures')
-    parser.add_argument('--picture', type=Path, help='file for a picture')
+    parser.add_argument('--threads', type=positive_int, default=1,
+                        help='number of cores and threads')
+    parser.add_argument('--limit', type=float, default=120.0,
+                        help='time limit per method in (b) [s]')
+    parser.add_argument('--parts', default='abc', help='parts to run')
+    parser.add_argument('--json', type=Path, help='JSON file for the figures')
+    parser.add_argument('--picture', type=Path, help='file for the picture')
     options = parser.parse_args()
-    pin(options.threads)
+    restrict_to(options.threads)
     if not HAVE_JAX:
-        print('JAX is not installed, so its figures are left out: '
+        print('JAX is not installed, so its figures are omitted; to install it: '
               'python -m pip install --no-deps -r requirements-peers.txt\n', file=sys.stderr)
     figures: dict = {'threads': options.threads}
     for part, measure in (('a', gradient), ('b', lambda: target(options.limit)), ('c', growth)):
@@ -59,8 +63,8 @@ def main() -> None:
         draw(figures, options.picture)
 
 
-def pin(n: int) -> None:
-    """Start anew on n cores with n threads, which libraries read when they are loaded."""
+def restrict_to(n: int) -> None:
+    """Restart this process on n cores with n threads; libraries read the number when loaded."""
     if threads() != n:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:n])
         os.environ['OPENBLAS_NUM_THREADS'] = str(n)
@@ -68,12 +72,12 @@ def pin(n: int) -> None:
 
 
 def threads() -> int:
-    """Threads that everybody has; 0 if it was not decided yet."""
+    """Return the number of threads, or 0 before it is set."""
     return int(os.environ.get('OPENBLAS_NUM_THREADS', 0))
 
 
 def gradient() -> dict:
-    """Part (a)."""
+    """Run part (a)."""
     scenario = Scenario()
     positions = monte_carlo(scenario, POSITIONS, streams.generator(0, streams.SAMPLES))
     start = random_codebook(scenario, streams.generator(0, streams.START))
@@ -91,7 +95,7 @@ def gradient() -> dict:
     value = {name: contenders[name]()[0] for name in ('ours', 'ours, exact rows')}
     ours = times_s['ours']
     print(f'(a) value and gradient, Table I, {POSITIONS} positions, {threads()} thread(s)\n')
-    print('| what | ms | ours is faster by |\n|---|---|---|')
+    print('| implementation | ms | speed-up of ours |\n|---|---|---|')
     for name, time_s in times_s.items():
         print(f'| {name} | {1e3 * time_s:.2f} | {time_s / ours:.2f} |')
     print(f'\nrelative error of the value: {value["ours"] / value["ours, exact rows"] - 1:.1e}; '
@@ -103,7 +107,7 @@ def gradient() -> dict:
 
 
 def products(problem: Problem, scenario: Scenario) -> Callable[[], list]:
-    """Return the products that value and gradient cannot do without: rows by patterns and back."""
+    """Return a callable for the unavoidable products: rows times patterns, and the reverse."""
     rng = np.random.default_rng(0)
     size = scenario.n_subbands * scenario.n_frames
     pairs = []
@@ -114,9 +118,9 @@ def products(problem: Problem, scenario: Scenario) -> Callable[[], list]:
 
 
 def target(limit_s: float) -> dict:
-    """Part (b)."""
+    """Run part (b)."""
     scenario = Scenario()
-    # What SciPy loads at the first use is nobody's time.
+    # Let SciPy finish its imports before the clock starts.
     sobol(scenario, 1, np.random.default_rng(0))
     held_out = monte_carlo(scenario, HELD_OUT, streams.generator(0, streams.HELD_OUT))
     runs = {f'lbfgs, {DEFAULT_POSITIONS} Sobol': run(scenario, 'lbfgs', sobol, limit_s),
@@ -129,15 +133,16 @@ def target(limit_s: float) -> dict:
     if HAVE_JAX:
         runs['JAX + L-BFGS-B'], compiled_s = run_peer(scenario, limit_s)
     print(f'(b) time to an average bound of {TARGET_M2} m^2 on {HELD_OUT} held-out positions\n')
-    print('| method | s | evaluations | at the end [m^2] | after [s] |\n|---|---|---|---|---|')
+    print('| method | s | evaluations | final bound [m^2] | final time [s] |')
+    print('|---|---|---|---|---|')
     reached = {}
     for name, trace in runs.items():
-        at = first_below(scenario, trace, held_out)
+        hit = first_below(scenario, trace, held_out)
         end_m2 = held_out_crlb(scenario, trace[-1], held_out)
         reached[name] = {
-            'target_s': at and at[0], 'evaluations': at and at[1], 'final_m2': end_m2,
+            'target_s': hit and hit[0], 'evaluations': hit and hit[1], 'final_m2': end_m2,
             'final_s': trace[-1][0]}
-        when = f'{at[0]:.2f} | {at[1]}' if at else 'not reached | '
+        when = f'{hit[0]:.2f} | {hit[1]}' if hit else 'not reached | '
         print(f'| {name} | {when} | {end_m2:.5f} | {trace[-1][0]:.1f} |')
     ours = reached[f'lbfgs, {DEFAULT_POSITIONS} Sobol']
     peer = reached.get('JAX + L-BFGS-B', {}).get('target_s')
@@ -148,9 +153,9 @@ def target(limit_s: float) -> dict:
             peer and ours['target_s'] and (peer + compiled_s) / ours['target_s'],
         'jax_compilation_s': compiled_s}
     if peer:
-        print(f'\nlbfgs is {figures["target_speedup_vs_jax"]:.1f} times as fast as JAX; '
-              f'{figures["target_speedup_vs_jax_with_compilation"]:.1f} with its compilation '
-              f'of {compiled_s:.1f} s')
+        print(f'\nspeed-up of lbfgs over JAX: {figures["target_speedup_vs_jax"]:.1f}; '
+              f'{figures["target_speedup_vs_jax_with_compilation"]:.1f} including its '
+              f'compilation of {compiled_s:.1f} s')
     print()
     return figures
 
@@ -161,21 +166,21 @@ Trace = list[tuple[float, int, np.ndarray]]
 
 def run(scenario: Scenario, method: str, sample: Callable, limit_s: float,
         n_positions: int = DEFAULT_POSITIONS) -> Trace:
-    """Run a method with its default steps, from the sampling on."""
+    """Run a method with its default limit of steps; sampling and set-up count."""
     begin = time.perf_counter()
     positions = sample(scenario, n_positions, streams.generator(0, streams.SAMPLES))
     problem = Problem(scenario, AverageCrlb(scenario, positions, ROW_TOLERANCE))
     start = problem.pack(random_codebook(scenario, streams.generator(0, streams.START)))
     trace: Trace = []
 
-    def note(progress: object) -> None:
+    def record(progress: object) -> None:
         elapsed_s = time.perf_counter() - begin
         trace.append((elapsed_s, progress.evaluations, search.best))
         if elapsed_s > limit_s:
             raise BudgetSpent
 
     search = Search(problem, start, METHODS[method].steps, None,
-                    streams.generator(0, streams.METHOD), note)
+                    streams.generator(0, streams.METHOD), record)
     try:
         METHODS[method].minimize(search)
     except BudgetSpent:
@@ -184,7 +189,7 @@ def run(scenario: Scenario, method: str, sample: Callable, limit_s: float,
 
 
 def run_peer(scenario: Scenario, limit_s: float) -> tuple[Trace, float]:
-    """Run SciPy's L-BFGS-B on the objective in JAX; compilation is timed apart."""
+    """Run SciPy's L-BFGS-B on the JAX objective; return its trace and the compilation time [s]."""
     begin = time.perf_counter()
     positions = monte_carlo(scenario, POSITIONS, streams.generator(0, streams.SAMPLES))
     peer = JaxAverageCrlb(scenario, positions)
@@ -205,26 +210,26 @@ def run_peer(scenario: Scenario, limit_s: float) -> tuple[Trace, float]:
         evaluations += 1
         return peer(variables)
 
-    def note(variables: np.ndarray) -> None:
+    def record(variables: np.ndarray) -> None:
         trace.append((time.perf_counter() - begin, evaluations, np.array(variables)))
         if trace[-1][0] > limit_s:
             raise BudgetSpent
 
     try:
         minimize(function, start, jac=True, method='L-BFGS-B', bounds=problem.bounds,
-                 callback=note, options={'maxiter': METHODS['lbfgs'].steps, 'maxfun': 10**6})
+                 callback=record, options={'maxiter': METHODS['lbfgs'].steps, 'maxfun': 10**6})
     except BudgetSpent:
         pass
     return trace, compiled_s
 
 
 def held_out_crlb(scenario: Scenario, entry: tuple, held_out: np.ndarray) -> float:
-    """Average bound of an entry of a trace on held-out positions [m^2]."""
+    """Return the average bound of an entry of a trace on held-out positions [m^2]."""
     return float(crlb(scenario, Problem(scenario, None).unpack(entry[2]), held_out).mean())
 
 
 def first_below(scenario: Scenario, trace: Trace, held_out: np.ndarray) -> tuple | None:
-    """First entry of a trace that reaches the target, by bisection; None if the last does not."""
+    """Return the first entry that reaches the target, by bisection; None if the last does not."""
     if held_out_crlb(scenario, trace[-1], held_out) > TARGET_M2:
         return None
     low, high = 0, len(trace) - 1
@@ -238,8 +243,9 @@ def first_below(scenario: Scenario, trace: Trace, held_out: np.ndarray) -> tuple
 
 
 def draw(figures: dict, path: Path) -> None:
-    """Draw what was measured."""
-    from matplotlib.figure import Figure
+    """Draw the results of all parts that were run."""
+    with optional_import('--picture', extra='plot'):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.6), layout='constrained')
     left, middle, right = figure.subplots(1, 3)

@@ -1,13 +1,14 @@
-"""How many Sobol points are worth 1200 random ones.
+"""How many Sobol points are as good as 1200 random ones.
 
-Problem: the optimiser sees the region of interest through samples. Too few, and it fits these
-alone. How good is the codebook on the whole region, after the same number of steps, by the number
-of samples and by how they are drawn? All are measured on the same Sobol points, which none saw.
+Problem: the optimiser sees the region of interest only through samples, and overfits if they are
+too few. How good is the codebook on the whole region, after a fixed number of steps, depending on
+the number of samples and on how they are drawn? All codebooks are evaluated on the same held-out
+Sobol points.
 """
 
 import os
 
-# One thread. This must come before NumPy is loaded.
+# One thread. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
@@ -20,6 +21,7 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.sampling import sobol
+from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario, streams
 
 CHOICES = (('monte_carlo', 300), ('monte_carlo', 600), ('monte_carlo', 1200), ('sobol', 64),
@@ -28,18 +30,19 @@ HELD_OUT, HELD_OUT_SEED = 16384, 1 << 20
 
 
 def main() -> None:
-    """Optimise, measure, and print a table."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--seeds', type=int, default=5, help='how many runs of each')
-    parser.add_argument('--steps', type=int, default=600, help='update steps of each')
-    parser.add_argument('--json', type=Path, help='file for the figures')
+    parser.add_argument('--seeds', type=positive_int, default=5, help='number of runs per choice')
+    parser.add_argument('--steps', type=positive_int, default=600,
+                        help='update steps of each run')
+    parser.add_argument('--json', type=Path, help='JSON file for the figures')
     options = parser.parse_args()
     scenario = Scenario()
     held_out = sobol(scenario, HELD_OUT, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))
     print(f'average CRLB on {HELD_OUT} held-out points after {options.steps} steps of L-BFGS, '
           f'{options.seeds} seeds\n')
-    print('| samples | mean [m^2] | standard deviation [m^2] | time of a run [s] |')
+    print('| samples | mean [m^2] | standard deviation [m^2] | time per run [s] |')
     print('|---|---|---|---|')
     figures = {}
     for sampling, n in CHOICES:

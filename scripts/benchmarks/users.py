@@ -1,8 +1,8 @@
-"""A crowd: cycles per second and the wait of each user, with few users and with many.
+"""Cycle rate and waiting times with few users and with many.
 
-Problem: all users answer every beacon, one is served. What do the others cost? The network runs
-twice, with few users and with many, and is compared with bare rclpy: the hops of a cycle, and the
-acks of all users as they come to one subscription, both measured in the same run.
+Problem: all users answer every beacon, but only one is served. What do the others cost? The
+network runs twice, with few users and with many, and is compared with the hops of a cycle in bare
+rclpy, measured in the same run.
 """
 
 import argparse
@@ -18,25 +18,28 @@ import rclpy
 from parts.hops import hops_of, ping_pong
 from system.chaos.watcher import Watcher
 
+from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
 from rhs_isac_ros.tools.demo import start_network
 
-PATIENCE_S = 600.0
+TIMEOUT_S = 600.0
 
 
 def main() -> int:
-    """Measure and print."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--few', type=int, default=2)
-    parser.add_argument('--users', type=int, default=64, help='users of the crowd')
-    parser.add_argument('--rounds', type=int, default=5, help='how often each user is served')
+    parser.add_argument('--few', type=positive_int, default=2,
+                        help='number of users in the first run')
+    parser.add_argument('--users', type=positive_int, default=64,
+                        help='number of users in the second run')
+    parser.add_argument('--rounds', type=positive_int, default=5, help='cycles for each user')
     parser.add_argument('--composed', action='store_true',
-                        help='all nodes in one process, instead of each in one of its own')
-    parser.add_argument('--json', type=Path, help='file for the figures')
+                        help='run all nodes in one process instead of one process per node')
+    parser.add_argument('--json', type=Path, help='JSON file for the figures')
     options = parser.parse_args()
     os.environ.update(private_domain())
     find_each_other_quickly()
@@ -55,22 +58,22 @@ def main() -> int:
         'few': few, 'many': many, 'rate_ratio': many['rate_hz'] / few['rate_hz'],
         'fair': many['longest_wait_cycles'] <= options.users,
     }
-    where = 'one process' if options.composed else 'every node a process'
+    where = 'one process' if options.composed else 'one process per node'
     for name in ('few', 'many'):
-        one = figures[name]
-        print(f'{one["users"]:3d} users, {where}: {one["rate_hz"]:.2f} cycles/s, cycle '
-              f'{one["cycle_ms"]:.1f} ms, {one["given_up"]} given up; each waits '
-              f'{one["longest_wait_cycles"]} cycles at most, {one["longest_wait_s"]:.2f} s')
+        run = figures[name]
+        print(f'{run["users"]:3d} users, {where}: {run["rate_hz"]:.2f} cycles/s, cycle '
+              f'{run["cycle_ms"]:.1f} ms, {run["given_up"]} given up; longest wait '
+              f'{run["longest_wait_cycles"]} cycles, {run["longest_wait_s"]:.2f} s')
     print(f'bare rclpy: {figures["floor_ms"]:.2f} ms for the {hops} hops of a cycle')
-    print(f'rate with {options.users} users, of that with {options.few}: '
-          f'{figures["rate_ratio"]:.2f}; fair within one round: {figures["fair"]}')
+    print(f'rate with {options.users} users relative to that with {options.few}: '
+          f'{figures["rate_ratio"]:.2f}; fair, one round at most: {figures["fair"]}')
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
     return 0
 
 
 def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> dict:
-    """Run a network until everybody is known, and so many cycles more."""
+    """Run a network until each user has been served, then measure a number of cycles."""
     watcher = Watcher(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
@@ -79,10 +82,11 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
             else:
                 start_network(
                     processes, users, 0, None, default_codebook_file(), scenario, rest_s=0.0)
-            spin(watcher, lambda: {end.user for end in watcher.ends} == {*range(1, users + 1)},
-                 'a cycle of each user')
+            everyone = {*range(1, users + 1)}
+            wait_until(watcher, lambda: {end.user for end in watcher.ends} == everyone,
+                       'a cycle of each user')
             first = len(watcher.ends)
-            spin(watcher, lambda: len(watcher.ends) >= first + cycles, f'{cycles} cycles')
+            wait_until(watcher, lambda: len(watcher.ends) >= first + cycles, f'{cycles} cycles')
     watcher.destroy_node()
     ends = watcher.ends[first:first + cycles]
     served = [end for end in ends if end.outcome == 'served']
@@ -95,14 +99,14 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
     }
 
 
-def spin(watcher: Watcher, done: Callable[[], bool], what: str) -> None:
-    """Hear messages until something is so."""
-    if not watcher.spin_until(done, PATIENCE_S):
-        raise RuntimeError(f'{what}: not within {PATIENCE_S:g} s')
+def wait_until(watcher: Watcher, done: Callable[[], bool], goal: str) -> None:
+    """Process messages until a condition holds, or raise RuntimeError on timeout."""
+    if not watcher.spin_until(done, TIMEOUT_S):
+        raise RuntimeError(f'{goal}: not within {TIMEOUT_S:g} s')
 
 
 def waits(order: list[int], ended_s: np.ndarray) -> dict:
-    """Longest wait of any user, in cycles and in time, from one of its cycles to the next."""
+    """Return the longest wait of any user between two of its cycles, in cycles and in seconds."""
     last: dict[int, int] = {}
     longest, longest_s = 0, 0.0
     for index, user in enumerate(order):
@@ -110,7 +114,7 @@ def waits(order: list[int], ended_s: np.ndarray) -> dict:
             longest = max(longest, index - last[user])
             longest_s = max(longest_s, float(ended_s[index] - ended_s[last[user]]))
         last[user] = index
-    # Who does not come again still waits.
+    # Users that are not served again were still waiting at the end.
     for index in last.values():
         longest = max(longest, len(order) - index)
     return {'longest_wait_cycles': longest, 'longest_wait_s': longest_s}

@@ -1,23 +1,23 @@
 """Fig. 3 of the paper: average bound and computing time of the optimisation methods.
 
-Problem: a base station has N_B bands, centred at (2 + 0.5 i) GHz, and measures F frames in each;
-N_B F = 8 frames are all it has. Which codebook has the lowest average CRLB over N_sam = 10
-positions, drawn at random? The paper's alternating algorithm, gradient descent on all variables
-at once, a genetic algorithm and our L-BFGS answer, each from the same start with the same samples;
-30 trials draw other ones. The paper claims that its algorithm
+Problem: a base station has N_B bands, centred at (2 + 0.5 i) GHz, and measures F frames in each,
+with N_B F = 8 frames in total. Which method finds the codebook with the lowest average CRLB over
+N_sam = 10 random positions? The paper's alternating algorithm, gradient descent on all variables
+at once, a genetic algorithm and our L-BFGS are compared, from the same start and with the same
+samples; each of the 30 trials draws new ones. The paper claims that its algorithm
 
-(1) reaches a lower CRLB than both of its rivals at each N_B,
-(2) takes less time than they do,
+(1) reaches a lower CRLB than both rivals at each N_B,
+(2) takes less time than both,
 (3) that its CRLB falls with N_B,
 (4) and that its lead in CRLB grows with N_B.
 
-Beyond the paper, each codebook is measured on 500 other positions, the same for all: ten samples
-are few, and a method may fit these ten alone.
+Beyond the paper, each codebook is also evaluated on 500 held-out positions, the same for all: a
+method may overfit ten samples.
 """
 
 import os
 
-# One thread for each job. This must come before NumPy is loaded.
+# One thread per job. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
@@ -32,49 +32,50 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
+from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.experiments import (
     Job,
     markdown_table,
     mean_and_std,
     parse_options,
     plus_minus,
-    positive,
+    positive_int,
     run_command,
     run_jobs,
 )
-from rhs_isac_ros.experiments.libraries import needed_for
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.optional import optional_import
 
 BANDS = (1, 2, 4, 8)
-FRAMES_IN_ALL = 8
+TOTAL_FRAMES = 8
 PROPOSED, RIVALS = 'alternating', ('direct', 'genetic')
 METHODS = (PROPOSED, *RIVALS, 'lbfgs')
 SAMPLES, HELD_OUT, HELD_OUT_SEED = 10, 500, 0
 TRIALS, QUICK_TRIALS = 30, 3
-# As many update steps for it as the paper's method and `direct` have.
+# The number of update steps of the paper's method and of `direct`.
 LBFGS_STEPS = 400
 
 
 def trial(method: str, n_bands: int, seed: int, samples: int, held_out: int,
           max_steps: int | None) -> dict:
-    """Let one method answer once."""
+    """Run one method in one trial."""
     scenario = Scenario(center_frequencies_hz=[2e9 + 0.5e9 * i for i in range(1, n_bands + 1)],
-                        n_frames=FRAMES_IN_ALL // n_bands)
-    how = {'method': method, 'sampling': 'monte_carlo', 'n_positions': samples, 'seed': seed}
-    # What is loaded and tabulated once is no part of the time.
-    optimize(scenario, **how, max_evaluations=1)
-    # Time of this thread: what else the machine does should not count.
+                        n_frames=TOTAL_FRAMES // n_bands)
+    settings = {'method': method, 'sampling': 'monte_carlo', 'n_positions': samples, 'seed': seed}
+    # Exclude imports and cached tables from the time.
+    optimize(scenario, **settings, max_evaluations=1)
+    # The time of this thread, so that other load on the machine does not count.
     begin = time.thread_time()
     if method == 'lbfgs':
         max_steps = max_steps or LBFGS_STEPS
-    result = optimize(scenario, **how, max_steps=max_steps)
+    result = optimize(scenario, **settings, max_steps=max_steps)
     seconds = time.thread_time() - begin
-    if result.reason == 'interrupted':  # a result, but not the method's
+    if result.reason == INTERRUPTED:  # the result is not that of the complete method
         raise KeyboardInterrupt
-    others = scenario.sample_positions(
+    held_out_positions = scenario.sample_positions(
         held_out, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))
-    bounds = crlb(scenario, result.codebook, others)
+    bounds = crlb(scenario, result.codebook, held_out_positions)
     end = result.history[-1]
     return {'crlb_m2': end.value_m2, 'held_out_m2': float(np.mean(bounds)),
             'held_out_median_m2': float(np.median(bounds)), 'seconds': seconds,
@@ -83,7 +84,7 @@ def trial(method: str, n_bands: int, seed: int, samples: int, held_out: int,
 
 
 def make_jobs(trials: int, max_steps: int | None) -> list[Job]:
-    """All methods of a trial in a row: what slows down the machine slows down all of them."""
+    """List the jobs, with the methods of a trial adjacent so that they run under similar load."""
     return [Job(f'{method}-{n_bands}-bands-trial-{seed}',
                 {'method': method, 'n_bands': n_bands, 'seed': seed, 'samples': SAMPLES,
                  'held_out': HELD_OUT, 'max_steps': max_steps})
@@ -91,7 +92,7 @@ def make_jobs(trials: int, max_steps: int | None) -> list[Job]:
 
 
 class Summary:
-    """The trials, by method and number of bands."""
+    """Statistics of the trials by method and number of bands."""
 
     def __init__(self, trials: Sequence[dict]) -> None:
         self._trials = trials
@@ -99,14 +100,14 @@ class Summary:
         self._time_unit = np.mean(self.of('seconds', PROPOSED, BANDS[0]))
 
     def of(self, name: str, method: str, n_bands: int) -> np.ndarray:
-        """Values of all trials, in their order."""
+        """Return the values of all trials, in order."""
         if name == 'normalised':
             return self.of('seconds', method, n_bands) / self._time_unit
         return np.array([entry[name] for entry in self._trials
                          if (entry['method'], entry['n_bands']) == (method, n_bands)])
 
     def table(self) -> str:
-        """One row for each method and number of bands."""
+        """Return a table with a row for each method and number of bands."""
         rows = []
         for method in METHODS:
             for n in BANDS:
@@ -120,35 +121,35 @@ class Summary:
              'time [s]', 'normalised time'], rows)
 
     def claims(self) -> list[str]:
-        """Say of each claim of the paper whether it holds here."""
-        falls = [self.of('crlb_m2', PROPOSED, n).mean() for n in BANDS]
-        chain = ', '.join(f'{value:.4f}' for value in falls)
+        """Return for each claim of the paper whether it holds here, with the numbers."""
+        means = [self.of('crlb_m2', PROPOSED, n).mean() for n in BANDS]
+        chain = ', '.join(f'{value:.4f}' for value in means)
         bands = ', '.join(map(str, BANDS))
         leads = {rival: [self.of('crlb_m2', rival, n).mean() - own
-                         for n, own in zip(BANDS, falls, strict=True)] for rival in RIVALS}
+                         for n, own in zip(BANDS, means, strict=True)] for rival in RIVALS}
         grows = all(np.all(np.diff(lead) > 0) for lead in leads.values())
-        gaps = ' and '.join(f'{", ".join(f"{gap:.4f}" for gap in lead)} m² on {rival}'
-                            for rival, lead in leads.items())
+        numbers = ' and '.join(f'{", ".join(f"{value:.4f}" for value in lead)} m² over {rival}'
+                               for rival, lead in leads.items())
         return [
             self._less('crlb_m2', 'm²', f'(1) {PROPOSED} reaches a lower CRLB than its rivals'),
             self._less('seconds', 's', f'(2) {PROPOSED} takes less time than its rivals'),
             f'(3) The CRLB of {PROPOSED} falls with N_B: '
-            f'{_verdict(bool(np.all(np.diff(falls) < 0)))}. It is {chain} m² with N_B = {bands}.',
+            f'{_verdict(bool(np.all(np.diff(means) < 0)))}. It is {chain} m² with N_B = {bands}.',
             f'(4) The lead of {PROPOSED} grows with N_B: {_verdict(grows)}. With N_B = {bands} it '
-            f'is {gaps}.']
+            f'is {numbers}.']
 
     def _less(self, name: str, unit: str, claim: str) -> str:
-        holds, sentences = True, []
+        holds, details = True, []
         for n in BANDS:
-            own, against = self.of(name, PROPOSED, n), []
+            own, rivals = self.of(name, PROPOSED, n), []
             for rival in RIVALS:
                 other = self.of(name, rival, n)
                 holds &= bool(own.mean() < other.mean())
-                against.append(f'{other.mean():.4f} {unit} of {rival} (lower in '
+                rivals.append(f'{other.mean():.4f} {unit} of {rival} (lower in '
                                f'{np.sum(own < other)} of {self.count} trials)')
-            sentences.append(f'With N_B = {n}: {own.mean():.4f} {unit} against '
-                             f'{" and ".join(against)}.')
-        return f'{claim} at each N_B: {_verdict(holds)}. {" ".join(sentences)}'
+            details.append(f'With N_B = {n}: {own.mean():.4f} {unit} against '
+                             f'{" and ".join(rivals)}.')
+        return f'{claim} at each N_B: {_verdict(holds)}. {" ".join(details)}'
 
 
 def _verdict(holds: bool) -> str:
@@ -156,8 +157,8 @@ def _verdict(holds: bool) -> str:
 
 
 def picture(summary: Summary) -> bytes:
-    """Draw both panels; bars are standard deviations, as in the paper."""
-    with needed_for('drawing the figure'):
+    """Draw both panels as PNG; error bars are standard deviations, as in the paper."""
+    with optional_import('drawing the figure', extra='plot'):
         from matplotlib.figure import Figure
     figure = Figure(figsize=(10, 4), layout='constrained')
     panels = figure.subplots(1, 2)
@@ -167,7 +168,7 @@ def picture(summary: Summary) -> bytes:
         for offset, method in zip(np.linspace(-0.12, 0.12, len(METHODS)), METHODS, strict=True):
             means, stds = np.array(
                 [mean_and_std(summary.of(name, method, n)) for n in BANDS]).T
-            # Side by side, so that the bars do not hide each other. One trial has none.
+            # Shifted so that the bars do not overlap. A single trial has no deviation.
             axes.errorbar(np.arange(len(BANDS)) + offset, means, np.nan_to_num(stds),
                           marker='o', capsize=3, label=method)
         axes.set(xlabel='number of bands N_B', ylabel=label, ylim=(0, None))
@@ -180,14 +181,14 @@ def picture(summary: Summary) -> bytes:
 
 def reproduce(trials: int, steps: int | None, n_jobs: int, dask: str | None,
               output: Path) -> None:
-    """Run what is not done yet, print the report and write the files."""
+    """Run the jobs that have no results yet, print the report and write the files."""
     jobs = make_jobs(trials, steps)
     results = run_jobs(trial, jobs, output / 'jobs', n_jobs, dask)
     entries = [{**job.arguments, **result} for job, result in zip(jobs, results, strict=True)]
     summary = Summary(entries)
     report = '\n\n'.join([
         f'Mean ± standard deviation of {trials} trials with {SAMPLES} samples each; {HELD_OUT} '
-        f'positions held out. Time is that of one core; it is normalised to {PROPOSED} with '
+        f'held-out positions. Time is CPU time on one core, normalised to {PROPOSED} with '
         f'N_B = {BANDS[0]}.',
         summary.table(), *summary.claims()])
     write_whole(output / 'fig3.png', picture(summary))
@@ -198,8 +199,8 @@ def reproduce(trials: int, steps: int | None, n_jobs: int, dask: str | None,
 
 
 def add_steps(parser: argparse.ArgumentParser) -> None:
-    """Add the option that cuts every method short."""
-    parser.add_argument('--steps', type=positive, metavar='N',
+    """Add the option that limits the steps of every method."""
+    parser.add_argument('--steps', type=positive_int, metavar='N',
                         help="limit of update steps (default: each method's own)")
 
 

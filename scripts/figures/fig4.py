@@ -1,23 +1,24 @@
 """Fig. 4 of the paper: positioning error and capacity loss by codebook and estimator.
 
-Problem: at Table I, a user is somewhere in the region of interest. The base station estimates
-where from the signals that one codebook gives, then steers its beam there. How large is (a) the
-mean squared error of the position, and (b) the capacity that the error costs? The codebooks are
+Problem: a user is somewhere in the region of interest of Table I. The base station estimates the
+position from the signals that a codebook yields, then steers its beam there. How large are (a) the
+mean squared error of the position and (b) the capacity loss due to the error? The codebooks are
 `optimised` (for the average CRLB, as in the paper), `ambiguity`, and the paper's benchmarks
-`directional` and `random`. The estimators are `neural`, the paper's network of one hidden layer,
-trained anew in every trial, and `bayes`, the posterior mean. The paper claims that, with its
+`directional` and `random`. The estimators are `neural`, the paper's network with one hidden layer,
+retrained in every trial, and `bayes`, the posterior mean. The paper claims that, with its
 network, `optimised` has
 
 (1) a mean squared error 42 % below directional's and 69 % below random's,
 (2) a median capacity loss 82 % below directional's and 86 % below random's,
 (3) an interquartile range of the loss 50 % below directional's and 64 % below random's.
 
-All codebooks face the same positions, multipath and noise; (b) takes the best training of each.
+All codebooks are evaluated with the same positions, multipath and noise; (b) uses the best
+training of each.
 """
 
 import os
 
-# One thread for each job. This must come before NumPy is loaded.
+# One thread per job. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
@@ -32,14 +33,14 @@ from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codeboo
 from rhs_isac_ros.experiments import (
     Job,
     parse_options,
-    positive,
+    positive_int,
     run_command,
     run_jobs,
 )
-from rhs_isac_ros.experiments.libraries import needed_for
 from rhs_isac_ros.link import Outcome, capacity, choose_beam
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning import NeuralEstimator, make_estimator
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.training import train
@@ -48,14 +49,14 @@ CONFIG = Path(__file__).parents[2] / 'config'
 TRIALS, QUICK_TRIALS = 50, 3
 PAIRS, QUICK_PAIRS = 100_000, 20_000
 POSITIONS, QUICK_POSITIONS = 1000, 500
-# Positions of a job of (b), and of a call of an estimator.
+# Positions per job of (b), and per call of an estimator.
 BLOCK = 50
-# The sequence of pairs that all are measured on; trainings draw others.
+# Seed of the test pairs, which are the same for all; trainings use other seeds.
 TEST_SEED = 1 << 20
 
 
 def codebooks(scenario: Scenario) -> dict[str, Codebook]:
-    """The codebooks to compare."""
+    """Return the codebooks to compare, by name."""
     return {
         'optimised': Codebook.load(CONFIG / 'codebook_crlb.yaml'),
         'ambiguity': Codebook.load(CONFIG / 'codebook_ambiguity.yaml'),
@@ -64,13 +65,13 @@ def codebooks(scenario: Scenario) -> dict[str, Codebook]:
 
 
 def locate(estimator: str, codebook: Mapping[str, Any], n: int, pairs: int, seed: int) -> dict:
-    """Locate the test positions with an estimator, trained first if it has to be."""
-    scenario, known = Scenario(), Codebook.from_parameters(codebook)
+    """Locate the test positions with an estimator, after training it if necessary."""
+    scenario, loaded = Scenario(), Codebook.from_parameters(codebook)
     if estimator == 'neural':
-        locator = NeuralEstimator(scenario, known, train(scenario, known, pairs, seed))
+        locator = NeuralEstimator(scenario, loaded, train(scenario, loaded, pairs, seed))
     else:
-        locator = make_estimator(estimator, scenario, known)
-    positions, received = simulate_pairs(scenario, known, n, TEST_SEED)
+        locator = make_estimator(estimator, scenario, loaded)
+    positions, received = simulate_pairs(scenario, loaded, n, TEST_SEED)
     estimates = [locator.estimate(received[k:k + BLOCK]) for k in range(0, n, BLOCK)]
     means = np.concatenate([estimate.mean for estimate in estimates])
     covariances = np.concatenate([estimate.covariance for estimate in estimates])
@@ -79,40 +80,40 @@ def locate(estimator: str, codebook: Mapping[str, Any], n: int, pairs: int, seed
             'covariances': covariances.tolist()}
 
 
-def lose(first: int, estimates: Mapping[str, Mapping[str, Any]]) -> dict:
-    """Capacity losses [bit/s, per cent] of some test positions, for everybody's estimates."""
+def capacity_losses(first: int, estimates: Mapping[str, Mapping[str, Any]]) -> dict:
+    """Return the capacity losses [bit/s, per cent] of a block of test positions by estimate."""
     scenario = Scenario()
     n = len(next(iter(estimates.values()))['means'])
-    # Positions do not depend on the codebook.
+    # The positions do not depend on the codebook.
     truth, _ = simulate_pairs(scenario, directional_codebook(scenario), n, TEST_SEED, first)
-    perfect_bps = [choose_beam(scenario, place).expected_bps for place in truth]
+    perfect_bps = [choose_beam(scenario, position).expected_bps for position in truth]
     losses: dict[str, list] = {}
     for name, estimate in estimates.items():
         losses[name] = []
-        for place, best_bps, mean, covariance in zip(
+        for position, best_bps, mean, covariance in zip(
                 truth, perfect_bps, estimate['means'], estimate['covariances'], strict=True):
             beam = choose_beam(scenario, np.array(mean), np.array(covariance)).beam
-            one = Outcome(float(capacity(scenario, beam, place[None])[0]), best_bps)
-            losses[name].append([one.loss_bps, one.loss_percent])
+            outcome = Outcome(float(capacity(scenario, beam, position[None])[0]), best_bps)
+            losses[name].append([outcome.loss_bps, outcome.loss_percent])
     return losses
 
 
 def location_jobs(books: Mapping[str, Codebook], trials: int, pairs: int, n: int) -> list[Job]:
-    """A job for every training, and one for every codebook with `bayes`."""
+    """List a job for every training, and one for every codebook with `bayes`."""
     return [Job(f'{estimator}-{name}-{seed}',
-                {'estimator': estimator, 'codebook': plain(book), 'n': n, 'seed': seed,
+                {'estimator': estimator, 'codebook': as_json(book), 'n': n, 'seed': seed,
                  'pairs': pairs if estimator == 'neural' else 0})
             for seed in range(trials) for name, book in books.items()
             for estimator in ESTIMATORS if estimator == 'neural' or seed == 0]
 
 
-def plain(codebook: Codebook) -> dict[str, Any]:
-    """A codebook as JSON holds it, without what is told of it."""
+def as_json(codebook: Codebook) -> dict[str, Any]:
+    """Return the parameters of a codebook with plain lists."""
     return {name: np.asarray(value).tolist() for name, value in codebook.to_parameters().items()}
 
 
 def loss_jobs(best: Mapping[str, dict], n: int) -> list[Job]:
-    """A job for every block of positions."""
+    """List a job for every block of positions."""
     return [Job(f'loss-{first}',
                 {'first': first, 'estimates': {
                     name: {key: result[key][first:first + BLOCK]
@@ -122,7 +123,7 @@ def loss_jobs(best: Mapping[str, dict], n: int) -> list[Job]:
 
 
 def measure(options: argparse.Namespace) -> Summary:
-    """Run what is not done yet."""
+    """Run the jobs that have no results yet and summarise all."""
     books = codebooks(Scenario())
     jobs = location_jobs(books, options.trials, options.pairs, options.positions)
     results = dict(zip([job.name for job in jobs], run_jobs(
@@ -133,9 +134,10 @@ def measure(options: argparse.Namespace) -> Summary:
               for estimator in ESTIMATORS for name in books}
     best = {f'{estimator} {name}': min(entries, key=lambda entry: entry['mse_m2'])
             for (estimator, name), entries in trials.items()}
-    # Blocks belong to the estimates that were the best when they were done.
-    blocks = run_jobs(lose, loss_jobs(best, options.positions), options.output / 'jobs',
-                      options.jobs, options.dask)
+    # A stored block is reused only if the best estimates are still the same.
+    blocks = run_jobs(
+        capacity_losses, loss_jobs(best, options.positions), options.output / 'jobs',
+        options.jobs, options.dask)
     truth, _ = simulate_pairs(
         Scenario(), books['directional'], options.positions, TEST_SEED)
     losses = {}
@@ -149,13 +151,13 @@ def measure(options: argparse.Namespace) -> Summary:
 
 
 def reproduce(options: argparse.Namespace) -> None:
-    """Measure, print the report and write the files."""
+    """Run the experiment, print the report and write the files."""
     summary = measure(options)
     report = '\n\n'.join([
         f'{options.trials} trainings with {options.pairs} pairs each; {options.positions} test '
-        'positions. Mean ± standard deviation over trainings; `bayes` needs none.',
+        'positions. Mean ± standard deviation over trainings; `bayes` needs no training.',
         summary.table(),
-        'How far below each benchmark with the same estimator, with 95 % intervals:',
+        'Reduction relative to each benchmark with the same estimator, with 95 % intervals:',
         summary.claims()])
     for name, text in tables(summary).items():
         write_whole(options.output / name, text)
@@ -166,18 +168,18 @@ def reproduce(options: argparse.Namespace) -> None:
 
 def add_sizes(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment."""
-    parser.add_argument('--pairs', type=positive, metavar='N',
-                        help=f'pairs of a training (default: {PAIRS}, quick {QUICK_PAIRS})')
-    parser.add_argument('--positions', type=positive, metavar='N',
+    parser.add_argument('--pairs', type=positive_int, metavar='N',
+                        help=f'pairs per training (default: {PAIRS}, quick {QUICK_PAIRS})')
+    parser.add_argument('--positions', type=positive_int, metavar='N',
                         help=f'test positions (default: {POSITIONS}, quick {QUICK_POSITIONS})')
     parser.add_argument('--ros', action='store_true',
-                        help='measure (b) through a running network instead, with the default '
-                             'codebook, and compare; --positions counts cycles')
+                        help='instead, measure (b) in a running network with the default codebook '
+                             'and compare; --positions is the number of cycles')
 
 
 def over_ros(options: argparse.Namespace) -> None:
-    """Measure (b) through a running network; only this needs ROS."""
-    with needed_for('measuring over ROS'):
+    """Measure (b) in a running network; only this needs ROS."""
+    with optional_import('measuring over ROS'):
         from parts import fig4_ros
     options.output.mkdir(parents=True, exist_ok=True)
     cycles = options.positions or (fig4_ros.QUICK_CYCLES if options.quick else fig4_ros.CYCLES)

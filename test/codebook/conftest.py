@@ -1,4 +1,4 @@
-"""A small scenario that optimises fast, and problems whose minimum is known."""
+"""A small scenario that is fast to optimise, and problems with a known minimum."""
 
 import dataclasses
 
@@ -12,16 +12,16 @@ N_ANALOG = 10
 
 
 class Quadratic:
-    """A separable quadratic of 20 variables, the first 10 of them in a box; records its points.
+    """A separable quadratic of 20 variables, the first 10 of them bounded; records its points.
 
-    As `Problem` does, it takes the nearest point in the box for one outside.
+    Like `Problem`, it clips the bounded variables.
 
     Attributes
     ----------
     best
-        Where its minimum is, which is `floor`.
+        Position of the minimum, whose value is `floor`.
     points
-        Where it was evaluated.
+        Points at which it was evaluated.
     """
 
     n_analog = N_ANALOG
@@ -48,7 +48,7 @@ class Quadratic:
 
 
 class Flat(Quadratic):
-    """The same value everywhere."""
+    """A constant function."""
 
     def value(self, variables: np.ndarray) -> float:
         self.points.append(np.array(variables))
@@ -65,7 +65,7 @@ def scenario(small) -> Scenario:
 
 @pytest.fixture
 def quadratic():
-    """Function of a seed: a quadratic."""
+    """Callable that takes a seed and returns a quadratic."""
     return Quadratic
 
 
@@ -76,7 +76,7 @@ def flat() -> Quadratic:
 
 @pytest.fixture
 def search_of():
-    """Function that makes a search of a problem, from the middle of the box."""
+    """Callable that creates a search for a problem, by default from the middle of the bounds."""
     def make(problem, max_steps=10, max_evaluations=None, *, start=None, seed=0, progress=None,
              done=(0, 0)) -> Search:
         start = np.full(20, 0.5) if start is None else start

@@ -1,4 +1,4 @@
-"""Algorithm 1: which variables it changes when, its steps, and its end."""
+"""Algorithm 1: the variables of each sub-problem, the steps, and the stopping rules."""
 
 import numpy as np
 import pytest
@@ -10,18 +10,18 @@ from rhs_isac_ros.codebook.alternating import minimize_alternating
 class Phase:
     """One call of the interior point method."""
 
-    def __init__(self, start, chosen, max_steps):
-        self.start, self.chosen, self.max_steps = np.array(start), np.array(chosen), max_steps
+    def __init__(self, start, free, max_steps):
+        self.start, self.free, self.max_steps = np.array(start), np.array(free), max_steps
         self.points, self.found = [], None
 
 
 @pytest.fixture
 def phases(monkeypatch):
-    """All sub-problems, with the points that were evaluated for each."""
+    """Record the sub-problems with the points evaluated in each."""
     seen, minimize = [], alternating.minimize_interior_point
 
-    def spy(search, start, chosen, max_steps):
-        phase = Phase(start, chosen, max_steps)
+    def spy(search, start, free, max_steps):
+        phase = Phase(start, free, max_steps)
         seen.append(phase)
         evaluate = search.value_and_gradient
 
@@ -31,7 +31,7 @@ def phases(monkeypatch):
 
         with monkeypatch.context() as patch:
             patch.setattr(search, 'value_and_gradient', record)
-            phase.found = minimize(search, start, chosen, max_steps)
+            phase.found = minimize(search, start, free, max_steps)
         return phase.found
 
     monkeypatch.setattr(alternating, 'minimize_interior_point', spy)
@@ -48,11 +48,11 @@ def test_changes_only_analog_in_sp1_and_only_digital_in_sp2(quadratic, search_of
     for number, phase in enumerate(phases):
         changed = np.array(phase.points) != phase.start
         assert changed.any() or number >= 2
-        # The configurations first, then the combining vectors.
+        # sP1 changes the configurations, sP2 the combining vectors.
         assert not changed[:, ~analog if number % 2 == 0 else analog].any()
 
 
-def test_every_sub_problem_starts_from_the_best_of_the_one_before(quadratic, search_of, phases):
+def test_each_sub_problem_starts_at_the_best_point_of_the_last(quadratic, search_of, phases):
     problem = quadratic(1)
     search = search_of(problem, 80, start=np.linspace(0.2, 0.8, 20))
     minimize_alternating(search)
@@ -74,14 +74,14 @@ def test_sub_problems_share_the_steps_evenly(quadratic, search_of, phases, max_s
     assert len(search.history) <= max_steps
 
 
-def test_all_iterations_are_done_as_long_as_something_changes(quadratic, search_of):
+def test_all_iterations_run_while_variables_change(quadratic, search_of):
     search = search_of(quadratic(3), 17)
     assert minimize_alternating(search) == '4 iterations of 2 x 2 steps'
     assert len(search.history) == 16
 
 
 @pytest.mark.parametrize('max_steps', [1, 8, 15])
-def test_few_steps_change_something_and_are_kept(quadratic, search_of, max_steps):
+def test_a_few_steps_suffice_for_progress_and_are_not_exceeded(quadratic, search_of, max_steps):
     problem = quadratic(3)
     search = search_of(problem, max_steps)
     minimize_alternating(search)
@@ -95,14 +95,14 @@ def test_stops_when_an_iteration_changes_nothing(flat, search_of, phases):
 
 
 @pytest.mark.parametrize(('changing', 'calls'), [((0, 1, 2), 6), ((0, 3), 6), ((1,), 4)])
-def test_one_sub_problem_that_changes_is_enough_to_go_on(
+def test_a_change_in_one_sub_problem_suffices_to_continue(
         flat, search_of, monkeypatch, changing, calls):
-    """Sub-problems by their numbers: even ones are sP1, odd ones sP2."""
+    """Even numbers are sP1, odd numbers sP2."""
     seen = []
 
-    def minimize(search, start, chosen, max_steps):
-        seen.append(chosen)
-        return start + 0.01 * chosen if len(seen) - 1 in changing else start
+    def minimize(search, start, free, max_steps):
+        seen.append(free)
+        return start + 0.01 * free if len(seen) - 1 in changing else start
 
     monkeypatch.setattr(alternating, 'minimize_interior_point', minimize)
     reason = minimize_alternating(search_of(flat, 80))

@@ -1,4 +1,4 @@
-"""The codebook: checks, identity, parameters and files; and the one that is shipped."""
+"""The codebook: checks, id, parameters and files; and the shipped codebooks."""
 
 import dataclasses
 import math
@@ -18,7 +18,7 @@ from rhs_isac_ros.model import Scenario
 CONFIG = Path(__file__).parents[2] / 'config'
 
 
-def test_arrays_are_copied_checked_and_frozen():
+def test_arrays_are_copied_converted_and_read_only():
     analog = np.zeros((2, 1, 3), dtype=int)
     codebook = Codebook(analog, [[[[1]]], [[[2j]]]])
     analog[:] = 1
@@ -57,7 +57,7 @@ def test_malformed_content_is_an_error(changes, words):
         assert word in str(caught.value)
 
 
-def test_id_is_that_of_the_content_alone(small):
+def test_the_id_depends_on_the_arrays_only(small):
     codebook = small.codebook
     assert re.fullmatch('cb[0-9a-f]{16}', codebook.id)
     noted = dataclasses.replace(codebook, average_crlb_m2=1.0, provenance='noted')
@@ -67,20 +67,20 @@ def test_id_is_that_of_the_content_alone(small):
     digital[0, 2, 1, 1] += 1e-18j
     swapped = Codebook(codebook.analog[:, ::-1], codebook.digital)
     others = [Codebook(analog, codebook.digital), Codebook(codebook.analog, digital), swapped]
-    # The same numbers in another shape are another codebook.
+    # The same numbers in another shape make a different codebook.
     flat = np.full(4, 0.5)
     others += [Codebook(np.full((1, 1, 4), 0.5), flat.reshape(1, 1, 1, 4)),
                Codebook(np.full((1, 1, 4), 0.5), flat.reshape(1, 4, 1, 1))]
     assert len({codebook.id, *(other.id for other in others)}) == 6
 
 
-def test_id_does_not_change_between_versions():
-    """Recordings and files hold ids: their definition is part of the format."""
+def test_the_id_is_the_same_in_all_versions():
+    """Recordings and files contain ids, so their definition is part of the format."""
     codebook = Codebook(np.full((1, 1, 1), 2958 / 4e5), np.ones((1, 1, 1, 1)))
     assert codebook.id == 'cb756847581339e099'
 
 
-def test_check_accepts_what_fits(case):
+def test_check_accepts_a_matching_scenario(case):
     case.codebook.check(case.scenario)
 
 
@@ -92,7 +92,7 @@ def test_check_accepts_what_fits(case):
     ({'n_subbands': 2}, 'digital: shape (1, 3, 2, 2), expected [N_B, N_SB, F, K] = (1, 2, 2, 2)'),
     ({'max_power_w': 2e-3}, 'power 0.001 W, expected max_power_w = 0.002 W'),
 ])
-def test_check_names_what_does_not_fit(small, changes, words):
+def test_check_names_the_size_that_differs(small, changes, words):
     with pytest.raises(CodebookError, match=re.escape(words)):
         small.codebook.check(dataclasses.replace(small.scenario, **changes))
 
@@ -106,7 +106,7 @@ def test_check_finds_one_wrong_frame(small):
     Codebook(small.codebook.analog, small.codebook.digital * (1 + 1e-8)).check(small.scenario)
 
 
-def test_a_file_keeps_every_bit(case, tmp_path):
+def test_a_file_preserves_every_bit(case, tmp_path):
     path = tmp_path / 'codebook.yaml'
     codebook = dataclasses.replace(
         case.codebook, average_crlb_m2=0.1 + 0.2, provenance='by hand: "é"\n')
@@ -126,8 +126,8 @@ def test_metadata_is_optional(small, tmp_path):
     assert loaded.provenance == ''
 
 
-def test_file_is_a_ros_2_parameter_file(tmp_path):
-    """A list of mixed integers and floats, as [1, 2.5], would abort a node's start."""
+def test_the_file_is_a_ros_2_parameter_file(tmp_path):
+    """A list with integers and floats, such as [1, 2.5], would keep a node from starting."""
     codebook = Codebook(
         [[[0, 1, 0.5]]], [[[[1e-5, 1]]]], average_crlb_m2=2, provenance='x')
     codebook.save(tmp_path / 'codebook.yaml')
@@ -146,7 +146,7 @@ def test_file_is_a_ros_2_parameter_file(tmp_path):
 
 
 def test_an_id_whose_digits_look_like_a_number_stays_a_string(tmp_path):
-    """ROS reads 756847581339e099 as 7.568e+110, whatever YAML says; the letters prevent it."""
+    """ROS parses 756847581339e099 as 7.568e+110 even if quoted; the prefix prevents this."""
     codebook = Codebook(np.full((1, 1, 1), 2958 / 4e5), np.ones((1, 1, 1, 1)))
     codebook.save(tmp_path / 'codebook.yaml')
     text = (tmp_path / 'codebook.yaml').read_text(encoding='utf-8')
@@ -164,6 +164,7 @@ MALFORMED = [
     ('codebook.shape', None, 'codebook.shape'),
     ('codebook.shape', [1, 3, 2, 2], 'codebook.shape: [1, 3, 2, 2], expected [N_B, N_SB, F'),
     ('codebook.shape', [1, 3, 2, 2, 0], 'codebook.shape: [1, 3, 2, 2, 0], expected'),
+    ('codebook.shape', [2**20] * 5, 'values, expected 1208925819614629174706176 = '),
     ('codebook.shape', [1, 3, 2, 2, -16], 'codebook.shape: [1, 3, 2, 2, -16], expected'),
     ('codebook.shape', 5, 'codebook.shape'),
     ('codebook.shape', [1, 3, 2, 2, 9], 'codebook.analog: 32 values, expected 18 = 1 x 2 x 9'),
@@ -193,7 +194,7 @@ def test_a_missing_parameter_is_an_error(small, name):
 
 
 @pytest.mark.parametrize('change', [{}, {'codebook.id': ''}], ids=['missing', 'empty'])
-def test_the_id_may_be_left_out(small, change):
+def test_the_id_is_optional(small, change):
     parameters = small.codebook.to_parameters()
     del parameters['codebook.id']
     assert Codebook.from_parameters(parameters | change).id == small.codebook.id
@@ -245,7 +246,7 @@ def test_any_node_of_a_parameter_file_may_hold_the_codebook(small, tmp_path):
     assert Codebook.load(path).id == small.codebook.id
 
 
-def test_a_failing_write_keeps_the_old_file_alone(small, tmp_path, monkeypatch):
+def test_a_failed_write_leaves_only_the_old_file(small, tmp_path, monkeypatch):
     path = tmp_path / 'codebook.yaml'
     small.codebook.save(path)
     before = path.read_bytes()
@@ -265,7 +266,7 @@ def test_a_failing_write_keeps_the_old_file_alone(small, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ['codebook.yaml']
 
 
-def test_saving_into_no_folder_is_an_error(small, tmp_path):
+def test_saving_into_a_missing_folder_is_an_error(small, tmp_path):
     with pytest.raises(OSError, match='none'):
         small.codebook.save(tmp_path / 'none' / 'codebook.yaml')
 
@@ -280,8 +281,8 @@ SHIPPED = {'codebook.yaml': 'ambiguity', 'codebook_ambiguity.yaml': 'ambiguity',
 
 
 @pytest.mark.parametrize('name', SHIPPED)
-def test_shipped_codebooks_are_feasible_and_what_they_say(name):
-    """Held-out positions; observing all elements would give about 0.018 m^2."""
+def test_shipped_codebooks_are_feasible_and_match_their_metadata(name):
+    """On held-out positions; observing all elements would give about 0.018 m^2."""
     scenario, codebook = Scenario(), Codebook.load(CONFIG / name)
     codebook.check(scenario)
     positions = scenario.sample_positions(2000, np.random.default_rng(2024))
@@ -292,7 +293,7 @@ def test_shipped_codebooks_are_feasible_and_what_they_say(name):
 
 
 def test_the_default_codebook_confuses_fewer_positions():
-    """On pairs that no optimisation saw."""
+    """On held-out pairs."""
     scenario, rng = Scenario(), np.random.default_rng(77)
     firsts = scenario.sample_positions(4000, rng)
     held_out = PairwiseErrorCost(

@@ -1,4 +1,4 @@
-"""The optimiser as a command: files, and what happens to them when something goes wrong."""
+"""The optimiser as a command: its files, also after errors and interrupts."""
 
 import argparse
 import errno
@@ -13,14 +13,14 @@ import yaml
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, Provenance, command, directional_codebook
 from rhs_isac_ros.codebook.__main__ import main
-from rhs_isac_ros.codebook.optimize import INTERRUPTED, _Keeper
+from rhs_isac_ros.codebook.optimize import INTERRUPTED, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario, streams
 
 
 @pytest.fixture
 def files(scenario, tmp_path):
-    """A folder with the file of the small scenario."""
+    """Folder with the file of the small scenario."""
     (tmp_path / 'scenario.yaml').write_text(
         yaml.safe_dump(scenario.changes()), encoding='utf-8')
     return tmp_path
@@ -28,7 +28,7 @@ def files(scenario, tmp_path):
 
 @pytest.fixture
 def call(files):
-    """Function that calls the command in that folder with few samples, and returns its code."""
+    """Callable that runs the command in that folder with few samples and returns its exit code."""
     def run(*arguments, output='codebook.yaml'):
         return main(['--scenario', str(files / 'scenario.yaml'), '--positions', '16', '--quiet',
                      '--output', str(files / output), *map(str, arguments)])
@@ -37,7 +37,7 @@ def call(files):
 
 @pytest.fixture
 def interrupted_after(monkeypatch):
-    """Function that sets after how many evaluations Ctrl-C comes."""
+    """Callable that sets the number of evaluations before a KeyboardInterrupt."""
     def arrange(n):
         evaluate, calls = Problem.value_and_gradient, []
 
@@ -50,7 +50,7 @@ def interrupted_after(monkeypatch):
     return arrange
 
 
-def test_writes_the_codebook_that_it_describes(call, files, scenario, capsys):
+def test_the_summary_describes_the_codebook_written(call, files, scenario, capsys):
     assert call('--steps', 8, '--seed', 3) == 0
     codebook = Codebook.load(files / 'codebook.yaml')
     codebook.check(scenario)
@@ -71,16 +71,17 @@ def test_table_1_is_the_default_scenario(files):
     Codebook.load(output).check(Scenario())
 
 
-def test_what_is_started_from(call, files, scenario):
+def test_the_start_is_a_name_or_a_file(call, files, scenario):
     expected = directional_codebook(scenario)
-    expected.save(files / 'mine.yaml')
-    for start in ('directional', files / 'mine.yaml'):
+    expected.save(files / 'start.yaml')
+    for start in ('directional', files / 'start.yaml'):
         assert call('--method', 'random', '--start', start) == 0
         codebook = Codebook.load(files / 'codebook.yaml')
         np.testing.assert_array_equal(codebook.analog, expected.analog)
 
 
-def test_ctrl_c_keeps_the_best_and_says_so(call, files, interrupted_after, capsys):
+def test_ctrl_c_writes_the_best_codebook_and_reports_it(
+        call, files, interrupted_after, capsys):
     interrupted_after(6)
     assert call('--steps', 30) == 0
     assert INTERRUPTED in capsys.readouterr().out
@@ -89,7 +90,7 @@ def test_ctrl_c_keeps_the_best_and_says_so(call, files, interrupted_after, capsy
     assert 2 <= made.steps <= 6
 
 
-def test_resume_goes_on_from_the_output(call, files):
+def test_resume_continues_from_the_output(call, files):
     assert call('--steps', 5) == 0
     first = Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance)
     assert call('--steps', 12, '--resume') == 0
@@ -99,14 +100,14 @@ def test_resume_goes_on_from_the_output(call, files):
     assert second.value_m2 < first.value_m2
 
 
-def test_resume_prefers_what_a_stopped_run_left(call, files, monkeypatch):
-    """A run that is killed leaves OUTPUT.part, and the last good file as it was."""
+def test_resume_prefers_the_partial_file_of_an_unfinished_run(call, files, monkeypatch):
+    """A killed run leaves OUTPUT.part and does not change the last output."""
     assert call('--steps', 5) == 0
     good = (files / 'codebook.yaml').read_bytes()
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
 
     class KilledError(BaseException):
-        """What no code of ours sees."""
+        """An exception that no code handles."""
 
     evaluate, calls = Problem.value_and_gradient, []
 
@@ -143,7 +144,7 @@ def fails_with(call, capsys, words, *arguments, **options):
     (['--steps', '-1'], ['max_steps: -1']),
     (['--start', '/no/file.yaml'], ['/no/file.yaml']),
     (['--resume', '--seed', '7'], ['seed: 7', 'as in the codebook to resume from'])])
-def test_wrong_arguments_leave_the_last_good_file(call, files, capsys, arguments, words):
+def test_invalid_arguments_leave_the_last_output(call, files, capsys, arguments, words):
     assert call('--steps', 3) == 0
     good = (files / 'codebook.yaml').read_bytes()
     fails_with(call, capsys, words, *arguments)
@@ -151,7 +152,7 @@ def test_wrong_arguments_leave_the_last_good_file(call, files, capsys, arguments
 
 
 @pytest.mark.parametrize('option', ['--method', '--objective', '--sampling'])
-def test_unknown_names_are_errors_of_the_command_line(call, capsys, option):
+def test_unknown_names_are_usage_errors(call, capsys, option):
     with pytest.raises(SystemExit) as caught:
         call(option, 'magic')
     assert caught.value.code == 2
@@ -159,7 +160,7 @@ def test_unknown_names_are_errors_of_the_command_line(call, capsys, option):
 
 
 @pytest.mark.parametrize('spoil', ['other scenario', 'nan', 'power', 'cut off'])
-def test_a_start_that_cannot_be_used_is_an_error(call, files, capsys, table1, small, spoil):
+def test_an_unusable_start_is_an_error(call, files, capsys, table1, small, spoil):
     bad = files / 'bad.yaml'
     (table1 if spoil == 'other scenario' else small).codebook.save(bad)
     text = bad.read_text(encoding='utf-8')
@@ -178,19 +179,19 @@ def test_a_start_that_cannot_be_used_is_an_error(call, files, capsys, table1, sm
 
 @pytest.mark.parametrize(('text', 'word'), [
     ('n_feedz: 3', 'n_feedz'), ('n_feeds: .nan', 'n_feeds'), ('n_feeds: [', 'scenario.yaml')])
-def test_a_wrong_scenario_is_an_error(call, files, capsys, text, word):
+def test_an_invalid_scenario_is_an_error(call, files, capsys, text, word):
     (files / 'scenario.yaml').write_text(text, encoding='utf-8')
     fails_with(call, capsys, [word])
 
 
-def test_a_place_that_cannot_be_written_is_known_before_the_work(call, files, capsys):
+def test_an_output_that_cannot_be_written_is_reported_before_the_search(call, files, capsys):
     fails_with(call, capsys, ['none/codebook.yaml', 'can be written'],
                output='none/codebook.yaml')
     fails_with(call, capsys, ['none/p.png'], '--plot', files / 'none' / 'p.png')
 
 
 def full_disk(monkeypatch, path):
-    """No room for what is written beside `path`."""
+    """Make every write to the folder of `path` fail."""
     save = Codebook.save
 
     def save_or_not(codebook, target):
@@ -200,22 +201,22 @@ def full_disk(monkeypatch, path):
     monkeypatch.setattr(Codebook, 'save', save_or_not)
 
 
-def test_a_full_disk_loses_neither_the_last_file_nor_the_result(
+def test_a_full_disk_loses_neither_the_last_output_nor_the_result(
         call, files, capsys, monkeypatch, tmp_path_factory):
     assert call('--steps', 3) == 0
     good = (files / 'codebook.yaml').read_bytes()
     rescue = tmp_path_factory.mktemp('rescue')
     monkeypatch.setattr('tempfile.tempdir', str(rescue))
     full_disk(monkeypatch, files / 'codebook.yaml')
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     fails_with(call, capsys, ['codebook.yaml', 'No space left', str(rescue)], '--steps', 4)
     assert (files / 'codebook.yaml').read_bytes() == good
     (saved,) = rescue.glob('*/codebook.yaml')
     assert Provenance.parse(Codebook.load(saved).provenance).steps == 4
 
 
-def test_a_full_disk_on_the_way_is_a_warning(call, files, capsys, monkeypatch):
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+def test_a_partial_file_that_cannot_be_written_is_a_warning(call, files, capsys, monkeypatch):
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     save = Codebook.save
 
     def save_or_not(codebook, target):
@@ -235,7 +236,7 @@ def test_progress_shows_value_and_step(files, capfd):
         assert 'm^2' in capfd.readouterr().err
 
 
-def test_without_tqdm_there_is_progress_all_the_same(files, capsys, monkeypatch):
+def test_without_tqdm_progress_is_printed_as_lines(files, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'tqdm', None)
     assert main(['--scenario', str(files / 'scenario.yaml'), '--positions', '16',
                  '--steps', '3', '--output', str(files / 'codebook.yaml')]) == 0
@@ -248,7 +249,7 @@ def test_the_picture_is_drawn(call, files):
     assert (files / 'picture.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_it_is_a_command_of_its_own(files):
+def test_the_package_is_executable(files):
     done = subprocess.run(
         [sys.executable, '-m', 'rhs_isac_ros.codebook', '--scenario', files / 'scenario.yaml',
          '--method', 'random', '--positions', '4', '--output', files / 'codebook.yaml'],

@@ -1,4 +1,4 @@
-"""The interior point method on all variables."""
+"""The interior point method on all variables at once."""
 
 import numpy as np
 import pytest
@@ -7,13 +7,13 @@ from rhs_isac_ros.codebook.direct import minimize_direct
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_finds_the_minimum_over_analog_and_digital_together(quadratic, search_of, seed):
+def test_finds_the_minimum_over_analog_and_digital_jointly(quadratic, search_of, seed):
     problem = quadratic(seed)
     search = search_of(problem, 400)
     assert minimize_direct(search) == '400 steps at most'
     np.testing.assert_allclose(search.best, problem.best, atol=0.02)
-    together = [np.all((point != search.start)[[0, 19]]) for point in problem.points[1:]]
-    assert np.mean(together) > 0.9
+    joint = [np.all((point != search.start)[[0, 19]]) for point in problem.points[1:]]
+    assert np.mean(joint) > 0.9
 
 
 def test_begins_at_the_start_and_stops_at_the_limit_of_steps(quadratic, search_of):

@@ -1,4 +1,4 @@
-"""The directional codebook: constraints, and where its beams look."""
+"""The directional codebook: its constraints and the directions of its beams."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_constraints_hold_and_sub_bands_share_the_power_evenly(scenario):
     assert codebook.provenance == 'directional'
 
 
-def test_nothing_is_random():
+def test_the_codebook_is_deterministic():
     one, other = (directional_codebook(Scenario(), np.random.default_rng(n)) for n in (1, 2))
     assert one.id == other.id == directional_codebook(Scenario()).id
 
@@ -51,8 +51,8 @@ def test_focal_points_scan_the_width_of_the_region(scenario):
 
 
 @pytest.mark.parametrize('scenario', SCENARIOS[:2])
-def test_each_beam_is_strongest_nearly_where_it_is_focused(scenario, plain):
-    """Received power without the loss of the path, at all focal points."""
+def test_each_beam_is_nearly_strongest_at_its_focal_point(scenario, plain):
+    """Compares the received power, without path loss, at all focal points."""
     codebook = directional_codebook(scenario)
     p = plain(scenario, codebook.analog, codebook.digital)
     points = focal_points(scenario).reshape(-1, 3)
@@ -66,7 +66,7 @@ def test_each_beam_is_strongest_nearly_where_it_is_focused(scenario, plain):
 
 
 @pytest.mark.parametrize('scenario', SCENARIOS[:2])
-def test_no_other_weights_of_a_sub_band_collect_more(scenario, plain):
+def test_no_other_weights_of_a_sub_band_receive_more_power(scenario, plain):
     codebook, rng = directional_codebook(scenario), np.random.default_rng(0)
     points = focal_points(scenario)
     for band, frame, j in [(0, 0, 0), (1, 2, 1)]:

@@ -1,4 +1,4 @@
-"""The genetic algorithm, which needs a library that may be missing."""
+"""The genetic algorithm, which needs an optional library."""
 
 import sys
 
@@ -7,13 +7,15 @@ import pytest
 
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.genetic import minimize_genetic
+from rhs_isac_ros.model.optional import MissingLibraryError
 
 
-def test_without_pymoo_the_error_says_what_is_missing(scenario, monkeypatch):
+def test_without_pymoo_the_error_names_the_extra(scenario, monkeypatch):
     for name in [name for name in sys.modules if name.partition('.')[0] == 'pymoo']:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'pymoo', None)
-    with pytest.raises(ValueError, match="^method: 'genetic' needs pymoo, which is not installed"):
+    words = r"^method: 'genetic' needs pymoo, .* \(pip install 'rhs_isac_ros\[genetic\]'\)$"
+    with pytest.raises(MissingLibraryError, match=words):
         optimize(scenario, method='genetic', n_positions=4, max_steps=1)
 
 
@@ -23,7 +25,7 @@ def pymoo():
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_comes_closer_generation_by_generation_and_stays_in_range(
+def test_improves_with_every_generation_and_stays_in_range(
         quadratic, search_of, pymoo, seed):
     problem = quadratic(seed)
     start = np.full(20, 0.5)
@@ -36,7 +38,7 @@ def test_comes_closer_generation_by_generation_and_stays_in_range(
     points = np.array(problem.points)
     assert points[:, :10].min() >= 0
     assert np.abs(points).max() <= 1
-    # Configurations from 0, combining vectors from -1.
+    # Configurations are at least 0, parts of combining vectors at least -1.
     assert points[:200, 10:].min() < -0.9
 
 
@@ -50,7 +52,7 @@ def test_the_start_is_in_the_first_generation(quadratic, search_of, pymoo, low):
     assert sum(np.array_equal(point, start) for point in problem.points) == 1
 
 
-def test_is_never_worse_than_a_start_that_is_the_best_of_all(quadratic, search_of, pymoo):
+def test_keeps_a_start_that_is_optimal(quadratic, search_of, pymoo):
     problem = quadratic(4)
     problem.center = np.clip(problem.center, 0, 1)
     search = search_of(problem, 2, start=problem.center)
@@ -58,7 +60,7 @@ def test_is_never_worse_than_a_start_that_is_the_best_of_all(quadratic, search_o
     np.testing.assert_array_equal(search.best, problem.center)
 
 
-def test_the_generator_decides_everything(quadratic, search_of, pymoo):
+def test_the_generator_determines_all_points(quadratic, search_of, pymoo):
     def points(seed):
         problem = quadratic(0)
         minimize_genetic(search_of(problem, 2, seed=seed))

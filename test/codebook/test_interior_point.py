@@ -1,4 +1,4 @@
-"""The interior point method, on functions whose minimum is known."""
+"""The interior point method, on functions with a known minimum."""
 
 import numpy as np
 import pytest
@@ -7,29 +7,29 @@ from rhs_isac_ros.codebook.interior_point import minimize_interior_point
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_changes_the_chosen_variables_only_and_finds_their_minimum(quadratic, search_of, seed):
+def test_changes_only_the_free_variables_and_finds_their_minimum(quadratic, search_of, seed):
     problem = quadratic(seed)
-    chosen = np.random.default_rng(seed).uniform(size=20) < 0.5
-    assert chosen[:10].any() and chosen[10:].any() and not chosen.all()
+    free = np.random.default_rng(seed).uniform(size=20) < 0.5
+    assert free[:10].any() and free[10:].any() and not free.all()
     start = np.linspace(0.3, 0.6, 20)
-    found = minimize_interior_point(search_of(problem, start=start), start, chosen, 400)
+    found = minimize_interior_point(search_of(problem, start=start), start, free, 400)
     assert len(problem.points) > 5
     for point in problem.points:
-        np.testing.assert_array_equal(point[~chosen], start[~chosen])
-    np.testing.assert_array_equal(found[~chosen], start[~chosen])
-    np.testing.assert_allclose(found[chosen], problem.best[chosen], atol=0.02)
+        np.testing.assert_array_equal(point[~free], start[~free])
+    np.testing.assert_array_equal(found[~free], start[~free])
+    np.testing.assert_allclose(found[free], problem.best[free], atol=0.02)
 
 
-@pytest.mark.parametrize('part', [slice(0, 10), slice(10, 20)], ids=['box', 'free'])
-def test_variables_may_all_be_bounded_or_all_be_free(quadratic, search_of, part):
+@pytest.mark.parametrize('part', [slice(0, 10), slice(10, 20)], ids=['bounded', 'unbounded'])
+def test_the_free_variables_may_all_be_bounded_or_all_be_unbounded(quadratic, search_of, part):
     problem, start = quadratic(5), np.full(20, 0.5)
-    chosen = np.zeros(20, bool)
-    chosen[part] = True
-    found = minimize_interior_point(search_of(problem), start, chosen, 400)
-    np.testing.assert_allclose(found[chosen], problem.best[chosen], atol=0.02)
+    free = np.zeros(20, bool)
+    free[part] = True
+    found = minimize_interior_point(search_of(problem), start, free, 400)
+    np.testing.assert_allclose(found[free], problem.best[free], atol=0.02)
 
 
-def test_returns_the_best_point_that_was_met(quadratic, search_of):
+def test_returns_the_best_point_evaluated(quadratic, search_of):
     problem, start = quadratic(2), np.full(20, 0.5)
     search = search_of(problem)
     found = minimize_interior_point(search, start, np.ones(20, bool), 6)
@@ -38,7 +38,7 @@ def test_returns_the_best_point_that_was_met(quadratic, search_of):
     assert problem.value(found) == min(values) == search.value_m2
 
 
-def test_returns_the_start_where_nothing_is_better(flat, search_of):
+def test_returns_the_start_if_no_point_is_better(flat, search_of):
     start = np.linspace(0.3, 0.6, 20)
     found = minimize_interior_point(search_of(flat, start=start), start, np.ones(20, bool), 10)
     np.testing.assert_array_equal(found, start)

@@ -1,4 +1,4 @@
-"""The quasi-Newton method, on functions whose minimum is known."""
+"""The quasi-Newton method, on functions with a known minimum."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a codebook is optimised for: values by plain equations, and gradients."""
+"""Objectives: values from the plain equations, and gradients."""
 
 import math
 
@@ -14,8 +14,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 
-def test_average_bound_is_that_of_the_vectors(case):
-    """As exact as its rows: six positions do not average their errors out."""
+def test_average_bound_matches_the_test_vectors(case):
+    """To the accuracy of its rows, whose errors do not average out over six positions."""
     bound = average_bound(
         case.scenario, case.vectors['positions'], np.random.default_rng(0))
     value, by_analog, by_digital = bound(case.codebook)
@@ -26,7 +26,7 @@ def test_average_bound_is_that_of_the_vectors(case):
         assert np.linalg.norm(gradient - wanted) < 0.03 * np.linalg.norm(wanted)
 
 
-def test_average_bound_errs_by_less_than_a_thousandth(table1, shipped):
+def test_the_relative_error_of_the_average_bound_is_below_a_thousandth(table1, shipped):
     scenario = table1.scenario
     positions = scenario.sample_positions(200, np.random.default_rng(0))
     bound = average_bound(scenario, positions, np.random.default_rng(0))
@@ -36,10 +36,10 @@ def test_average_bound_errs_by_less_than_a_thousandth(table1, shipped):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_ambiguity_is_the_plain_confusion_of_pairs(
+def test_ambiguity_is_the_pairwise_error_cost_of_the_plain_equations(
         scenario, plain, random_beams, seed, monkeypatch):
-    """|p - p'|^2 Q(sqrt(q / 2)), with five others for each position."""
-    monkeypatch.setattr(objective, '_PAIRS_A_POSITION', 5)
+    """|p - p'|^2 Q(sqrt(q / 2)), with five pairs for each position."""
+    monkeypatch.setattr(objective, '_PAIRS_PER_POSITION', 5)
     rng = np.random.default_rng(seed)
     codebook, positions = random_beams(scenario, rng), scenario.sample_positions(4, rng)
     value = ambiguity(scenario, positions, np.random.default_rng(seed)).value(codebook)
@@ -57,7 +57,7 @@ def test_ambiguity_is_the_plain_confusion_of_pairs(
 
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('name', OBJECTIVES)
-def test_gradients_are_the_limit_of_differences(name, random_beams, seed):
+def test_gradients_agree_with_finite_differences(name, random_beams, seed):
     rng = np.random.default_rng(seed)
     scenario = Scenario(
         center_frequencies_hz=(1.8e9, 2.9e9), n_subbands=2, n_frames=2, n_feeds=2,
@@ -65,20 +65,20 @@ def test_gradients_are_the_limit_of_differences(name, random_beams, seed):
     problem = Problem(scenario, OBJECTIVES[name](
         scenario, scenario.sample_positions(12, rng), rng))
     variables = problem.pack(random_beams(scenario, rng))
-    # Off the box's faces, and with another scale in every frame.
+    # Move off the bounds, and change the scale of the combining vectors.
     variables[:problem.n_analog] = 0.1 + 0.8 * variables[:problem.n_analog]
     variables[problem.n_analog:] *= 1.9
     value, gradient = problem.value_and_gradient(variables)
     assert value == pytest.approx(problem.value(variables), rel=1e-12)
     for _ in range(4):
-        way = rng.normal(size=variables.shape)
-        difference = (problem.value(variables + 1e-5 * way)
-                      - problem.value(variables - 1e-5 * way)) / 2e-5
-        assert gradient @ way == pytest.approx(
-            difference, abs=1e-5 * np.linalg.norm(gradient) * np.linalg.norm(way))
+        direction = rng.normal(size=variables.shape)
+        difference = (problem.value(variables + 1e-5 * direction)
+                      - problem.value(variables - 1e-5 * direction)) / 2e-5
+        assert gradient @ direction == pytest.approx(
+            difference, abs=1e-5 * np.linalg.norm(gradient) * np.linalg.norm(direction))
 
 
-def test_optimising_ambiguity_confuses_fewer_pairs_also_of_others(scenario):
+def test_optimising_the_ambiguity_lowers_it_on_held_out_pairs(scenario):
     result = optimize(scenario, method='lbfgs', objective='ambiguity', n_positions=128, seed=1,
                       max_steps=30)
     rng = np.random.default_rng(99)
@@ -88,13 +88,13 @@ def test_optimising_ambiguity_confuses_fewer_pairs_also_of_others(scenario):
     bound = optimize(scenario, n_positions=128, seed=1, max_steps=30)
     found = held_out.value(result.codebook)
     assert found < 0.8 * held_out.value(start)
-    # What the bound is optimised for is something else.
+    # Optimising the bound is a different goal.
     assert found < held_out.value(bound.codebook)
     assert bound.codebook.average_crlb_m2 < result.codebook.average_crlb_m2
 
 
 @pytest.mark.parametrize('name', ['ambiguity', 'crlb'])
-def test_the_generator_decides_what_is_random(scenario, small, name):
+def test_the_generator_determines_the_random_pairs(scenario, small, name):
     positions = scenario.sample_positions(5, np.random.default_rng(0))
     one, same, other = (
         OBJECTIVES[name](scenario, positions, np.random.default_rng(seed)).value(small.codebook)
@@ -104,6 +104,6 @@ def test_the_generator_decides_what_is_random(scenario, small, name):
 
 
 @pytest.mark.parametrize('name', OBJECTIVES)
-def test_no_samples_are_an_error(small, name):
+def test_an_empty_sample_is_an_error(small, name):
     with pytest.raises(ValueError, match='expected .*at least one'):
         OBJECTIVES[name](small.scenario, np.zeros((0, 3)), np.random.default_rng(0))

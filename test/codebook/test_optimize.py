@@ -20,7 +20,7 @@ from rhs_isac_ros.codebook import (
     optimize,
     random_codebook,
 )
-from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _Keeper
+from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -42,7 +42,7 @@ def positions(scenario):
 
 @pytest.fixture(scope='module')
 def run(scenario, positions):
-    """One optimisation, and what its progress callback was given."""
+    """An optimisation, the arguments of its progress callback, and its positions."""
     seen = []
     result = optimize(scenario, positions, seed=3, max_steps=STEPS, progress=seen.append)
     return result, seen, positions
@@ -50,7 +50,7 @@ def run(scenario, positions):
 
 @pytest.fixture
 def evaluated(monkeypatch):
-    """All variables that the objective was evaluated for."""
+    """Record all variables for which the objective is evaluated."""
     seen = []
     for name in ('value', 'value_and_gradient'):
         def spy(problem, variables, *, evaluate):
@@ -61,7 +61,7 @@ def evaluated(monkeypatch):
     return seen
 
 
-def test_bound_falls_strongly_also_on_other_positions(scenario, run):
+def test_the_bound_falls_strongly_also_on_held_out_positions(scenario, run):
     result, _, _ = run
     assert result.history[-1].value_m2 < 0.3 * result.history[0].value_m2
     held_out = scenario.sample_positions(400, np.random.default_rng(1))
@@ -70,7 +70,7 @@ def test_bound_falls_strongly_also_on_other_positions(scenario, run):
     assert optimised < 0.3 * crlb(scenario, start, held_out).mean()
 
 
-def test_best_codebook_is_feasible_and_has_the_value_it_claims(scenario, run, plain):
+def test_the_best_codebook_is_feasible_and_has_the_reported_bound(scenario, run, plain):
     result, _, positions = run
     result.codebook.check(scenario)
     p = plain(scenario, result.codebook.analog, result.codebook.digital)
@@ -79,7 +79,7 @@ def test_best_codebook_is_feasible_and_has_the_value_it_claims(scenario, run, pl
     assert result.history[-1].value_m2 == pytest.approx(expected, rel=ABOUT)
 
 
-def test_provenance_tells_how_it_was_made(scenario, run):
+def test_the_provenance_contains_arguments_and_progress(scenario, run):
     result, _, _ = run
     end = result.history[-1]
     assert Provenance.parse(result.codebook.provenance) == Provenance(
@@ -96,7 +96,7 @@ def assert_consistent(history):
         assert after.elapsed_s >= before.elapsed_s
 
 
-def test_history_never_rises_and_is_what_progress_saw(run):
+def test_the_history_never_rises_and_is_passed_to_progress(run):
     result, seen, _ = run
     assert list(result.history) == seen
     assert_consistent(result.history)
@@ -124,7 +124,7 @@ def test_every_method_lowers_every_objective(scenario, positions, method, object
     assert list(result.history) == seen
     assert_consistent(result.history)
     assert len(result.history) <= FEW_STEPS[method] + 1
-    # Every evaluation is counted, and the best of all is the result.
+    # Every evaluation is counted, and the result is the best.
     assert result.history[-1].evaluations == len(evaluated)
     made = Provenance.parse(result.codebook.provenance)
     assert (made.method, made.objective) == (method, objective)
@@ -149,7 +149,7 @@ def test_equal_seeds_give_equal_results(scenario, method):
 
 
 @pytest.mark.parametrize('method', SEARCHING)
-def test_every_method_begins_at_the_start(scenario, positions, method, small, evaluated):
+def test_every_method_evaluates_the_start_first(scenario, positions, method, small, evaluated):
     result = optimize(scenario, positions, method, start=small.codebook, max_steps=2)
     np.testing.assert_array_equal(evaluated[0][:32], small.codebook.analog.ravel())
     exact = crlb(scenario, small.codebook, positions).mean()
@@ -175,14 +175,14 @@ def test_a_budget_of_evaluations_ends_every_method(
         assert result.history[-1].value_m2 == result.history[0].value_m2
 
 
-def test_a_budget_that_is_not_used_up_changes_nothing(scenario, positions, run):
+def test_a_budget_that_is_not_exhausted_changes_nothing(scenario, positions, run):
     result = optimize(scenario, positions, seed=3, max_steps=STEPS, max_evaluations=10_000)
     assert result.codebook.id == run[0].codebook.id
 
 
 @pytest.mark.parametrize('method', SEARCHING)
 @pytest.mark.parametrize('at', [2, 4, 12])
-def test_an_interrupt_gives_the_best_so_far(scenario, positions, method, at, monkeypatch):
+def test_an_interrupt_returns_the_best_so_far(scenario, positions, method, at, monkeypatch):
     values = []
     for name in ('value', 'value_and_gradient'):
         def spy(problem, variables, *, evaluate):
@@ -203,7 +203,7 @@ def test_an_interrupt_gives_the_best_so_far(scenario, positions, method, at, mon
 
 
 @pytest.mark.skipif(NO_PYMOO, reason='needs pymoo')
-def test_an_interrupt_is_told_with_what_was_reached(scenario, positions, monkeypatch):
+def test_the_provenance_after_an_interrupt_is_complete(scenario, positions, monkeypatch):
     calls, evaluate = [], Problem.value
 
     def spy(problem, variables):
@@ -220,7 +220,7 @@ def test_an_interrupt_is_told_with_what_was_reached(scenario, positions, monkeyp
     assert made.evaluations in (51, 52)
 
 
-def test_an_interrupt_while_progress_is_shown_gives_the_best_so_far(scenario, positions):
+def test_an_interrupt_in_the_progress_callback_returns_the_best_so_far(scenario, positions):
     def interrupt(entry):
         if entry.step == 3:
             raise KeyboardInterrupt
@@ -232,8 +232,8 @@ def test_an_interrupt_while_progress_is_shown_gives_the_best_so_far(scenario, po
         result.codebook.average_crlb_m2, result.history[-1].value_m2, rtol=ABOUT)
 
 
-def test_keep_is_called_with_the_results_so_far(scenario, positions, monkeypatch):
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+def test_keep_receives_the_results_so_far(scenario, positions, monkeypatch):
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     kept, seen = [], []
     result = optimize(scenario, positions, seed=3, max_steps=6, progress=seen.append,
                       keep=kept.append)
@@ -253,41 +253,40 @@ def test_keep_is_called_with_the_results_so_far(scenario, positions, monkeypatch
     assert kept[0].codebook.average_crlb_m2 > kept[-1].codebook.average_crlb_m2
 
 
-def test_keep_is_not_called_all_the_time(scenario, positions):
-    """A run of less than ten seconds keeps nothing in between."""
+def test_keep_is_not_called_in_the_first_ten_seconds(scenario, positions):
     kept = []
     optimize(scenario, positions, seed=3, max_steps=6, keep=kept.append)
     assert kept == []
 
 
-def test_keeping_does_not_change_the_result(scenario, positions, run, monkeypatch):
-    monkeypatch.setattr(_Keeper, '_PERIOD_S', 0.0)
+def test_keep_does_not_change_the_result(scenario, positions, run, monkeypatch):
+    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     result = optimize(
         scenario, positions, seed=3, max_steps=STEPS, keep=lambda partial: None)
     assert result.codebook.id == run[0].codebook.id
 
 
-def test_keeps_the_best_point_of_a_method_that_wanders(small, monkeypatch):
-    """The vectors' codebook is far better than one with nearly all elements switched off."""
-    def wander(search):
+def test_returns_the_best_point_of_a_method_that_ends_elsewhere(small, monkeypatch):
+    """The codebook of the test vectors is far better than one with nearly all elements off."""
+    def drift(search):
         assert len(search.bounds) == len(search.start)
         for scale in (0.5, 1.0, 0.01):
             search.value_and_gradient(
                 np.concatenate([scale * search.start[:32], search.start[32:]]))
             search.on_step()
-        return f'wandered, of {search.max_steps}'
+        return f'drifted, of {search.max_steps}'
 
-    monkeypatch.setitem(METHODS, 'wander', Method(wander, 9))
-    result = optimize(small.scenario, small.vectors['positions'], 'wander',
+    monkeypatch.setitem(METHODS, 'drift', Method(drift, 9))
+    result = optimize(small.scenario, small.vectors['positions'], 'drift',
                       start=small.codebook, max_steps=7)
     np.testing.assert_array_equal(result.codebook.analog, small.codebook.analog)
     assert result.codebook.average_crlb_m2 == pytest.approx(
         float(small.vectors['average_crlb']), rel=1e-8)
-    assert result.reason == 'wandered, of 7'
+    assert result.reason == 'drifted, of 7'
     assert len(result.history) == 4
-    assert 'method: wander' in result.codebook.provenance
-    by_default = optimize(small.scenario, small.vectors['positions'], 'wander')
-    assert by_default.reason == 'wandered, of 9'
+    assert 'method: drift' in result.codebook.provenance
+    by_default = optimize(small.scenario, small.vectors['positions'], 'drift')
+    assert by_default.reason == 'drifted, of 9'
 
 
 def test_starts_from_the_given_codebook(small):
@@ -300,7 +299,7 @@ def test_starts_from_the_given_codebook(small):
 
 @pytest.mark.parametrize('max_steps', [None, 5])
 @pytest.mark.parametrize('method', ['random', 'directional'])
-def test_codebooks_that_need_no_optimisation_come_back_as_they_are(
+def test_methods_without_a_search_return_the_start(
         scenario, positions, method, max_steps, small):
     result = optimize(scenario, positions, method, seed=2, max_steps=max_steps)
     assert result.reason == 'nothing to optimise'
@@ -309,7 +308,7 @@ def test_codebooks_that_need_no_optimisation_come_back_as_they_are(
     if method == 'directional':
         expected = directional_codebook(scenario)
     else:
-        # The paper's start of every method.
+        # Every method starts from it by default.
         expected = random_codebook(scenario, np.random.default_rng(0))
         first = optimize(scenario, positions, 'lbfgs', seed=2, max_steps=1).history[0]
         assert first.value_m2 == result.history[0].value_m2
@@ -325,7 +324,7 @@ def test_codebooks_that_need_no_optimisation_come_back_as_they_are(
     np.testing.assert_array_equal(given.codebook.analog, small.codebook.analog)
 
 
-def test_seed_decides_positions_and_start(scenario):
+def test_the_seed_determines_positions_and_start(scenario):
     one, same, other = (optimize(scenario, seed=seed, max_steps=2) for seed in (5, 5, 6))
     assert one.codebook.id == same.codebook.id
     assert one.codebook.id != other.codebook.id
@@ -335,7 +334,7 @@ def test_seed_decides_positions_and_start(scenario):
         5, DEFAULT_POSITIONS, 'sobol')
 
 
-def test_sampling_and_number_decide_the_positions(scenario, small):
+def test_sampling_and_number_determine_the_positions(scenario, small):
     bounds = set()
     for sampling in SAMPLINGS:
         for n in (3, 50):
@@ -345,7 +344,7 @@ def test_sampling_and_number_decide_the_positions(scenario, small):
             assert (made.sampling, made.positions) == (sampling, n)
             bounds.add(result.codebook.average_crlb_m2)
     assert len(bounds) == 4
-    # Enough of them all sample the same region.
+    # With many samples, both samplings agree.
     one, other = (optimize(scenario, method='random', sampling=sampling, n_positions=4096,
                            start=small.codebook).codebook.average_crlb_m2
                   for sampling in SAMPLINGS)
@@ -357,7 +356,7 @@ def steps_of(history):
 
 
 @pytest.mark.parametrize('method', SEARCHING)
-def test_a_result_can_be_gone_on_from(scenario, positions, method):
+def test_a_result_can_be_resumed(scenario, positions, method):
     half = max(FEW_STEPS[method] // 2, 1)
     first = optimize(scenario, positions, method, seed=3, max_steps=half)
     saved = Codebook.from_parameters(first.codebook.to_parameters())
@@ -365,7 +364,7 @@ def test_a_result_can_be_gone_on_from(scenario, positions, method):
         scenario, positions, method, seed=3, max_steps=3 * half + 13, resume=saved)
     end, begin = first.history[-1], second.history[0]
     assert begin.step == end.step
-    # The start was evaluated before, and does not count again.
+    # The evaluation of the start is not counted twice.
     assert begin.evaluations == end.evaluations
     assert begin.value_m2 == pytest.approx(end.value_m2, rel=1e-7)
     assert steps_of(second.history) == sorted(steps_of(second.history))
@@ -374,7 +373,7 @@ def test_a_result_can_be_gone_on_from(scenario, positions, method):
     assert Provenance.parse(second.codebook.provenance).steps == second.history[-1].step
 
 
-def test_a_result_that_is_complete_comes_back(scenario, positions, run):
+def test_resuming_a_complete_result_returns_it(scenario, positions, run):
     again = optimize(
         scenario, positions, seed=3, max_steps=STEPS, resume=run[0].codebook)
     assert again.reason == 'max_steps reached'
@@ -384,7 +383,7 @@ def test_a_result_that_is_complete_comes_back(scenario, positions, run):
         run[0].codebook.average_crlb_m2, rel=1e-9)
 
 
-def test_a_budget_counts_what_was_done_before(scenario, positions, evaluated):
+def test_the_budget_includes_the_evaluations_of_the_resumed_run(scenario, positions, evaluated):
     first = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=5)
     second = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=9,
                       resume=first.codebook)
@@ -393,14 +392,14 @@ def test_a_budget_counts_what_was_done_before(scenario, positions, evaluated):
     assert second.reason == 'max_evaluations reached'
 
 
-def test_a_result_whose_budget_is_spent_comes_back(scenario, positions):
+def test_resuming_with_no_budget_left_evaluates_nothing_more(scenario, positions):
     first = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=5)
     again = optimize(scenario, positions, seed=3, max_steps=50, max_evaluations=5,
                      resume=first.codebook)
     assert again.reason == 'max_evaluations reached'
 
 
-def test_a_result_of_other_arguments_cannot_be_gone_on_from(scenario, positions, run):
+def test_a_result_of_other_arguments_cannot_be_resumed(scenario, positions, run):
     codebook = run[0].codebook
     for arguments, words in [
             ({'seed': 4}, 'seed: 4, expected 3'),
@@ -410,15 +409,15 @@ def test_a_result_of_other_arguments_cannot_be_gone_on_from(scenario, positions,
             ({'positions': None}, "sampling: 'sobol', expected 'given'"),
             ({'resume': random_codebook(scenario, np.random.default_rng(0))},
              "resume: provenance 'random', expected that of an optimisation")]:
-        chosen = {'positions': positions, 'seed': 3, 'resume': codebook, 'max_steps': 40}
+        original = {'positions': positions, 'seed': 3, 'resume': codebook, 'max_steps': 40}
         with pytest.raises(ValueError) as caught:
-            optimize(scenario, **(chosen | arguments))
+            optimize(scenario, **(original | arguments))
         assert str(caught.value).startswith(words)
 
 
 @pytest.mark.parametrize(('name', 'known'), [
     ('method', METHODS), ('objective', OBJECTIVES), ('sampling', SAMPLINGS)])
-def test_all_known_names_are_in_the_error_for_an_unknown_one(scenario, name, known):
+def test_the_error_for_an_unknown_name_lists_the_known_ones(scenario, name, known):
     with pytest.raises(ValueError, match=f"^{name}: 'magic', expected one of") as caught:
         optimize(scenario, **{name: 'magic'})
     for one in known:
@@ -449,37 +448,36 @@ def test_malformed_positions_are_errors(scenario, objective, positions):
         optimize(scenario, np.array(positions), objective=objective, max_steps=1)
 
 
-def test_no_positions_are_an_error(scenario):
+def test_empty_positions_are_an_error(scenario):
     with pytest.raises(ValueError, match='^positions: .*, expected '):
         optimize(scenario, np.zeros((0, 3)), max_steps=1)
 
 
-def test_no_positions_are_an_error_also_for_ambiguity(scenario):
+def test_empty_positions_are_an_error_for_ambiguity(scenario):
     with pytest.raises(ValueError, match='^positions: .*, expected '):
         optimize(scenario, np.zeros((0, 3)), objective='ambiguity', max_steps=1)
 
 
 @pytest.mark.parametrize('objective', OBJECTIVES)
-def test_a_tiny_region_will_do(scenario, objective):
+def test_a_tiny_region_is_accepted(scenario, objective):
     tiny = dataclasses.replace(scenario, roi_size_m=(0.01, 0.01, 0.01))
     result = optimize(tiny, n_positions=4, objective=objective, max_steps=1)
     result.codebook.check(tiny)
 
 
-def test_a_seed_may_be_any_integer(scenario):
-    """What numpy's random numbers give is none of Python's integers."""
+def test_a_seed_may_be_large(scenario):
     result = optimize(scenario, n_positions=4, seed=2**31 - 1, max_steps=1)
     assert Provenance.parse(result.codebook.provenance).seed == 2**31 - 1
 
 
-def test_a_seed_may_be_an_integer_of_numpy(scenario):
+def test_a_seed_may_be_a_numpy_integer(scenario):
     one, same = (optimize(scenario, n_positions=4, seed=seed, max_steps=1)
                  for seed in (np.int64(3), 3))
     assert one.codebook.provenance == same.codebook.provenance
 
 
-def test_an_undetermined_position_is_an_error_that_says_so():
-    """One complex signal cannot give three coordinates: every codebook has an infinite bound."""
+def test_a_position_that_the_signals_do_not_determine_is_an_error():
+    """One complex signal cannot determine three coordinates, so every bound is infinite."""
     scenario = Scenario(center_frequencies_hz=(2.5e9,), n_subbands=1, n_frames=1,
                         elements_per_side=3)
     with pytest.raises(ValueError, match='bound|position|infinite'):
@@ -487,7 +485,7 @@ def test_an_undetermined_position_is_an_error_that_says_so():
 
 
 def test_importing_needs_no_pymoo_and_no_slow_part_of_scipy():
-    """Most that use a codebook do not optimise one."""
+    """Most users of a codebook do not optimise one."""
     import subprocess
     code = ("import sys, rhs_isac_ros.codebook\n"
             "print([n for n in ('pymoo', 'scipy.optimize') if n in sys.modules])")

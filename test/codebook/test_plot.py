@@ -9,21 +9,22 @@ from rhs_isac_ros.codebook import Progress, directional_codebook, plot
 from rhs_isac_ros.codebook.directional import focal_points
 from rhs_isac_ros.codebook.plot import beam_powers, draw_optimisation
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.optional import MissingLibraryError
 
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    monkeypatch.setattr(plot, '_ROI_POINTS', 6)
+    monkeypatch.setattr(plot, '_N_MAP_POINTS', 6)
 
 
 @pytest.mark.parametrize('n_bands', [1, 2, 4])
-def test_any_number_of_bands_is_drawn(scenario, n_bands, tmp_path):
+def test_draws_any_number_of_bands(scenario, n_bands, tmp_path):
     pytest.importorskip('matplotlib')
-    some = Scenario(**scenario.changes() | {
+    changed = Scenario(**scenario.changes() | {
         'center_frequencies_hz': [2.5e9 + 1e8 * i for i in range(n_bands)]})
-    draw_optimisation(some, directional_codebook(some), HISTORY, tmp_path / 'p.png')
+    draw_optimisation(changed, directional_codebook(changed), HISTORY, tmp_path / 'p.png')
     assert (tmp_path / 'p.png').read_bytes().startswith(b'\x89PNG')
 
 
@@ -34,13 +35,13 @@ def test_an_unknown_format_is_an_error(scenario, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_matplotlib_the_error_says_so(scenario, tmp_path, monkeypatch):
+def test_without_matplotlib_the_error_names_the_extra(scenario, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
-    with pytest.raises(ValueError, match='^plot: needs matplotlib'):
+    with pytest.raises(MissingLibraryError, match='^plot needs matplotlib, .*rhs_isac_ros.plot'):
         draw_optimisation(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.png')
 
 
-def test_beams_point_where_they_are_focused():
+def test_beams_point_at_their_focal_points():
     scenario = Scenario()
     codebook, points = directional_codebook(scenario), focal_points(scenario)
     for band in range(scenario.n_bands):

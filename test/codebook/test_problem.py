@@ -1,4 +1,4 @@
-"""Problem P1: its variables, its constraints and its gradient, with the exact bound."""
+"""Problem P1: variables, constraints and gradient, with the exact bound."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ def problem(small):
     return Problem(small.scenario, AverageCrlb(small.scenario, small.vectors['positions']))
 
 
-def test_value_is_that_of_the_vectors(case):
+def test_the_value_matches_the_test_vectors(case):
     problem = Problem(case.scenario, AverageCrlb(case.scenario, case.vectors['positions']))
     variables = problem.pack(case.codebook)
     expected = pytest.approx(float(case.vectors['average_crlb']), rel=1e-8)
@@ -36,11 +36,11 @@ def test_variables_are_configurations_then_combining_vectors(problem, small):
     np.testing.assert_allclose(back.digital, small.codebook.digital, rtol=1e-12)
 
 
-def test_bounds_are_a_box_for_the_configurations_only(problem):
+def test_only_the_configurations_are_bounded(problem):
     assert problem.bounds == [(0.0, 1.0)] * 32 + [(None, None)] * 24
 
 
-def test_any_variables_make_a_feasible_codebook(problem, small):
+def test_any_variables_yield_a_feasible_codebook(problem, small):
     rng = np.random.default_rng(0)
     for scale in (1e-3, 1.0, 1e3):
         variables = scale * rng.normal(size=56)
@@ -53,7 +53,7 @@ def test_any_variables_make_a_feasible_codebook(problem, small):
         np.testing.assert_array_equal(codebook.analog.ravel(), expected)
 
 
-def test_the_scale_of_a_frame_does_not_count(problem, small):
+def test_the_scale_of_the_combining_vectors_has_no_effect(problem, small):
     variables = problem.pack(small.codebook)
     scaled = variables.copy()
     scaled[32:] *= 7.0
@@ -61,12 +61,12 @@ def test_the_scale_of_a_frame_does_not_count(problem, small):
         problem.unpack(scaled).digital, problem.unpack(variables).digital, rtol=1e-12)
     value, gradient = problem.value_and_gradient(scaled)
     assert value == pytest.approx(float(small.vectors['average_crlb']), rel=1e-8)
-    # Nothing is gained along the scale.
+    # The gradient has no component along the scale.
     assert abs(gradient[32:] @ scaled[32:]) < 1e-8 * np.linalg.norm(gradient[32:]) * 7
 
 
-def test_gradient_is_the_limit_of_differences_of_plain_bounds(plain, random_beams):
-    """The plain reference scales the combining vectors itself."""
+def test_the_gradient_agrees_with_finite_differences_of_plain_bounds(plain, random_beams):
+    """The reference scales the combining vectors independently."""
     rng = np.random.default_rng(1)
     scenario = Scenario(
         center_frequencies_hz=(1.8e9, 2.9e9), n_subbands=2, n_frames=2, n_feeds=2,
@@ -75,7 +75,7 @@ def test_gradient_is_the_limit_of_differences_of_plain_bounds(plain, random_beam
     spatial = multipath_covariance(scenario)
     problem = Problem(scenario, AverageCrlb(scenario, positions))
     start = random_beams(scenario, rng)
-    # Stay off the box's faces, and give every frame another scale.
+    # Move off the bounds, and change the scale of the combining vectors.
     start = dataclasses.replace(start, analog=0.1 + 0.8 * start.analog)
     variables = problem.pack(start)
     variables[problem.n_analog:] *= 1.9
@@ -92,7 +92,8 @@ def test_gradient_is_the_limit_of_differences_of_plain_bounds(plain, random_beam
     value, gradient = problem.value_and_gradient(variables)
     assert value == pytest.approx(bound(variables), rel=1e-7)
     for _ in range(4):
-        way = rng.normal(size=variables.shape)
-        difference = (bound(variables + 1e-5 * way) - bound(variables - 1e-5 * way)) / 2e-5
-        assert gradient @ way == pytest.approx(
-            difference, abs=1e-5 * np.linalg.norm(gradient) * np.linalg.norm(way))
+        direction = rng.normal(size=variables.shape)
+        difference = (bound(variables + 1e-5 * direction)
+                      - bound(variables - 1e-5 * direction)) / 2e-5
+        assert gradient @ direction == pytest.approx(
+            difference, abs=1e-5 * np.linalg.norm(gradient) * np.linalg.norm(direction))

@@ -1,4 +1,4 @@
-"""How a codebook was made: text for people that programs read."""
+"""Provenance: text that can be parsed, and the checks before resuming."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ def text_of(provenance=PLAIN, end=END, reason='done', **changes):
     return dataclasses.replace(provenance, **changes).of_result(end, reason)
 
 
-def test_text_is_one_line_of_yaml_that_tells_all():
+def test_the_text_is_one_line_of_yaml_with_all_fields():
     text = text_of(scenario={'n_feeds': 2})
     assert '\n' not in text
     assert yaml.safe_load(text) == {
@@ -37,7 +37,7 @@ SCENARIOS = [
 
 
 @pytest.mark.parametrize('scenario', SCENARIOS, ids=['table1', 'feeds', 'roi'])
-def test_what_is_written_is_read(scenario):
+def test_parsing_restores_all_fields(scenario):
     text = text_of(scenario=scenario.changes(), seed=2**31 - 1)
     read = Provenance.parse(text)
     assert read == dataclasses.replace(
@@ -49,24 +49,24 @@ def test_what_is_written_is_read(scenario):
 @pytest.mark.parametrize('reason', [
     '', 'a: b, {c} [d] #e', '"quoted" and \'quoted\'', 'é ∞ 日本', '- x', 'null', '1e3', 'yes',
     '2023-99-99', '%s & *x !tag', '\\n \t|>', 'line\nline', 'x' * 3000, '\x07', ' ends '])
-def test_any_reason_survives(reason):
+def test_any_reason_is_preserved(reason):
     assert Provenance.parse(text_of(reason=reason)).reason == reason
 
 
 @pytest.mark.parametrize('value', [0.0, 1e-300, 1e22, np.float64(0.25), 3.0, np.inf])
-def test_any_value_survives_as_a_float(value):
+def test_any_value_is_preserved_as_a_float(value):
     end = dataclasses.replace(END, value_m2=value)
     read = Provenance.parse(text_of(end=end)).value_m2
     assert type(read) is float
     assert read == value
 
 
-def test_a_value_that_is_none_survives():
+def test_nan_is_preserved():
     text = text_of(end=dataclasses.replace(END, value_m2=np.nan))
     assert np.isnan(Provenance.parse(text).value_m2)
 
 
-def test_a_codebook_file_keeps_it(small, tmp_path):
+def test_a_codebook_file_preserves_it(small, tmp_path):
     text = text_of(scenario=small.scenario.changes(), reason='a: "b"')
     dataclasses.replace(small.codebook, provenance=text).save(tmp_path / 'codebook.yaml')
     loaded = Codebook.load(tmp_path / 'codebook.yaml')
@@ -80,24 +80,24 @@ def test_a_codebook_file_keeps_it(small, tmp_path):
     '{a: !x 1}',
     text_of().replace('seed', 'seeds'), text_of()[:-1], text_of() + ' x', text_of()[1:],
     text_of().replace('}}', '}, more: 1}').replace('reason: done}', 'reason: done, more: 1}')])
-def test_other_text_is_none(text):
+def test_parsing_any_other_text_returns_none(text):
     assert Provenance.parse(text) is None
 
 
 @pytest.mark.parametrize('text', ['2023-99-99', '{method: 0b_}', '[' * 3000],
                          ids=['date', 'number', 'deep'])
-def test_text_that_yaml_stumbles_over_is_none(text):
+def test_parsing_text_that_breaks_the_yaml_parser_returns_none(text):
     assert Provenance.parse(text) is None
 
 
 @pytest.mark.parametrize('text', ['', 'random', '{method: lbfgs}'])
-def test_only_a_result_can_be_resumed(small, text):
+def test_only_a_result_of_an_optimisation_can_be_resumed(small, text):
     codebook = dataclasses.replace(small.codebook, provenance=text)
     with pytest.raises(ValueError, match='^resume: provenance .*, expected that of an optim'):
         PLAIN.resumed(codebook)
 
 
-def test_resuming_gives_what_was_done(small):
+def test_resuming_returns_the_earlier_progress(small):
     earlier = PLAIN.resumed(dataclasses.replace(small.codebook, provenance=text_of()))
     assert (earlier.steps, earlier.evaluations, earlier.reason) == (5, 9, 'done')
 
@@ -105,7 +105,7 @@ def test_resuming_gives_what_was_done(small):
 @pytest.mark.parametrize(('name', 'value'), [
     ('method', 'direct'), ('objective', 'ambiguity'), ('seed', 4), ('sampling', 'given'),
     ('positions', 65), ('scenario', {'n_feeds': 2})])
-def test_other_arguments_cannot_be_resumed(small, name, value):
+def test_a_result_of_other_arguments_cannot_be_resumed(small, name, value):
     codebook = dataclasses.replace(small.codebook, provenance=text_of(**{name: value}))
     with pytest.raises(ValueError, match=f'^{name}: .*, expected .* as in the codebook') as caught:
         PLAIN.resumed(codebook)

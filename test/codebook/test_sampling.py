@@ -1,4 +1,4 @@
-"""Samples of the region of interest, and positions that are taken for one another."""
+"""Samples of the region of interest, and pairs of confusable positions."""
 
 import dataclasses
 
@@ -10,14 +10,14 @@ from rhs_isac_ros.codebook.sampling import confusable, monte_carlo, sobol
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 
 LOPSIDED = Scenario(roi_center_m=(4, 1, -2), roi_size_m=(2, 6, 1))
-# So large that the lags of a position in its middle are not cut off.
+# Large enough that the lags of a position at its centre are not truncated.
 WIDE = Scenario(roi_center_m=(50, 0, 0), roi_size_m=(90, 90, 90))
 BANDS = {'two': (2.5e9, 3.0e9), 'one': (2.5e9,), 'three': (2.0e9, 2.3e9, 3.1e9)}
 
 
 @pytest.mark.parametrize('n', [1, 2, 3, 64, 100, 1000])
 @pytest.mark.parametrize('name', SAMPLINGS)
-def test_samples_are_in_the_region_and_the_generators(name, n):
+def test_samples_are_in_the_region_and_depend_on_the_generator(name, n):
     low, high = LOPSIDED.roi_bounds_m
     one, same, other = (
         SAMPLINGS[name](LOPSIDED, n, np.random.default_rng(seed)) for seed in (1, 1, 2))
@@ -47,7 +47,7 @@ def test_sobol_puts_one_point_in_each_slice(n, seed):
 
 
 @pytest.mark.parametrize('n', [100, 256])
-def test_sobol_integrates_a_smooth_function_better(n):
+def test_sobol_integrates_a_smooth_function_more_accurately(n):
     """(1 + sin x)(2 + y^2) exp(z / 2), whose mean over the region is known."""
     def function(points):
         x, y, z = points.T
@@ -68,7 +68,7 @@ def test_sobol_integrates_a_smooth_function_better(n):
 
 @pytest.mark.parametrize('bands', BANDS)
 @pytest.mark.parametrize('region', [LOPSIDED, Scenario()], ids=['lopsided', 'table1'])
-def test_confusable_positions_are_other_ones_in_the_region(region, bands):
+def test_confusable_positions_differ_and_are_in_the_region(region, bands):
     scenario = dataclasses.replace(region, center_frequencies_hz=BANDS[bands])
     low, high = scenario.roi_bounds_m
     positions = np.vstack([
@@ -87,7 +87,7 @@ def test_confusable_positions_are_other_ones_in_the_region(region, bands):
 
 
 def lags_of(bands, n=20_000):
-    """Range lags of positions in the middle of a wide region, up to 20 m."""
+    """Return the range lags below 20 m of positions at the centre of a wide region."""
     scenario = dataclasses.replace(WIDE, center_frequencies_hz=BANDS[bands])
     positions = np.tile([50.0, 0, 0], (n, 1))
     others = confusable(scenario, positions, np.random.default_rng(3))
@@ -101,11 +101,11 @@ def lags_of(bands, n=20_000):
 @pytest.mark.parametrize(('bands', 'period'), [
     ('two', 0.5996), ('one', 0.119917), ('three', 2.99792)])
 def test_lags_cluster_at_the_period_of_the_bands(bands, period):
-    """Ranges repeat where all bands have gone through whole turns."""
+    """The phases of all bands repeat after this period in range."""
     lags = np.abs(lags_of(bands))
     lags = lags[lags > period / 2]
     away = np.abs((lags / period + 0.5) % 1 - 0.5) * period
-    # An eighth of a wavelength off on either side, and half a wavelength off: equally wide.
+    # Equally wide intervals, around the multiples of the period and half a wavelength off.
     wavelength = SPEED_OF_LIGHT_MPS / max(BANDS[bands])
     near = np.sum(away < wavelength / 8)
     beside = np.sum((away >= wavelength * 3 / 8) & (away < wavelength / 2))
@@ -113,8 +113,8 @@ def test_lags_cluster_at_the_period_of_the_bands(bands, period):
 
 
 @pytest.mark.parametrize('bands', BANDS)
-def test_lags_have_the_density_they_should(bands):
-    """exp(-sum_i (1 - cos 2 pi f_i lag / v_0)) on both sides, where there is a lag."""
+def test_lags_have_the_documented_density(bands):
+    """exp(-sum_i (1 - cos 2 pi f_i lag / v_0)), for lags of either sign."""
     lags = lags_of(bands)
     count = len(lags)
     assert count > 3000
@@ -125,9 +125,9 @@ def test_lags_have_the_density_they_should(bands):
         1 - np.cos(2 * np.pi * frequencies * grid / SPEED_OF_LIGHT_MPS), axis=0))
     expected = np.cumsum(density) / density.sum()
     found = np.searchsorted(np.sort(np.abs(lags)), grid, side='right') / count
-    # Kolmogorov and Smirnov: 1.95 is exceeded once in a thousand times.
+    # Kolmogorov-Smirnov test; 1.95 is exceeded with a probability of 0.001.
     assert np.abs(found - expected).max() < 1.95 / np.sqrt(count)
-    # Within one period, where the clusters are.
+    # Mean phase within a period.
     phase = np.exp(2j * np.pi * frequencies * np.abs(lags) / SPEED_OF_LIGHT_MPS).mean(axis=1)
     wanted = (np.exp(2j * np.pi * frequencies * grid / SPEED_OF_LIGHT_MPS) * density).sum(
         axis=1) / density.sum()
@@ -137,7 +137,7 @@ def test_lags_have_the_density_they_should(bands):
 
 @pytest.mark.parametrize('side', [5, 20])
 def test_confusable_positions_lie_within_a_beam(side):
-    """Narrower surfaces have wider beams; 0.3 wavelengths an element."""
+    """Smaller surfaces have wider beams; the elements are 0.3 wavelengths apart."""
     scenario = dataclasses.replace(WIDE, elements_per_side=side)
     positions = np.tile([50.0, 0, 0], (5000, 1))
     others = confusable(scenario, positions, np.random.default_rng(3))
@@ -147,12 +147,12 @@ def test_confusable_positions_lie_within_a_beam(side):
     assert np.quantile(angles, 0.02) < 0.1 * width
     assert 0.05 * width < np.median(angles) < 0.3 * width
     assert 0.3 * width < angles.max() < 1.7 * width
-    # Along y and z alike.
+    # The spread is the same along y and z.
     np.testing.assert_allclose(np.std(others[:, 1]), np.std(others[:, 2]), rtol=0.1)
 
 
 @pytest.mark.parametrize('size', [(0.02, 0.02, 0.02), (2.0, 1e-3, 1e-3), (1e-6, 4.0, 4.0)])
-def test_thin_regions_have_pairs_too(size):
+def test_thin_regions_have_confusable_pairs(size):
     scenario = Scenario(roi_size_m=size)
     positions = scenario.sample_positions(200, np.random.default_rng(0))
     others = confusable(scenario, positions, np.random.default_rng(1))

@@ -1,4 +1,4 @@
-"""What methods see of an optimisation, and what is remembered."""
+"""The interface of the optimisation methods: best point, history and budget."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from rhs_isac_ros.codebook.search import BudgetSpent, Progress
 START = np.full(20, 0.5)
 
 
-def test_a_search_has_what_methods_need(quadratic, search_of):
+def test_a_search_provides_limits_bounds_start_and_generator(quadratic, search_of):
     search = search_of(quadratic(0), 7, seed=3)
     assert search.max_steps == 7
     assert search.n_analog == 10
@@ -18,7 +18,7 @@ def test_a_search_has_what_methods_need(quadratic, search_of):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_remembers_the_best_point_however_it_was_evaluated(quadratic, search_of, seed):
+def test_keeps_the_best_point_of_both_kinds_of_evaluation(quadratic, search_of, seed):
     problem, rng = quadratic(seed), np.random.default_rng(seed)
     search = search_of(problem)
     reference = quadratic(seed)
@@ -33,7 +33,7 @@ def test_remembers_the_best_point_however_it_was_evaluated(quadratic, search_of,
         assert value == reference.value(point)
         if best is None or value < best[0]:
             best = value, point.copy()
-        # A method may go on in the same array.
+        # A method may reuse the array.
         point[:] = 0
         assert search.value_m2 == best[0]
         np.testing.assert_array_equal(search.best, best[1])
@@ -45,7 +45,7 @@ def test_before_any_evaluation_the_start_is_the_best(quadratic, search_of):
     np.testing.assert_array_equal(search.best, START)
 
 
-def test_a_value_that_is_none_is_never_the_best(flat, search_of):
+def test_nan_is_never_the_best_value(flat, search_of):
     search = search_of(flat)
     search.value(START)
     flat.value = lambda variables: np.nan
@@ -54,7 +54,7 @@ def test_a_value_that_is_none_is_never_the_best(flat, search_of):
     np.testing.assert_array_equal(search.best, START)
 
 
-def test_the_same_point_again_is_not_evaluated_again(quadratic, search_of):
+def test_a_repeated_point_is_not_evaluated_again(quadratic, search_of):
     problem = quadratic(0)
     search = search_of(problem)
     point = START.copy()
@@ -63,7 +63,7 @@ def test_the_same_point_again_is_not_evaluated_again(quadratic, search_of):
     assert len(problem.points) == 1
     assert first[0] == again[0]
     np.testing.assert_array_equal(first[1], again[1])
-    # Another point in the same array is another point.
+    # A change in place makes it another point.
     point[3] = 0.25
     moved = search.value_and_gradient(point)
     assert len(problem.points) == 2
@@ -102,7 +102,7 @@ def test_no_evaluation_is_done_beyond_the_budget(quadratic, search_of, budget, n
     assert search.history[-1].evaluations == budget
 
 
-def test_limits_count_what_an_earlier_search_has_done(quadratic, search_of):
+def test_limits_include_the_steps_and_evaluations_of_the_resumed_search(quadratic, search_of):
     search = search_of(quadratic(0), 10, 7, done=(4, 5))
     assert search.max_steps == 6
     search.value(START)

@@ -1,4 +1,4 @@
-"""The random codebook, from which optimisation starts."""
+"""The random codebook, the default start."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def test_random_codebook_is_the_papers_start():
     assert np.abs(ordered - (np.arange(7200) + 0.5) / 7200).max() < 0.02
 
 
-def test_random_codebook_depends_on_the_generator_alone(small):
+def test_random_codebook_depends_only_on_the_generator(small):
     one, same, other = (random_codebook(small.scenario, np.random.default_rng(seed))
                         for seed in (1, 1, 2))
     assert one.id == same.id

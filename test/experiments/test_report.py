@@ -1,4 +1,4 @@
-"""Figures over trials as text."""
+"""Statistics of trials as text."""
 
 import math
 
@@ -15,7 +15,7 @@ def test_mean_and_std_are_those_of_a_sample():
 
 
 @pytest.mark.parametrize('values', [[2.0], [1.0, math.inf], [math.inf, math.inf]])
-def test_where_there_is_no_deviation_it_is_nan(values):
+def test_an_undefined_deviation_is_nan(values):
     mean, std = mean_and_std(values)
     assert mean == np.mean(values)
     assert math.isnan(std)

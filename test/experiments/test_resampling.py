@@ -1,4 +1,4 @@
-"""Comparisons and how sure they are."""
+"""Bootstrap intervals of comparisons."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_the_reduction_is_that_of_the_statistics():
     assert low < 50 < high
 
 
-def test_pairs_that_go_together_are_surer_than_the_same_values_apart():
+def test_paired_samples_have_narrower_intervals():
     rng = np.random.default_rng(0)
     theirs = rng.exponential(size=500)
     ours = 0.6 * theirs
@@ -27,7 +27,7 @@ def test_pairs_that_go_together_are_surer_than_the_same_values_apart():
     assert high - low > 5
 
 
-def test_intervals_contain_the_truth_as_often_as_they_say():
+def test_intervals_have_their_nominal_coverage():
     rng = np.random.default_rng(1)
     inside = 0
     for _ in range(100):
@@ -39,10 +39,10 @@ def test_intervals_contain_the_truth_as_often_as_they_say():
 
 @pytest.mark.parametrize(('ours', 'theirs', 'paired'), [
     ([], [1.0], False), ([1.0], [], False), ([1.0], [1.0, 2.0], True)])
-def test_samples_that_cannot_be_compared_are_an_error(ours, theirs, paired):
+def test_empty_or_mismatched_samples_are_errors(ours, theirs, paired):
     with pytest.raises(ValueError, match='^ours, theirs: '):
         reduction(ours, theirs, mean, paired)
 
 
-def test_nothing_is_less_than_zero():
+def test_the_reduction_from_zero_is_nan():
     assert np.isnan(reduction([0.0, 0.0], [0.0, 0.0], mean)).all()

@@ -1,4 +1,4 @@
-"""Running jobs: what is kept, what is done again, and how a run ends early."""
+"""Running jobs: stored results, repeated jobs, and runs that end early."""
 
 import json
 import os
@@ -13,7 +13,6 @@ from rhs_isac_ros.experiments import (
     JobError,
     MissingLibraryError,
     ResultStore,
-    run_command,
     run_jobs,
 )
 from rhs_isac_ros.experiments import store as store_module
@@ -22,7 +21,7 @@ from rhs_isac_ros.experiments import workers as workers_module
 
 JOBS = [Job(f'square-{number}', {'number': number, 'of': (1, 2)}) for number in range(4)]
 SQUARES = [{'square': number**2} for number in range(4)]
-# A worker sends what a terminal does at Ctrl-C, then waits to be ended.
+# A worker sends SIGINT to the process group, as a terminal does on Ctrl-C, then waits.
 INTERRUPTED = '''
 import os, signal, sys
 from pathlib import Path
@@ -40,7 +39,7 @@ sys.exit(run_command(lambda: run_jobs(work, jobs, Path(sys.argv[1]), n_jobs=2)))
 
 
 class Worker:
-    """Squares numbers in this process and remembers which; may fail at one."""
+    """Squares numbers in this process and records them; fails at a given one."""
 
     def __init__(self, fails_at=None, error=None):
         self.seen, self._fails_at, self._error = [], fails_at, error
@@ -52,7 +51,7 @@ class Worker:
         return {'square': number**2}
 
 
-def seen_when_run_again(folder, jobs=JOBS) -> list[int]:
+def numbers_run_again(folder, jobs=JOBS) -> list[int]:
     worker = Worker()
     run_jobs(worker, jobs, folder, n_jobs=1)
     return worker.seen
@@ -64,42 +63,42 @@ def test_results_come_in_the_order_of_the_jobs(tmp_path):
     assert worker.seen == [0, 1, 2, 3]
 
 
-def test_finished_jobs_are_not_done_again(tmp_path):
+def test_finished_jobs_are_not_repeated(tmp_path):
     run_jobs(Worker(), JOBS[:2], tmp_path, n_jobs=1)
     worker = Worker()
     assert run_jobs(worker, JOBS, tmp_path, n_jobs=1) == SQUARES
     assert worker.seen == [2, 3]
-    assert seen_when_run_again(tmp_path) == []
+    assert numbers_run_again(tmp_path) == []
 
 
-def test_an_interrupted_run_keeps_what_is_finished(tmp_path):
+def test_an_interrupted_run_keeps_its_finished_jobs(tmp_path):
     worker = Worker(2, KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
         run_jobs(worker, JOBS, tmp_path, n_jobs=1)
     assert worker.seen == [0, 1]
-    assert seen_when_run_again(tmp_path) == [2, 3]
+    assert numbers_run_again(tmp_path) == [2, 3]
 
 
 @pytest.mark.parametrize('content', [
     b'', b'{"version": ', b'\xff\xfe', b'[]', b'{}', b'{"result": 1}'])
-def test_a_damaged_result_is_computed_again(tmp_path, content):
+def test_a_job_with_a_damaged_result_is_repeated(tmp_path, content):
     run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
     ResultStore(tmp_path).path(JOBS[1]).write_bytes(content)
-    assert seen_when_run_again(tmp_path) == [1]
-    assert seen_when_run_again(tmp_path) == []
+    assert numbers_run_again(tmp_path) == [1]
+    assert numbers_run_again(tmp_path) == []
 
 
-def test_a_result_of_other_arguments_does_not_count(tmp_path):
+def test_a_job_whose_arguments_changed_is_repeated(tmp_path):
     run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
     changed = [Job(JOBS[0].name, {**JOBS[0].arguments, 'of': (1, 3)}), *JOBS[1:]]
-    assert seen_when_run_again(tmp_path, changed) == [0]
+    assert numbers_run_again(tmp_path, changed) == [0]
 
 
-def test_a_result_of_another_version_does_not_count(tmp_path, monkeypatch):
+def test_a_job_of_another_version_is_repeated(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(store_module, '__version__', '0.0.0')
         run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
-    assert seen_when_run_again(tmp_path) == [0, 1, 2, 3]
+    assert numbers_run_again(tmp_path) == [0, 1, 2, 3]
 
 
 def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
@@ -108,7 +107,7 @@ def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
         run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
 
 
-def test_a_file_appears_whole_and_leaves_nothing_beside_it(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_only_the_old_file(tmp_path, monkeypatch):
     store = ResultStore(tmp_path)
     store.write(JOBS[0], {'mean': float('inf')})
     assert store.read(JOBS[0]) == {'mean': float('inf')}
@@ -124,21 +123,21 @@ def test_a_file_appears_whole_and_leaves_nothing_beside_it(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize('n_jobs', [1, 2])
-def test_an_error_names_its_job_and_the_others_are_kept(tmp_path, n_jobs):
+def test_an_error_names_its_job_and_other_results_are_kept(tmp_path, n_jobs):
     def work(number, of):
         return {'square': number**2} if number != 2 else of[number]
 
     with pytest.raises(JobError, match=r'(?s)job square-2 failed: .*IndexError: tuple index'):
         run_jobs(work, JOBS[:3], tmp_path, n_jobs=n_jobs)
-    assert seen_when_run_again(tmp_path, JOBS[2:3]) == [2]
+    assert numbers_run_again(tmp_path, JOBS[2:3]) == [2]
 
 
-def test_a_result_that_json_cannot_hold_names_its_job(tmp_path):
+def test_a_result_that_is_not_serialisable_names_its_job(tmp_path):
     with pytest.raises(JobError, match='(?s)job square-0 failed: .*not JSON serializable'):
         run_jobs(lambda number, of: {'square': {1, 2}}, JOBS, tmp_path, n_jobs=1)
 
 
-def test_processes_share_the_work(tmp_path):
+def test_jobs_run_in_other_processes_with_one_thread(tmp_path):
     def work(number, of):
         import os
         return {'process': os.getpid(), 'threads': os.environ['OPENBLAS_NUM_THREADS']}
@@ -158,7 +157,7 @@ def test_a_process_that_dies_is_an_error(tmp_path):
 
 
 def test_ctrl_c_ends_all_processes_and_the_run_resumes(tmp_path):
-    # The pipes end when the last process that holds them does.
+    # The call returns only after every process that inherited the pipes has ended.
     done = subprocess.run(
         [sys.executable, '-c', INTERRUPTED, str(tmp_path)], capture_output=True, text=True,
         timeout=60, start_new_session=True, check=False)
@@ -169,7 +168,7 @@ def test_ctrl_c_ends_all_processes_and_the_run_resumes(tmp_path):
     assert [result['number'] for result in results] == [0, 1, 2, 3]
 
 
-def test_ctrl_c_works_as_before_afterwards(tmp_path):
+def test_the_signal_handler_is_restored(tmp_path):
     before = signal.getsignal(signal.SIGINT)
     run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
     assert signal.getsignal(signal.SIGINT) == before
@@ -183,7 +182,7 @@ def cluster():
         yield local
 
 
-def test_a_dask_cluster_does_the_jobs(tmp_path, cluster):
+def test_jobs_run_on_a_dask_cluster(tmp_path, cluster):
     def work(number, of):
         from distributed import get_worker
         return {'square': number**2, 'worker': get_worker().address}
@@ -191,7 +190,7 @@ def test_a_dask_cluster_does_the_jobs(tmp_path, cluster):
     results = run_jobs(work, JOBS, tmp_path, dask=cluster.scheduler_address)
     assert [result['square'] for result in results] == [0, 1, 4, 9]
     assert {result['worker'] for result in results} == {cluster.workers[0].address}
-    assert seen_when_run_again(tmp_path) == []
+    assert numbers_run_again(tmp_path) == []
 
 
 def test_an_error_on_a_dask_cluster_names_its_job(tmp_path, cluster):
@@ -202,13 +201,13 @@ def test_an_error_on_a_dask_cluster_names_its_job(tmp_path, cluster):
 
 def test_a_dask_cluster_without_workers_is_an_error(tmp_path, monkeypatch):
     distributed = pytest.importorskip('distributed')
-    monkeypatch.setattr(workers_module, '_PATIENCE_S', 0.1)
+    monkeypatch.setattr(workers_module, '_TIMEOUT_S', 0.1)
     with distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=':0') as empty:
         with pytest.raises(ConnectionError, match='^Dask cluster inproc://.*workers'):
             run_jobs(Worker(), JOBS, tmp_path, dask=empty.scheduler_address)
 
 
-def test_equal_names_are_an_error(tmp_path):
+def test_duplicate_names_are_an_error(tmp_path):
     with pytest.raises(ValueError, match='two of the same name'):
         run_jobs(Worker(), [JOBS[0], JOBS[0]], tmp_path, n_jobs=1)
 
@@ -217,21 +216,8 @@ def test_equal_names_are_an_error(tmp_path):
     ('tqdm', 'showing progress'), ('joblib', 'running jobs')])
 def test_a_missing_library_is_named(tmp_path, monkeypatch, library, purpose):
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(MissingLibraryError, match=f'^{purpose} needs {library}, which is not'):
+    with pytest.raises(MissingLibraryError, match=f'^{purpose} needs {library}, .*experiments'):
         run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
-
-
-@pytest.mark.parametrize(('error', 'code', 'message'), [
-    (KeyboardInterrupt(), 130, 'interrupted: finished jobs are kept, the same command resumes'),
-    (JobError('job 3 failed'), 1, 'error: job 3 failed'),
-    (MissingLibraryError('needs joblib'), 1, 'error: needs joblib'),
-])
-def test_a_command_says_how_it_ended(capsys, error, code, message):
-    def experiment():
-        raise error
-
-    assert run_command(experiment) == code
-    assert capsys.readouterr().err.startswith(message)
 
 
 def test_results_are_plain_json(tmp_path):
@@ -239,3 +225,11 @@ def test_results_are_plain_json(tmp_path):
     record = json.loads(ResultStore(tmp_path).path(JOBS[0]).read_text())
     assert record['arguments'] == {'number': 0, 'of': [1, 2]}
     assert record['result'] == {'square': 0}
+
+
+def test_a_library_missing_in_a_job_is_reported_in_one_line(tmp_path):
+    def work(number, of):
+        raise MissingLibraryError('method needs pymoo')
+
+    with pytest.raises(JobError, match='^job square-0 failed: method needs pymoo$'):
+        run_jobs(work, JOBS, tmp_path, n_jobs=1)

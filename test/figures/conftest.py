@@ -11,14 +11,14 @@ FOLDER = Path(__file__).parents[2] / 'scripts' / 'figures'
 
 @pytest.fixture(scope='session')
 def load_figure():
-    """Function that imports a script by its name."""
-    # As Python does for a script that is started: its parts lie beside it.
+    """Callable that imports a script by name."""
+    # As Python does when it runs a script, so that it finds its parts.
     sys.path.insert(0, str(FOLDER))
 
     def load(name):
         spec = importlib.util.spec_from_file_location(f'figures_{name}', FOLDER / f'{name}.py')
         module = importlib.util.module_from_spec(spec)
-        # Jobs find their function by the name of its module.
+        # Jobs are pickled with the name of the module of their function.
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)
         return module

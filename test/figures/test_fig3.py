@@ -1,4 +1,4 @@
-"""Fig. 3 with few steps: every method and every number of bands, and what is said of them."""
+"""Fig. 3: a trial, the report of synthetic trials, and the command."""
 
 import json
 import os
@@ -22,7 +22,7 @@ def fig3(load_figure):
 
 @pytest.fixture(scope='module')
 def entries(fig3):
-    """Made-up trials in which everything is as the paper says."""
+    """Synthetic trials in which all claims of the paper hold."""
     level = {'alternating': 1.0, 'direct': 2.0, 'genetic': 3.0, 'lbfgs': 0.5}
     return [{'method': method, 'n_bands': n, 'seed': seed, 'seconds': level[method],
              'crlb_m2': level[method] * (1 + 0.01 * seed) - (method == 'alternating') * n / 10,
@@ -34,21 +34,21 @@ def verdicts(summary):
     return [': holds' in claim for claim in summary.claims()]
 
 
-def test_claims_hold_where_they_do(fig3, entries):
+def test_all_claims_hold_for_the_synthetic_trials(fig3, entries):
     assert verdicts(fig3.Summary(entries)) == [True] * 4
 
 
 @pytest.mark.parametrize(('changes', 'expected'), [
     ({'crlb_m2': 5.0}, [False, True, False, False]),
     ({'seconds': 2.5}, [True, False, True, True])])
-def test_claims_do_not_hold_where_one_number_of_bands_says_otherwise(
+def test_one_number_of_bands_can_refute_a_claim(
         fig3, entries, changes, expected):
     changed = [entry | changes if (entry['method'], entry['n_bands']) == ('alternating', 4)
                else entry for entry in entries]
     assert verdicts(fig3.Summary(changed)) == expected
 
 
-def test_table_has_every_method_and_number_of_bands(fig3, entries):
+def test_the_table_has_a_row_for_each_method_and_number_of_bands(fig3, entries):
     rows = fig3.Summary(entries).table().splitlines()[2:]
     assert len(rows) == len(fig3.METHODS) * len(fig3.BANDS)
     first = [cell.strip() for cell in rows[0].strip('|').split('|')]
@@ -56,7 +56,7 @@ def test_table_has_every_method_and_number_of_bands(fig3, entries):
                      '1.00 ± 0.00']
 
 
-def test_a_trial_is_what_it_says(fig3):
+def test_a_trial_optimises_with_its_arguments(fig3):
     result = fig3.trial('lbfgs', 2, 5, samples=6, held_out=50, max_steps=3)
     assert (result['steps'], result['reason']) == (3, 'max_steps reached')
     scenario = Scenario(center_frequencies_hz=(2.5e9, 3.0e9), n_frames=4)
@@ -66,7 +66,7 @@ def test_a_trial_is_what_it_says(fig3):
     assert result['seconds'] > 0
 
 
-def test_the_command_writes_everything_and_goes_on_where_it_ended(
+def test_the_command_writes_all_files_and_repeats_no_finished_trial(
         fig3, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fig3, 'METHODS', ('alternating', 'direct', 'genetic'))
     monkeypatch.setattr(fig3, 'BANDS', (1, 2))
@@ -80,7 +80,7 @@ def test_the_command_writes_everything_and_goes_on_where_it_ended(
     assert fig3.main(['--trials', '1', *call]) == 0
     assert len(made) == 6
     assert fig3.main(['--trials', '2', *call]) == 0
-    # Six more: those of the first trial are kept.
+    # Six more; the results of the first trial are reused.
     assert len(made) == len(set(made)) == 12
     assert {'fig3.json', 'fig3.md', 'fig3.png'} <= set(os.listdir(tmp_path))
     figures = json.loads((tmp_path / 'fig3.json').read_text(encoding='utf-8'))

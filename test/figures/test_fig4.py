@@ -1,4 +1,4 @@
-"""Fig. 4 with few pairs and positions, and what is said of made-up results."""
+"""Fig. 4: the command with few pairs and positions, and the report of synthetic results."""
 
 import csv
 import os
@@ -24,7 +24,7 @@ def report(fig4):
 
 @pytest.fixture
 def summary(report):
-    """Made-up results: everything of `optimised` is half of directional's, a third of random's."""
+    """Synthetic results: those of `optimised` are half of directional's, a third of random's."""
     level = {'optimised': 6.0, 'ambiguity': 3.0, 'directional': 12.0, 'random': 18.0}
     shape = np.random.default_rng(0).exponential(size=(400, 3))
     return report.Summary(
@@ -39,7 +39,7 @@ def cells(row):
     return [cell.strip() for cell in row.strip('|').split('|')]
 
 
-def test_claims_stand_beside_what_is_measured(summary):
+def test_the_table_of_claims_has_the_measured_reductions(summary):
     rows = [cells(row) for row in summary.claims().splitlines()[2:]]
     assert [row[1] for row in rows] == ['42 %', '69 %', '82 %', '86 %', '50 %', '64 %']
     for row, less in zip(rows, [50, 67, 50, 67, 50, 67], strict=True):
@@ -54,7 +54,7 @@ def test_the_table_has_a_row_for_each_pair(summary):
     assert rows[4][:3] == ['bayes, optimised', '3.000', '3.000']
 
 
-def test_numbers_are_written_as_csv(report, summary):
+def test_the_data_are_available_as_csv(report, summary):
     tables = report.tables(summary)
     rows = list(csv.DictReader(tables['fig4b.csv'].splitlines()))
     assert len(rows) == 8 * 400
@@ -67,7 +67,7 @@ def test_the_picture_is_drawn(report, summary):
     assert report.picture(summary).startswith(b'\x89PNG')
 
 
-def test_the_command_does_everything_with_small_numbers(fig4, tmp_path, capsys):
+def test_the_command_writes_all_files_and_repeats_no_job(fig4, tmp_path, capsys):
     call = ['--trials', '1', '--pairs', '200', '--positions', '4', '--jobs', '1',
             '--output', str(tmp_path)]
     assert fig4.main(call) == 0
@@ -78,15 +78,15 @@ def test_the_command_does_everything_with_small_numbers(fig4, tmp_path, capsys):
     assert len(jobs) == 4 + 4 + 1
     assert fig4.main(call) == 0
     assert capsys.readouterr().out == out
-    # Nothing was done again.
+    # No job was repeated.
     assert jobs == {path.name: path.stat().st_mtime_ns for path in (tmp_path / 'jobs').iterdir()}
 
 
-def test_losses_are_those_of_the_estimates(fig4):
+def test_capacity_losses_depend_on_the_estimates(fig4):
     truth, _ = fig4.simulate_pairs(
         fig4.Scenario(), fig4.directional_codebook(fig4.Scenario()), 2, fig4.TEST_SEED, 3)
     still = np.zeros((2, 3, 3)).tolist()
-    losses = fig4.lose(3, {
+    losses = fig4.capacity_losses(3, {
         'right': {'means': truth.tolist(), 'covariances': still},
         'wrong': {'means': (truth + [0, 2, 0]).tolist(), 'covariances': still}})
     assert np.allclose(losses['right'], 0)

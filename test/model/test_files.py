@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.files import check_writable, write_whole
 
 
 @pytest.mark.parametrize('content', ['größer', 'größer'.encode(),
@@ -39,3 +39,10 @@ def test_a_failing_write_keeps_the_old_file_alone(tmp_path, monkeypatch, failing
 def test_no_folder_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match='none'):
         write_whole(tmp_path / 'none' / 'file', 'x')
+
+
+def test_a_file_in_a_missing_folder_is_not_writable(tmp_path):
+    check_writable(tmp_path / 'file')
+    path = tmp_path / 'none' / 'file'
+    with pytest.raises(OSError, match=f'^{path}: expected a file in a directory that can be'):
+        check_writable(path)

@@ -1,4 +1,4 @@
-"""The hops of a cycle as bare rclpy ping-pong: the floor under every cycle."""
+"""The hops of a cycle as ping-pong in bare rclpy: the lower bound of its duration."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.run import run
 
-# The chain of a cycle; the pilots of a band travel side by side and count once.
+# Messages of a cycle in order. The pilots of a band are sent in parallel and count once.
 BEFORE = ('beacon', 'ack')
 PER_BAND = ('rhs/command', 'rhs/configuration', 'pilot_request', 'pilot', 'feed_signals')
 AFTER = ('received_signals', 'position_estimate', 'beam', 'rhs/configuration',
@@ -24,22 +24,22 @@ ROUND_TRIPS = 2000
 
 
 def hops_of(scenario: Scenario) -> int:
-    """Count the messages of a cycle that wait for each other."""
+    """Return the number of consecutive messages of a cycle."""
     return len(BEFORE) + scenario.n_bands * len(PER_BAND) + len(AFTER)
 
 
 def ping_pong(scenario: Scenario) -> np.ndarray:
-    """Measure round trips between this process and another one [s]."""
+    """Measure round trips between this process and another one, float64 [N] [s]."""
     feeds = np.ones((scenario.n_subbands, scenario.n_feeds), complex)
-    ball = convert.to_ros(m.FeedSignals(1, 1, 0, 0, feeds), None)
+    message = convert.to_ros(m.FeedSignals(1, 1, 0, 0, feeds), None)
     times_s: list[float] = []
     node = Node('ping')
     publisher = node.create_publisher(FeedSignals, 'benchmark/ping', qos.EXCHANGE)
 
-    def on_pong(message: FeedSignals) -> None:
+    def on_pong(_: FeedSignals) -> None:
         times_s.append(time.perf_counter() - on_pong.sent_s)
         on_pong.sent_s = time.perf_counter()
-        publisher.publish(ball)
+        publisher.publish(message)
 
     node.create_subscription(
         FeedSignals, 'benchmark/pong', on_pong, qos.EXCHANGE,
@@ -54,7 +54,7 @@ def ping_pong(scenario: Scenario) -> np.ndarray:
             before = len(times_s)
             if before == 0:
                 on_pong.sent_s = time.perf_counter()
-                publisher.publish(ball)
+                publisher.publish(message)
             executor.spin_once(timeout_sec=1.0)
     finally:
         other.terminate()
@@ -65,7 +65,7 @@ def ping_pong(scenario: Scenario) -> np.ndarray:
 
 
 def pong() -> int:
-    """Send back what comes, until a signal ends the process."""
+    """Echo each message until a signal ends the process."""
     def make() -> list[Node]:
         node = Node('pong')
         publisher = node.create_publisher(FeedSignals, 'benchmark/pong', qos.EXCHANGE)

@@ -1,6 +1,6 @@
 """Part (c) of the benchmark of the optimizer: time and memory by the size of the problem.
 
-As a script, it measures the sizes that its argument says, on the cores that it was started on.
+As a script, it measures the sizes in its argument, a JSON object, on the cores assigned to it.
 """
 
 import json
@@ -20,42 +20,43 @@ from rhs_isac_ros.codebook.sampling import monte_carlo
 from rhs_isac_ros.model import Scenario, streams
 
 POSITIONS = 1200
-# Sides of the surface, numbers of positions and of bands of part (c).
+# Sizes to measure: numbers of positions, elements and bands.
 GROWTH = {'N_sam': (100, 300, 1000, 3000, 10000), 'N_E': (100, 256, 484, 1024),
           'N_B': (1, 2, 4, 8)}
 LARGE = {'N_sam': POSITIONS, 'N_E': 1024, 'N_B': 4}
 
 
 def growth() -> dict:
-    """Part (c); every size in a process of its own, for its peak memory."""
-    print('(c) growth: set-up, one value and gradient, peak memory of the process\n')
+    """Run part (c), each size in a new process so that its peak memory can be measured."""
+    print('(c) growth: set-up, value with gradient, peak memory of the process\n')
     print('| size | set-up [s] | evaluation [ms] | peak [MiB] | ranks |\n|---|---|---|---|---|')
     base = {'N_sam': POSITIONS, 'N_E': 100, 'N_B': 2}
     rows = {}
     for symbol, values in GROWTH.items():
         for value in values:
-            rows[f'{symbol} = {value}'] = measured(base | {symbol: value})
+            rows[f'{symbol} = {value}'] = measure(base | {symbol: value})
     large = ', '.join(f'{symbol} = {value}' for symbol, value in LARGE.items())
-    rows[large] = measured(LARGE)
+    rows[large] = measure(LARGE)
     for name, row in rows.items():
         print(f'| {name} | {row["setup_s"]:.2f} | {row["evaluation_ms"]:.1f} | '
               f'{row["peak_mib"]:.0f} | {", ".join(map(str, row["ranks"]))} |')
 
-    def to_linear(symbol: str, a: int, b: int) -> float:
+    def relative_to_linear(symbol: str, a: int, b: int) -> float:
         first, second = (rows[f'{symbol} = {n}']['evaluation_ms'] for n in (a, b))
         return second / first * a / b
 
-    whole = {symbol: to_linear(symbol, values[0], values[-1])
+    whole = {symbol: relative_to_linear(symbol, values[0], values[-1])
              for symbol, values in GROWTH.items()}
-    step = {symbol: max(to_linear(symbol, *pair) for pair in zip(values, values[1:], strict=False))
+    step = {symbol: max(relative_to_linear(symbol, *pair)
+                        for pair in zip(values, values[1:], strict=False))
             for symbol, values in GROWTH.items()}
-    print('\nrelative to linear growth, from end to end (and in the steepest step): '
+    print('\nrelative to linear growth, overall (and in the steepest step): '
           + ', '.join(f'{s} {whole[s]:.2f} ({step[s]:.2f})' for s in GROWTH) + '\n')
     return {'growth': rows, 'growth_to_linear': whole, 'growth_to_linear_steepest': step,
             'large_peak_mib': rows[large]['peak_mib']}
 
 
-def measured(sizes: dict[str, int]) -> dict:
+def measure(sizes: dict[str, int]) -> dict:
     """Measure one size in a new process."""
     done = subprocess.run(
         [sys.executable, __file__, json.dumps(sizes)], stdout=subprocess.PIPE, text=True,
@@ -64,7 +65,7 @@ def measured(sizes: dict[str, int]) -> dict:
 
 
 def grow(sizes: dict[str, int]) -> dict:
-    """Set-up time, time of an evaluation, and peak memory of this process."""
+    """Measure set-up time, evaluation time, and peak memory of this process."""
     scenario = Scenario(
         center_frequencies_hz=tuple(2e9 + 0.5e9 * (i + 1) for i in range(sizes['N_B'])),
         elements_per_side=round(sizes['N_E']**0.5))
@@ -75,14 +76,14 @@ def grow(sizes: dict[str, int]) -> dict:
     setup_s = time.perf_counter() - begin
     average(codebook)
     seconds = side_by_side({'evaluation': lambda: average(codebook)}, 15)['evaluation']
-    # Not getrusage, which also counts the process that this one was forked from.
+    # getrusage would include the peak of the process that this one was forked from.
     peak = re.search(r'VmHWM:\s*(\d+) kB', Path('/proc/self/status').read_text(encoding='ascii'))
     return {'setup_s': setup_s, 'evaluation_ms': 1e3 * seconds, 'peak_mib': int(peak[1]) / 1024,
             'ranks': average.rows.ranks}
 
 
 def side_by_side(contenders: dict[str, Callable], rounds: int = 25) -> dict[str, float]:
-    """Median times, taken in turn so that a disturbance meets everybody [s]."""
+    """Return median times [s], measured in turn so that a disturbance affects all contenders."""
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, function in contenders.items():

@@ -1,4 +1,4 @@
-"""The average bound in JAX: the objective as one would write it with automatic differentiation."""
+"""The average bound in JAX, with automatic differentiation."""
 
 from collections.abc import Callable
 
@@ -16,8 +16,6 @@ class JaxAverageCrlb:
 
     Parameters
     ----------
-    scenario
-        The scenario.
     positions
         Float64 [N, 3] [m].
     """
@@ -30,23 +28,23 @@ class JaxAverageCrlb:
         self._block = jax.block_until_ready
         n, n_bands, n_subbands = len(positions), scenario.n_bands, scenario.n_subbands
         n_rows = n_subbands * scenario.n_frames
-        # Sub-bands first: the products then read one run of memory.
-        slopes = np.stack([
+        # With the sub-bands first, the products read contiguous memory.
+        derivatives = np.stack([
             np.moveaxis(los_derivative(scenario, positions, band), 2, 0).reshape(
                 n_subbands, 3 * n, scenario.n_elements) for band in range(n_bands)])
         self._constants = [jnp.asarray(array) for array in (
-            slopes, onboard_matrix(scenario), multipath_covariance(scenario),
+            derivatives, onboard_matrix(scenario), multipath_covariance(scenario),
             measurement_correlation(scenario))]
         noise = scenario.noise_power_w * jnp.eye(n_rows)
         self._shapes = ((n_bands, scenario.n_frames, scenario.n_elements),
                         (n_bands, n_subbands, scenario.n_frames, scenario.n_feeds))
         root_power = np.sqrt(scenario.max_power_w)
 
-        def bound(analog, real, imag, slopes, onboard, spatial, correlation):
+        def bound(analog, real, imag, derivatives, onboard, spatial, correlation):
             raw = real + 1j * imag
             norm = jnp.sqrt(jnp.sum(real**2 + imag**2, axis=(1, 3), keepdims=True))
             patterns = analog[:, None] * jnp.matmul(raw * (root_power / norm), onboard)
-            means = jnp.matmul(slopes, jnp.swapaxes(patterns, 2, 3))
+            means = jnp.matmul(derivatives, jnp.swapaxes(patterns, 2, 3))
             means = jnp.transpose(means, (0, 1, 3, 2)).reshape(n_bands, n_rows, 3 * n)
             rows = patterns.reshape(n_bands, n_rows, -1)
             scattered = rows @ spatial @ jnp.conj(jnp.swapaxes(rows, 1, 2))
@@ -60,18 +58,7 @@ class JaxAverageCrlb:
         self._function: Callable = jax.jit(jax.value_and_grad(bound, argnums=(0, 1, 2)))
 
     def __call__(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate value and gradient at variables in the order of `Problem`.
-
-        Parameters
-        ----------
-        variables
-            Float64 [n].
-
-        Returns
-        -------
-        tuple
-            Value [m^2], and gradient, float64 [n].
-        """
+        """Return value [m^2] and gradient, float64 [n], at variables in the order of `Problem`."""
         analog_shape, digital_shape = self._shapes
         analog = variables[:np.prod(analog_shape)].reshape(analog_shape)
         real, imag = variables[analog.size:].reshape(2, *digital_shape)

@@ -1,4 +1,4 @@
-"""What Fig. 4 says: its table, the claims of the paper beside it, the picture and the numbers."""
+"""The report of Fig. 4: table, comparison with the paper's claims, picture and CSV files."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -6,27 +6,28 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.experiments.libraries import needed_for
 from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.model.optional import optional_import
 
 ESTIMATORS = ('neural', 'bayes')
-# What the paper claims of `optimised` against each benchmark, in per cent, and of what.
+# Reductions that the paper claims for `optimised`, by quantity and benchmark [%].
 CLAIMS = {'mean squared error': {'directional': 42, 'random': 69},
           'median capacity loss': {'directional': 82, 'random': 86},
           'interquartile range of the loss': {'directional': 50, 'random': 64}}
 
 
 class Summary:
-    """What was measured: errors of every training, and everybody's losses at every position.
+    """Results: the error of every training, and losses and errors at every position.
 
     Parameters
     ----------
     names
-        Codebooks.
+        Names of the codebooks.
     mses
         Mean squared errors of the trials by estimator and codebook [m^2].
     losses
-        Losses by ``estimator codebook``, float64 [n, 2] [bit/s, per cent].
+        Loss, relative loss and squared error by ``estimator codebook``, float64 [n, 3]
+        [bit/s, per cent, m^2].
     """
 
     def __init__(self, names: Sequence[str], mses: Mapping[tuple[str, str], np.ndarray],
@@ -34,7 +35,7 @@ class Summary:
         self.names, self.mses, self.losses = tuple(names), mses, losses
 
     def table(self) -> str:
-        """One row for each estimator and codebook."""
+        """Return a table with a row for each estimator and codebook."""
         rows = []
         for estimator in ESTIMATORS:
             for name in self.names:
@@ -47,60 +48,60 @@ class Summary:
                     f'{median[0] / 1e3:.1f}', f'{(high - low)[0] / 1e3:.1f}',
                     f'{median[1]:.3f}'])
         return markdown_table(
-            ['estimator, codebook', 'MSE [m²]', 'the best', 'median loss [kbit/s]',
+            ['estimator, codebook', 'MSE [m²]', 'best', 'median loss [kbit/s]',
              'interquartile range [kbit/s]', 'median loss [%]'], rows)
 
     def claims(self) -> str:
-        """What the paper claims beside what is measured, with 95 % intervals."""
+        """Return a table of the claimed and the measured reductions, with 95 % intervals."""
         rows = []
-        for what, rivals in CLAIMS.items():
+        for quantity, rivals in CLAIMS.items():
             for rival, claimed in rivals.items():
-                row = [f'{what}, below {rival}', f'{claimed} %']
+                row = [f'{quantity}, below {rival}', f'{claimed} %']
                 for estimator, own in (('neural', 'optimised'), ('bayes', 'optimised'),
                                        ('bayes', 'ambiguity')):
-                    row.append(self._reduction(what, estimator, own, rival))
+                    row.append(self._reduction(quantity, estimator, own, rival))
                 rows.append(row)
         return markdown_table(
             ['claim', 'paper', 'neural, optimised', 'bayes, optimised', 'bayes, ambiguity'], rows)
 
-    def _reduction(self, what: str, estimator: str, own: str, rival: str) -> str:
-        def of(name: str) -> np.ndarray:
-            if what == 'mean squared error' and estimator == 'neural':
+    def _reduction(self, quantity: str, estimator: str, own: str, rival: str) -> str:
+        def values_of(name: str) -> np.ndarray:
+            if quantity == 'mean squared error' and estimator == 'neural':
                 return self.mses[estimator, name]
-            column = 2 if what == 'mean squared error' else 0
+            column = 2 if quantity == 'mean squared error' else 0
             return self.losses[f'{estimator} {name}'][:, column]
 
         statistic = {
             'mean squared error': lambda values: values.mean(axis=-1),
             'median capacity loss': lambda values: np.median(values, axis=-1),
             'interquartile range of the loss':
-                lambda values: np.subtract(*np.quantile(values, (0.75, 0.25), axis=-1))}[what]
-        less, low, high = reduction(of(own), of(rival), statistic)
+                lambda values: np.subtract(*np.quantile(values, (0.75, 0.25), axis=-1))}[quantity]
+        less, low, high = reduction(values_of(own), values_of(rival), statistic)
         return f'{less:.0f} % [{low:.0f}, {high:.0f}]'
 
 
 def picture(summary: Summary) -> bytes:
-    """Draw (a), trainings as dots in their distribution, and (b), the losses as boxes."""
-    with needed_for('drawing the figure'):
+    """Draw (a), trainings as dots in their distribution, and (b), box plots of the losses."""
+    with optional_import('drawing the figure', extra='plot'):
         from matplotlib.figure import Figure
     figure = Figure(figsize=(11, 4), layout='constrained')
     left, right = figure.subplots(1, 2)
-    places = np.arange(len(summary.names))
-    for shift, estimator, colour in zip((-0.2, 0.2), ESTIMATORS, ('C0', 'C1'), strict=True):
-        for place, name in zip(places + shift, summary.names, strict=True):
+    centers = np.arange(len(summary.names))
+    for shift, estimator, color in zip((-0.2, 0.2), ESTIMATORS, ('C0', 'C1'), strict=True):
+        for x, name in zip(centers + shift, summary.names, strict=True):
             mses = summary.mses[estimator, name]
             if len(mses) > 2 and np.ptp(mses) > 0:
-                bodies = left.violinplot(mses, [place], widths=0.35, showextrema=False)['bodies']
-                bodies[0].set(facecolor=colour, alpha=0.3)
-            left.plot(np.full(len(mses), place), mses, '.', color=colour, alpha=0.6)
-            left.plot(place, mses.mean(), 'x', color='k')
+                bodies = left.violinplot(mses, [x], widths=0.35, showextrema=False)['bodies']
+                bodies[0].set(facecolor=color, alpha=0.3)
+            left.plot(np.full(len(mses), x), mses, '.', color=color, alpha=0.6)
+            left.plot(x, mses.mean(), 'x', color='k')
             box = right.boxplot(
-                summary.losses[f'{estimator} {name}'][:, 0] / 1e3, positions=[place],
+                summary.losses[f'{estimator} {name}'][:, 0] / 1e3, positions=[x],
                 widths=0.3, showfliers=False, patch_artist=True)
-            box['boxes'][0].set(facecolor=colour, alpha=0.5)
-        left.plot([], [], 's', color=colour, alpha=0.5, label=estimator)
+            box['boxes'][0].set(facecolor=color, alpha=0.5)
+        left.plot([], [], 's', color=color, alpha=0.5, label=estimator)
     for axes, label in ((left, '(a) mean squared error [m²]'), (right, '(b) loss [kbit/s]')):
-        axes.set_xticks(places, summary.names)
+        axes.set_xticks(centers, summary.names)
         axes.set(ylabel=label)
     left.set(ylim=(0, None))
     left.legend()
@@ -110,7 +111,7 @@ def picture(summary: Summary) -> bytes:
 
 
 def tables(summary: Summary) -> dict[str, str]:
-    """The numbers behind both panels, as CSV."""
+    """Return the data of both panels as CSV, by file name."""
     lines = {'fig4a.csv': ['estimator,codebook,training,mse_m2'],
              'fig4b.csv': ['estimator,codebook,position,loss_bps,loss_percent,squared_error_m2']}
     for estimator in ESTIMATORS:
@@ -118,6 +119,6 @@ def tables(summary: Summary) -> dict[str, str]:
             lines['fig4a.csv'] += [f'{estimator},{name},{trial},{mse:.6g}' for trial, mse
                                    in enumerate(summary.mses[estimator, name])]
             lines['fig4b.csv'] += [
-                f'{estimator},{name},{place},' + ','.join(f'{value:.6g}' for value in row)
-                for place, row in enumerate(summary.losses[f'{estimator} {name}'])]
+                f'{estimator},{name},{position},' + ','.join(f'{value:.6g}' for value in row)
+                for position, row in enumerate(summary.losses[f'{estimator} {name}'])]
     return {name: '\n'.join(rows) + '\n' for name, rows in lines.items()}

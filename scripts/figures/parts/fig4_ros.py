@@ -1,10 +1,10 @@
-"""Fig. 4 (b) once more, through a running network of ROS nodes.
+"""Fig. 4 (b) in a running network of ROS nodes.
 
-Problem: does the network add anything to the error that the library computes? Users stand at
-random positions; the network serves them. Each estimate of the positioner must be the library's
-answer to the signals on the topic, to rounding. And the capacity losses must be those that the
-library finds for the same positions with multipath and noise of its own: the two samples are
-compared position by position.
+Problem: does the network add anything to the error that the library computes? The network serves
+users at random positions. Each published estimate must equal, up to rounding, that of the library
+for the published signals. The capacity losses must agree with those that the library finds for
+the same positions, with multipath and noise drawn independently; the two samples are compared
+position by position.
 """
 
 import tempfile
@@ -26,29 +26,19 @@ from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.tools.demo import watch
 
-# A network has so many users, each at a place of its own, and serves each so often.
-USERS, CYCLES_A_USER = 25, 4
-# Cycles by the network, without and with --quick.
+# Users of a network, each at its own position, and cycles for each.
+USERS, CYCLES_PER_USER = 25, 4
+# Cycles in all, without and with --quick.
 CYCLES, QUICK_CYCLES = 500, 100
-# Estimates that differ by less are the same [m].
-SAME_M = 1e-9
+# Estimates are equal if they differ by less [m].
+TOLERANCE_M = 1e-9
 SEED, RESAMPLES = 1 << 21, 2000
 
 
 def compare(codebook_file: Path, cycles: int, output: Path) -> None:
-    """Run networks until they have served enough cycles, compare, print and write.
-
-    Parameters
-    ----------
-    codebook_file
-        The codebook.
-    cycles
-        How many cycles.
-    output
-        Folder of the results.
-    """
+    """Run networks, compare them with the library, and print and write the report."""
     scenario, codebook = Scenario(), Codebook.load(codebook_file)
-    records = measured(codebook_file, cycles)
+    records = run_networks(codebook_file, cycles)
     truth = np.array([record.truth.position for record in records])
     estimator = make_estimator('bayes', scenario, codebook)
     received = np.stack([record.signals.signals for record in records])
@@ -57,33 +47,34 @@ def compare(codebook_file: Path, cycles: int, output: Path) -> None:
     difference_m = np.abs(published - repeated).max()
 
     signals = simulate_received(scenario, codebook, truth, np.random.default_rng(SEED))
-    alone = estimator.estimate(signals)
+    simulated = estimator.estimate(signals)
     losses = np.array([
-        outcome(scenario, choose_beam(scenario, mean, covariance).beam, place).loss_bps
-        for place, mean, covariance in zip(truth, alone.mean, alone.covariance, strict=True)])
+        outcome(scenario, choose_beam(scenario, mean, covariance).beam, position).loss_bps
+        for position, mean, covariance in zip(
+            truth, simulated.mean, simulated.covariance, strict=True)])
     samples = {
         'squared error [m²]': (np.sum((published - truth)**2, axis=1),
-                               np.sum((alone.mean - truth)**2, axis=1)),
+                               np.sum((simulated.mean - truth)**2, axis=1)),
         'capacity loss [bit/s]': (
             np.array([record.capacity.loss_bps for record in records]), losses)}
     report = '\n\n'.join([
-        f'{len(records)} cycles of {len(np.unique(truth, axis=0))} users through the network.',
-        f'Estimates on the topic and by the library for the same signals differ by at most '
-        f'{difference_m:.1e} m: {"the same" if difference_m < SAME_M else "NOT the same"}.',
+        f'{len(records)} cycles of {len(np.unique(truth, axis=0))} users in the network.',
+        f'Published estimates and those of the library for the same signals differ by at most '
+        f'{difference_m:.1e} m: {"the same" if difference_m < TOLERANCE_M else "NOT the same"}.',
         comparison(samples, truth)])
     write_whole(output / 'fig4_ros.md', f'# Fig. 4 (b) over ROS\n\n{report}\n')
     print(f'{report}\n\nwritten: {output}/fig4_ros.md')
 
 
 def comparison(samples: dict[str, tuple[np.ndarray, np.ndarray]], truth: np.ndarray) -> str:
-    """Mean and median of both samples, and whether they agree: 95 % intervals of differences."""
-    _, place = np.unique(truth, axis=0, return_inverse=True)
-    place = place.ravel()
-    members = [np.nonzero(place == one)[0] for one in range(place.max() + 1)]
+    """Return a table of means and medians, with 95 % intervals of their differences."""
+    _, site = np.unique(truth, axis=0, return_inverse=True)
+    site = site.ravel()
+    members = [np.nonzero(site == index)[0] for index in range(site.max() + 1)]
     rng = np.random.default_rng(SEED)
-    # Cycles at one place are no independent samples of the region: places are drawn anew.
+    # Cycles at one position are not independent samples of the region: resample positions.
     picks = rng.integers(len(members), size=(RESAMPLES, len(members)))
-    draws = [np.concatenate([members[one] for one in pick]) for pick in picks]
+    draws = [np.concatenate([members[index] for index in pick]) for pick in picks]
     rows = []
     for name, (network, library) in samples.items():
         for statistic in (np.mean, np.median):
@@ -95,11 +86,11 @@ def comparison(samples: dict[str, tuple[np.ndarray, np.ndarray]], truth: np.ndar
                 f'{statistic(library):.3g}', f'[{low:.2g}, {high:.2g}]',
                 'yes' if low <= 0 <= high else 'no'])
     return markdown_table(
-        ['what', 'network', 'library', '95 % interval of the difference', 'agree'], rows)
+        ['quantity', 'network', 'library', '95 % interval of the difference', 'agree'], rows)
 
 
-def measured(codebook_file: Path, cycles: int) -> list[CycleRecord]:
-    """Cycles of as many networks as it takes, one after the other."""
+def run_networks(codebook_file: Path, cycles: int) -> list[CycleRecord]:
+    """Return the records of cycles, from as many networks in succession as needed."""
     records: list[CycleRecord] = []
     domain = private_domain()
     rclpy.init(domain_id=int(domain['ROS_DOMAIN_ID']),
@@ -108,17 +99,17 @@ def measured(codebook_file: Path, cycles: int) -> list[CycleRecord]:
         with tqdm(total=cycles, unit='cycle', disable=None) as bar:
             seed = 0
             while len(records) < cycles:
-                some = min(USERS * CYCLES_A_USER, cycles - len(records))
-                records += one_network(codebook_file, some, seed, domain, bar)
+                batch = min(USERS * CYCLES_PER_USER, cycles - len(records))
+                records += run_network(codebook_file, batch, seed, domain, bar)
                 seed += 1
     finally:
         rclpy.try_shutdown()
     return records
 
 
-def one_network(codebook_file: Path, cycles: int, seed: int, domain: dict[str, str],
+def run_network(codebook_file: Path, cycles: int, seed: int, domain: dict[str, str],
                 bar: tqdm) -> list[CycleRecord]:
-    """Cycles of one network, whose users are placed by a seed."""
+    """Return the records of cycles of one network; the seed determines its users' positions."""
     observer = CycleObserver()
     before = bar.n
     try:

@@ -1,0 +1,33 @@
+"""Imports of optional libraries, which the extras of the package install."""
+
+import contextlib
+from collections.abc import Iterator
+
+
+class MissingLibraryError(ImportError):
+    """An optional library is not installed."""
+
+
+@contextlib.contextmanager
+def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
+    """Replace an ImportError inside the block by one that names the library and the extra.
+
+    Parameters
+    ----------
+    purpose
+        What the library is needed for; the message begins with it.
+    extra
+        Extra of this package that installs the library, if there is one.
+
+    Raises
+    ------
+    MissingLibraryError
+        If an import inside the block fails.
+    """
+    try:
+        yield
+    except ImportError as error:
+        library = (error.name or str(error)).partition('.')[0]
+        hint = f" (pip install 'rhs_isac_ros[{extra}]')" if extra else ''
+        raise MissingLibraryError(
+            f'{purpose} needs {library}, which is not installed{hint}') from error

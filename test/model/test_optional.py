@@ -1,0 +1,29 @@
+"""Errors for optional libraries that are not installed."""
+
+import sys
+
+import pytest
+
+from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
+
+
+def test_an_import_that_succeeds_is_left_alone():
+    with optional_import('a test'):
+        import json
+    assert json.loads('1') == 1
+
+
+@pytest.mark.parametrize(('extra', 'hint'), [
+    ('watch', r" \(pip install 'rhs_isac_ros\[watch\]'\)"), ('', '')])
+def test_the_error_names_purpose_library_and_extra(monkeypatch, extra, hint):
+    monkeypatch.setitem(sys.modules, 'json.decoder', None)
+    words = f'^a test needs json, which is not installed{hint}$'
+    with pytest.raises(MissingLibraryError, match=words):
+        with optional_import('a test', extra):
+            import json.decoder  # noqa: F401
+
+
+def test_other_errors_pass():
+    with pytest.raises(ZeroDivisionError):
+        with optional_import('a test'):
+            raise ZeroDivisionError
