@@ -1,18 +1,18 @@
-"""Water-filling: how much power each of several parallel channels gets."""
+"""Water-filling: the optimal division of power among parallel channels."""
 
 import numpy as np
 
 
 def water_filling(gains: np.ndarray, power: float) -> np.ndarray:
-    """Share power over parallel channels so that the sum of log(1 + gain * share) is highest.
+    """Divide power among channels so that the sum of log(1 + gain * share) is highest.
 
     Parameters
     ----------
     gains
-        Gain over noise of each channel, float64 [N] [1/W]. Without a positive one, all get the
-        same.
+        Gain over noise of each channel, float64 [N] [1/W]. If none is positive, all channels get
+        the same share.
     power
-        Power to share [W].
+        Power to divide [W].
 
     Returns
     -------
@@ -27,7 +27,7 @@ def water_filling(gains: np.ndarray, power: float) -> np.ndarray:
     (filled,) = np.nonzero(levels > floors)
     shares = np.zeros(len(gains))
     if not len(filled):
-        # Gains so small that the power is lost in the rounding of the level.
+        # The gains are so small that the power is lost in the rounding of the level.
         shares[np.argmax(gains)] = power
         return shares
     level = levels[filled[-1]]
