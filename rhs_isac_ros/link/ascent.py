@@ -13,25 +13,18 @@ _MIN_GAIN = 1e-9
 
 
 def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Raise the capacity until no step gains; the result is never below the start.
+    """Increase the capacity of a configuration, float64 [N_E], until no step gains.
 
     Each round finds the best digital part and then, with that part fixed, a better configuration.
     The received power is convex in the configuration, so that it lies above its linear model at
     any point. The corner of the box [0, 1]^N_E to which the gradient points therefore receives
     more power, unless the point is that corner. The sum of logarithms usually follows the power,
     but not always, so that the capacities are compared. If the corner does not gain, the round
-    changes the single element that gains most at an end of its range.
+    changes the single element that gains most at an end of its range. The capacity never falls
+    below that of the start.
 
-    Parameters
-    ----------
-    analog
-        Configuration to start from, float64 [N_E], each entry in [0, 1].
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Configuration, float64 [N_E], each entry in [0, 1], and the best digital part for it,
-        complex128 [N_SB, K] [sqrt(W)].
+    Returns a configuration, float64 [N_E], each entry in [0, 1], and the best digital part for
+    it, complex128 [N_SB, K] [sqrt(W)].
     """
     point = _Point.at(link, analog)
     for _ in range(_MAX_ROUNDS):
@@ -50,10 +43,6 @@ class _Point:
 
     Attributes
     ----------
-    analog
-        The configuration, float64 [N_E].
-    digital
-        The digital part, complex128 [N_SB, K] [sqrt(W)].
     weights
         Digital part and on-board propagation over noise, complex128 [N_SB, N_E].
     los_weights

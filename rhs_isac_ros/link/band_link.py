@@ -29,10 +29,8 @@ class BandLink:
         V_i, which is real, float64 [N_E, N_E].
     modes
         The strongest modes of V_i, float64 [N_E, r]: G with G G^T close to V_i.
-    noise_w
-        Noise power of a sub-band [W].
-    power_w
-        Power of the digital weights over all sub-bands [W].
+    noise_w, power_w
+        Noise power of a sub-band, and power of the digital part over all sub-bands [W].
     """
 
     onboard: np.ndarray
@@ -57,20 +55,10 @@ class BandLink:
                    scenario.max_power_w)
 
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
-        """Return the digital part of the highest capacity for a configuration.
+        """Return the best digital part for a configuration, complex128 [N_SB, K] [sqrt(W)].
 
         It follows the principal directions of the K x K channels, with the power divided by
-        water-filling.
-
-        Parameters
-        ----------
-        analog
-            Configuration, float64 [N_E].
-
-        Returns
-        -------
-        numpy.ndarray
-            Complex128 [N_SB, K] [sqrt(W)].
+        water-filling. The configuration is float64 [N_E].
         """
         gains, directions = np.linalg.eigh(self._channels(analog))
         power = water_filling(gains[:, -1] / self.noise_w, self.power_w)
@@ -79,10 +67,7 @@ class BandLink:
         return digital
 
     def best_rate(self, analog: np.ndarray) -> float:
-        """Return the capacity of a configuration, float64 [N_E], with the best digital part.
-
-        The capacity is in nats per symbol, summed over the sub-bands.
-        """
+        """Return the capacity with the best digital part [nat/symbol], summed over sub-bands."""
         gains = np.linalg.eigvalsh(self._channels(analog))[:, -1] / self.noise_w
         return float(np.log1p(gains * water_filling(gains, self.power_w)).sum())
 

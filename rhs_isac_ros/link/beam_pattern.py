@@ -19,10 +19,8 @@ class BeamPattern:
         Unit vectors from the surface's centre, float64 [n_el, n_az, 3]; elevation grows along
         the first axis, azimuth along the second, both from -90 to 90 degrees.
     relative
-        Line-of-sight power relative to the strongest of the directions, float64 [n_el, n_az];
-        zeros if the beam is off.
-    distance_m
-        The distance [m].
+        Line-of-sight power relative to that of the peak, the strongest direction, float64
+        [n_el, n_az]; zeros if the beam is off.
     """
 
     directions: np.ndarray
@@ -30,45 +28,28 @@ class BeamPattern:
     distance_m: float
 
     def azimuth_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern at the elevation of the strongest direction.
-
-        Returns
-        -------
-        tuple of numpy.ndarray
-            Azimuths, float64 [n_az] [rad], and `relative` there, float64 [n_az].
-        """
+        """Cut the pattern at the elevation of the peak: azimuths [rad] and power, both [n_az]."""
         row, _ = self.peak
         x, y, _ = self.directions[len(self.directions) // 2].T
         return np.arctan2(y, x), self.relative[row]
 
     def elevation_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern at the azimuth of the strongest direction.
-
-        Returns
-        -------
-        tuple of numpy.ndarray
-            Elevations, float64 [n_el] [rad], and `relative` there, float64 [n_el].
-        """
+        """Cut the pattern at the azimuth of the peak: elevations [rad] and power, both [n_el]."""
         _, column = self.peak
         return np.arcsin(self.directions[:, column, 2]), self.relative[:, column]
 
     @property
     def peak(self) -> tuple[int, int]:
-        """Row and column of the strongest direction."""
+        """Row and column of the strongest direction in `relative`."""
         row, column = np.unravel_index(np.argmax(self.relative), self.relative.shape)
         return int(row), int(column)
 
 
 def beam_pattern(
         scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
-    """Compute the pattern of a beam with the near-field model at a distance.
+    """Compute the pattern of a beam at a distance from the surface's centre, in the near field.
 
-    Parameters
-    ----------
-    distance_m
-        Distance from the surface's centre [m], above 0.
-    step_deg
-        Largest step between neighbouring azimuths, and elevations [deg], above 0.
+    Neighbouring azimuths, and elevations, are at most `step_deg` apart.
 
     Raises
     ------

@@ -38,17 +38,9 @@ class Beam:
 
 
 def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
-    """Implements Eq. (10). Capacity of a beam for a user at each of several positions.
+    """Implements Eq. (10). Capacity R_i of a beam at `positions`, float64 [N, 3] [m].
 
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m].
-
-    Returns
-    -------
-    numpy.ndarray
-        R_i, float64 [N] [bit/s].
+    The result is float64 [N] [bit/s].
 
     Raises
     ------
@@ -66,19 +58,9 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
 
 def expected_capacity(
         scenario: Scenario, beam: Beam, mean: np.ndarray, covariance: np.ndarray) -> float:
-    """Average Eq. (10) over a Gaussian posterior of the user's position.
+    """Average Eq. (10) [bit/s] over a Gaussian posterior of the user's position.
 
-    Parameters
-    ----------
-    mean
-        Mean of the position, float64 [3] [m].
-    covariance
-        Covariance of the position, float64 [3, 3] [m^2].
-
-    Returns
-    -------
-    float
-        The expected capacity [bit/s].
+    The posterior has a mean, float64 [3] [m], and a covariance, float64 [3, 3] [m^2].
 
     Raises
     ------
@@ -91,22 +73,9 @@ def expected_capacity(
 
 
 def direct_power_w(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
-    """Compute the line-of-sight term of Eq. (10): the power received at each of several positions.
+    """Compute the power of the line-of-sight term of Eq. (10) at positions, float64 [N, 3] [m].
 
-    Parameters
-    ----------
-    positions
-        Float64 [N, 3] [m].
-
-    Returns
-    -------
-    numpy.ndarray
-        Sum over the sub-bands, float64 [N] [W].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
+    The result is the sum over the sub-bands, float64 [N] [W]. Errors are those of `capacity`.
     """
     power: np.ndarray = _direct_power_w(
         scenario, beam.band, _radiation(scenario, beam), positions).sum(axis=1)
@@ -122,17 +91,15 @@ def posterior_points(
     the covariance, exact for polynomials up to the fifth degree in each axis. All weights are
     positive, so that an average of capacities lies between the smallest and the largest of them.
     An axis without variance has one node. Nodes closer to the surface than both the region of
-    interest and the mean are moved out to the closer of the two: the user is in front of the
-    surface, and the tail of a Gaussian behind it or among the elements would contribute
-    capacities that cannot occur.
+    interest and the mean are moved out to the closer of the two, because the tail of a Gaussian
+    behind the surface or among its elements would contribute capacities that cannot occur.
 
     Parameters
     ----------
     mean
-        Mean of the position, float64 [3] [m].
+        Float64 [3] [m].
     covariance
-        Covariance of the position, float64 [3, 3] [m^2]. Only its symmetric part is used, and
-        negative variances count as 0.
+        Float64 [3, 3] [m^2]. Only its symmetric part is used; negative variances count as 0.
 
     Returns
     -------

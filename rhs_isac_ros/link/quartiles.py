@@ -8,12 +8,7 @@ class RunningQuartiles:
 
     The window bounds memory and time, and lets the quartiles follow a changing network.
 
-    Parameters
-    ----------
-    n_values
-        Values in a row.
-    window
-        Number of rows to keep; older rows are discarded.
+    A row has `n_values` values; rows older than the last `window` are discarded.
 
     Raises
     ------

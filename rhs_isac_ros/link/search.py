@@ -26,11 +26,8 @@ def candidate_configurations(link: BandLink, max_count: int) -> np.ndarray:
     all directions, the search improves waves and configuration in turn: the best pair for a
     configuration belongs to the largest singular value of B diag(c) G.
 
-    Returns
-    -------
-    numpy.ndarray
-        Up to `max_count` different configurations, float64 [n, N_E], each entry 0 or 1, in
-        descending order of the capacity over the sub-bands and modes that are searched.
+    Returns up to `max_count` different configurations, float64 [n, N_E], each entry 0 or 1, in
+    descending order of the capacity over the sub-bands and modes that are searched.
     """
     paths = _paths(link)
     n_subbands, n_feeds, n_waves, n_elements = paths.shape

@@ -20,13 +20,7 @@ _N_ASCENTS = 4
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Choice:
-    """A beam steered to the mean of a position, with its expected capacity.
-
-    Attributes
-    ----------
-    expected_bps
-        Capacity of the beam, averaged over the posterior of the position [bit/s].
-    """
+    """A beam, and its capacity averaged over the posterior of the position [bit/s]."""
 
     beam: Beam
     expected_bps: float
@@ -34,15 +28,7 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Capacities at a true position.
-
-    Attributes
-    ----------
-    actual_bps
-        Capacity of the beam in use [bit/s].
-    perfect_bps
-        Capacity of the beam chosen with the true position [bit/s].
-    """
+    """Capacities of the beam in use and of the beam chosen with the true position [bit/s]."""
 
     actual_bps: float
     perfect_bps: float
@@ -59,23 +45,12 @@ class Outcome:
 
 
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
-    """Find a beam that maximises Eq. (10) for a user at a position.
+    """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
 
     A search from many starts proposes configurations. The best few of these and of the matched
     filters are then improved together with the digital part, so that the beam is never worse
-    than the matched filter. The same position always gives the same beam.
-
-    Parameters
-    ----------
-    position
-        Position of the user, float64 [3] [m].
-    band
-        Index of the band, from 0.
-
-    Returns
-    -------
-    Beam
-        The beam, with the power P_max over all sub-bands.
+    than the matched filter. It has the power P_max over all sub-bands. The same position always
+    gives the same beam. Bands are counted from 0.
 
     Raises
     ------
@@ -98,21 +73,17 @@ def choose_beam(
     """Steer each band to the mean of a position and choose the highest expected capacity.
 
     The capacity at the mean alone would mislead: a band with a stronger but narrower beam may
-    lose more to the positioning error than it gains without one.
+    lose more to the positioning error than it gains without one. Of equal bands, the first is
+    chosen.
 
     Parameters
     ----------
     mean
-        Mean of the position, float64 [3] [m].
+        Float64 [3] [m].
     covariance
-        Covariance of the position, float64 [3, 3] [m^2]; None if the position is known exactly.
+        Float64 [3, 3] [m^2]; None if the position is known exactly.
     bands
-        Indices of the bands to choose from, from 0; None for all.
-
-    Returns
-    -------
-    Choice
-        The beam of the highest expected capacity; the first one of equals.
+        Bands to choose from, counted from 0; None for all.
 
     Raises
     ------
@@ -130,17 +101,11 @@ def choose_beam(
 def outcome(
         scenario: Scenario, beam: Beam, position: np.ndarray,
         bands: Sequence[int] | None = None) -> Outcome:
-    """Compare a beam with the one chosen with the true position.
+    """Compare a beam with the one chosen with the true position, float64 [3] [m].
 
-    The search for a beam ends slightly below the maximum. The loss with an accurate estimate may
-    therefore be negative, by a few hundredths of a per cent at most.
-
-    Parameters
-    ----------
-    position
-        True position of the user, float64 [3] [m].
-    bands
-        Indices of the bands that the beam was chosen from, from 0; None for all.
+    Both are chosen from `bands`, as in `choose_beam`. The search for a beam ends slightly below
+    the maximum, so that the loss with an accurate estimate may be negative, by a few hundredths
+    of a per cent at most.
 
     Raises
     ------

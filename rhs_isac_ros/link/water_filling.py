@@ -4,20 +4,10 @@ import numpy as np
 
 
 def water_filling(gains: np.ndarray, power: float) -> np.ndarray:
-    """Divide power among channels so that the sum of log(1 + gain * share) is highest.
+    """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
 
-    Parameters
-    ----------
-    gains
-        Gain over noise of each channel, float64 [N] [1/W]. If none is positive, all channels get
-        the same share.
-    power
-        Power to divide [W].
-
-    Returns
-    -------
-    numpy.ndarray
-        Shares, float64 [N] [W], none negative, with the sum `power`.
+    The gains are over noise, float64 [N] [1/W]. The shares, float64 [N] [W], are not negative and
+    have the sum `power`. If no gain is positive, all shares are equal.
     """
     useful = gains > 0
     if not useful.any():
