@@ -7,7 +7,6 @@ class RunningQuartiles:
     """Quartiles of the newest rows of values, exact over a bounded window.
 
     The window bounds memory and time, and lets the quartiles follow a changing network.
-
     A row has `n_values` values; rows older than the last `window` are discarded.
 
     Raises

@@ -13,7 +13,7 @@ from rhs_isac_ros.link.search import candidate_configurations
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface import matched_configuration
 
-# Candidates of the search to compare over all sub-bands and modes, and starts of an ascent.
+# Number of candidates to compare over all sub-bands and modes, and of ascents.
 _N_CANDIDATES = 8
 _N_ASCENTS = 4
 
@@ -47,9 +47,9 @@ class Outcome:
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
     """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
 
-    A search from many starts proposes configurations. The best few of these and of the matched
-    filters are then improved together with the digital part, so that the beam is never worse
-    than the matched filter. It has the power P_max over all sub-bands. The same position always
+    A search from many starts proposes configurations. The best few among these and the matched
+    filter are then improved together with the digital part, so that the beam is never worse than
+    the matched filter. It has the power P_max over all sub-bands. The same position always
     gives the same beam. Bands are counted from 0.
 
     Raises
@@ -103,9 +103,9 @@ def outcome(
         bands: Sequence[int] | None = None) -> Outcome:
     """Compare a beam with the one chosen with the true position, float64 [3] [m].
 
-    Both are chosen from `bands`, as in `choose_beam`. The search for a beam ends slightly below
-    the maximum, so that the loss with an accurate estimate may be negative, by a few hundredths
-    of a per cent at most.
+    The latter is chosen from `bands`, as in `choose_beam`. The search for a beam ends slightly
+    below the maximum, so that the loss with an accurate estimate may be negative, by a few
+    hundredths of a per cent at most.
 
     Raises
     ------

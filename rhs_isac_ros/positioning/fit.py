@@ -1,4 +1,4 @@
-"""Tests whether the model can explain received signals at all.
+"""Tests of whether the model can explain received signals at all.
 
 Whitened signals y at a position with whitened mean t differ from it by unit noise:
 ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per measurement. Signals
@@ -11,7 +11,7 @@ FALSE_ALARM = 1e-9
 
 
 class FitTest:
-    """Tests of whitened signals; each returns a reason, which is empty if the test is passed.
+    """Tests of whitened signals; each returns a reason, which is empty if the signals pass.
 
     An energy is the square norm of a whitened signal, and `n_measurements` is the number of
     complex measurements of a positioning phase, N_B N_SB F.
@@ -37,7 +37,7 @@ class FitTest:
                 f'{self.min_energy:.3g}, the energy of noise')
 
     def max_energy_test(self, energy: float, max_mean_energy: float) -> str:
-        """Reject signals that exceed the largest energy of a whitened mean in the region."""
+        """Reject signals stronger than noise plus the strongest whitened mean in the region."""
         # The norm of a sum is at most the sum of the norms.
         max_energy = (max_mean_energy**0.5 + self.max_residual**0.5)**2
         if energy <= max_energy:

@@ -31,7 +31,7 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray)
         offset: np.ndarray = nearest - points
         nearest[:, 0] = points[:, 0]
         positions = to_positions(nearest)
-    # A small remainder is left by the projections; a larger one means that the sphere does not
+    # The projections leave a small remainder; a larger one means that the sphere does not
     # intersect the region.
     excess = np.sign(offset[:, 0]) * np.maximum(np.abs(offset[:, 0]) - _RANGE_TOLERANCE_M, 0.0)
     coupling = np.einsum('mq,mq->m', curvature[:, 0, 1:], offset[:, 1:]) / curvature[:, 0, 0]

@@ -25,7 +25,7 @@ _MIN_SEPARATION = (0.3, 0.05, 0.05)
 # Error of a mode's log-likelihood due to the grid, as a share of the template's energy.
 _GRID_ERROR = 0.05
 # Curvature of the log-likelihood in (r, u, v) [1/m^2, 1, 1] to add everywhere. It keeps matrices
-# regular where the signals carry no information; a region of interest of any size has more.
+# regular where the signals carry no information; any region of interest is more precise.
 MIN_CURVATURE = (1e-3, 1e-1, 1e-1)
 # The linear model does not hold for longer steps.
 _STEP_LIMITS = np.array([0.02, 0.03, 0.03])
@@ -103,7 +103,7 @@ class TemplateTable:
 
     def _loss_outside(self, points: np.ndarray, cell: np.ndarray, value: np.ndarray,
                       margin: float) -> np.ndarray:
-        """Log-likelihood that points outside the region lose up to its border, [C].
+        """Loss of log-likelihood from points to the region, [C]: 0 inside.
 
         The loss is infinite for points that are too unlikely even without it.
         """
