@@ -1,4 +1,4 @@
-"""The link of one band to one position: what steering needs of it, as arrays."""
+"""The link between the surface and one position in one band, as arrays for steering."""
 
 import dataclasses
 import functools
@@ -11,23 +11,26 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
 
+# Largest share of the multipath power that the modes may omit.
+_MAX_OMITTED = 0.02
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BandLink:
-    """One band between the surface and a user.
+    """The link between the surface and a user in one band.
 
     Attributes
     ----------
     onboard
         B_j, complex128 [N_SB, K, N_E].
     los
-        Gains of the line of sight, complex128 [N_SB, N_E].
+        Line-of-sight gains, complex128 [N_SB, N_E].
     spatial
         V_i, which is real, float64 [N_E, N_E].
     modes
-        The strongest modes of V_i, float64 [N_E, r]: G with G G^T nearly V_i.
+        The strongest modes of V_i, float64 [N_E, r]: G with G G^T close to V_i.
     noise_w, power_w
-        Powers of the noise of a sub-band and of the digital weights [W].
+        Noise power of a sub-band, and power of the digital part over all sub-bands [W].
     """
 
     onboard: np.ndarray
@@ -39,21 +42,7 @@ class BandLink:
 
     @classmethod
     def to(cls, scenario: Scenario, position: np.ndarray, band: int) -> 'BandLink':
-        """Return the link to a position.
-
-        Parameters
-        ----------
-        scenario
-            The scenario.
-        position
-            Position of the user, float64 [3] [m].
-        band
-            Index of the band, from 0.
-
-        Returns
-        -------
-        BandLink
-            The link.
+        """Return the link to a position, float64 [3] [m], in a band, counted from 0.
 
         Raises
         ------
@@ -66,68 +55,36 @@ class BandLink:
                    scenario.max_power_w)
 
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
-        """Principal directions of the K x K channels, the power shared out by water-filling.
+        """Return the best digital part for a configuration, complex128 [N_SB, K] [sqrt(W)].
 
-        Parameters
-        ----------
-        analog
-            Configuration, float64 [N_E].
-
-        Returns
-        -------
-        numpy.ndarray
-            The digital part of the highest capacity, complex128 [N_SB, K] [sqrt(W)].
+        It follows the principal directions of the K x K channels, with the power divided by
+        water-filling. The configuration is float64 [N_E].
         """
         gains, directions = np.linalg.eigh(self._channels(analog))
         power = water_filling(gains[:, -1] / self.noise_w, self.power_w)
         # s is a row: s M s^H is largest along the conjugate of the eigenvector.
-        return np.conj(directions[:, :, -1]) * np.sqrt(power)[:, None]
+        digital: np.ndarray = np.conj(directions[:, :, -1]) * np.sqrt(power)[:, None]
+        return digital
 
     def best_rate(self, analog: np.ndarray) -> float:
-        """Capacity with the best digital part.
-
-        Parameters
-        ----------
-        analog
-            Configuration, float64 [N_E].
-
-        Returns
-        -------
-        float
-            The capacity in nats for each symbol, summed over the sub-bands.
-        """
+        """Return the capacity with the best digital part [nat/symbol], summed over sub-bands."""
         gains = np.linalg.eigvalsh(self._channels(analog))[:, -1] / self.noise_w
         return float(np.log1p(gains * water_filling(gains, self.power_w)).sum())
 
-    def scatter(self, patterns: np.ndarray) -> np.ndarray:
-        """Multiply patterns with V_i.
-
-        Parameters
-        ----------
-        patterns
-            Weights of the elements, complex128 [..., N_E].
-
-        Returns
-        -------
-        numpy.ndarray
-            Complex128 [..., N_E].
-        """
+    def scatter(self, weights: np.ndarray) -> np.ndarray:
+        """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
         # Two real products take half the time of one complex product.
-        result = np.empty(patterns.shape, complex)
-        result.real, result.imag = patterns.real @ self.spatial, patterns.imag @ self.spatial
+        result = np.empty(weights.shape, complex)
+        result.real, result.imag = weights.real @ self.spatial, weights.imag @ self.spatial
         return result
 
     def _channels(self, analog: np.ndarray) -> np.ndarray:
         """K x K channels between feeds and user, complex128 [N_SB, K, K]."""
         configured = self.onboard * analog
-        toward = np.matmul(configured, self.los[:, :, None])
-        channels = toward * np.conj(np.swapaxes(toward, 1, 2))
+        direct = np.matmul(configured, self.los[:, :, None])
+        channels: np.ndarray = direct * np.conj(np.swapaxes(direct, 1, 2))
         channels += np.matmul(self.scatter(configured), np.conj(np.swapaxes(configured, 1, 2)))
         return channels
-
-
-# What the modes leave out of the multipath's power.
-_LEFT_OUT = 0.02
 
 
 @functools.lru_cache(maxsize=16)
@@ -138,7 +95,7 @@ def _multipath(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         spatial = np.ascontiguousarray(covariance.real)
         powers, directions = np.linalg.eigh(spatial)
         powers, directions = np.maximum(powers[::-1], 0), directions[:, ::-1]
-        rank = 1 + int(np.searchsorted(np.cumsum(powers), (1 - _LEFT_OUT) * powers.sum()))
+        rank = 1 + int(np.searchsorted(np.cumsum(powers), (1 - _MAX_OMITTED) * powers.sum()))
         modes = directions[:, :rank] * np.sqrt(powers[:rank])
         for array in (spatial, modes):
             array.flags.writeable = False

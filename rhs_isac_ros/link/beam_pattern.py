@@ -1,4 +1,4 @@
-"""The pattern of a beam: how strong it is in the directions in front of the surface."""
+"""Beam patterns: the power of a beam over the directions in front of the surface."""
 
 import dataclasses
 import functools
@@ -19,10 +19,8 @@ class BeamPattern:
         Unit vectors from the surface's centre, float64 [n_el, n_az, 3]; elevation grows along
         the first axis, azimuth along the second, both from -90 to 90 degrees.
     relative
-        Power over the line of sight, of that in the strongest of the directions, float64
+        Line-of-sight power relative to that of the peak, the strongest direction, float64
         [n_el, n_az]; zeros if the beam is off.
-    distance_m
-        The distance [m].
     """
 
     directions: np.ndarray
@@ -30,54 +28,28 @@ class BeamPattern:
     distance_m: float
 
     def azimuth_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern at the elevation of the strongest direction.
-
-        Returns
-        -------
-        tuple of numpy.ndarray
-            Azimuths, float64 [n_az] [rad], and `relative` there, float64 [n_az].
-        """
+        """Cut the pattern at the elevation of the peak: azimuths [rad] and power, both [n_az]."""
         row, _ = self.peak
         x, y, _ = self.directions[len(self.directions) // 2].T
         return np.arctan2(y, x), self.relative[row]
 
     def elevation_cut(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the pattern at the azimuth of the strongest direction.
-
-        Returns
-        -------
-        tuple of numpy.ndarray
-            Elevations, float64 [n_el] [rad], and `relative` there, float64 [n_el].
-        """
+        """Cut the pattern at the azimuth of the peak: elevations [rad] and power, both [n_el]."""
         _, column = self.peak
         return np.arcsin(self.directions[:, column, 2]), self.relative[:, column]
 
     @property
     def peak(self) -> tuple[int, int]:
-        """Row and column of the strongest direction."""
+        """Row and column of the strongest direction in `relative`."""
         row, column = np.unravel_index(np.argmax(self.relative), self.relative.shape)
         return int(row), int(column)
 
 
 def beam_pattern(
         scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
-    """Compute the pattern of a beam, with the near field that the model has at a distance.
+    """Compute the pattern of a beam at a distance from the surface's centre, in the near field.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    beam
-        The beam.
-    distance_m
-        Distance from the surface's centre [m], above 0.
-    step_deg
-        At most this lies between neighbouring azimuths, and elevations [deg], above 0.
-
-    Returns
-    -------
-    BeamPattern
-        The pattern.
+    Neighbouring azimuths, and elevations, are at most `step_deg` apart.
 
     Raises
     ------
@@ -90,16 +62,16 @@ def beam_pattern(
     directions = _directions(step_deg)
     power_w = direct_power_w(scenario, beam, distance_m * directions.reshape(-1, 3))
     power_w = power_w.reshape(directions.shape[:2])
-    strongest_w = power_w.max()
-    return BeamPattern(directions, power_w / strongest_w if strongest_w else power_w, distance_m)
+    max_power_w = power_w.max()
+    return BeamPattern(directions, power_w / max_power_w if max_power_w else power_w, distance_m)
 
 
 @functools.lru_cache(maxsize=4)
 def _directions(step_deg: float) -> np.ndarray:
     """Unit vectors over the half space x > 0, float64 [n_el, n_az, 3], read-only."""
-    half = max(1, int(np.ceil(90 / step_deg)))
-    # An odd number: the middle ones point straight ahead.
-    angles = np.linspace(-np.pi / 2, np.pi / 2, 2 * half + 1)
+    n_half = max(1, int(np.ceil(90 / step_deg)))
+    # An odd number of angles, so that the middle ones are on boresight.
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 2 * n_half + 1)
     elevation, azimuth = np.meshgrid(angles, angles, indexing='ij')
     directions = np.stack([np.cos(elevation) * np.cos(azimuth),
                            np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)

@@ -1,6 +1,8 @@
-"""Capacity of the transmission phase."""
+"""Capacity of the transmission phase at known positions and over a posterior."""
 
 import dataclasses
+import functools
+import itertools
 
 import numpy as np
 
@@ -9,6 +11,11 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.shapes import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
+
+# Quadrature nodes along each principal axis of the covariance.
+_N_NODES = 3
+# Upper limit of a standard deviation [m]: it keeps squared distances finite.
+_MAX_SPREAD_M = 1e6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,71 +38,118 @@ class Beam:
 
 
 def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
-    """Implements Eq. (10). Capacity of a beam for users at some positions.
+    """Implements Eq. (10). Capacity R_i of a beam at `positions`, float64 [N, 3] [m].
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    beam
-        The beam; its band is the one that counts.
-    positions
-        Positions of the user, float64 [N, 3] [m].
-
-    Returns
-    -------
-    numpy.ndarray
-        R_i, float64 [N] [bit/s].
+    The result is float64 [N] [bit/s].
 
     Raises
     ------
     ValueError
         If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
     """
-    patterns = _patterns(scenario, beam)
-    direct = _direct(scenario, beam.band, patterns, positions)
+    radiation = _radiation(scenario, beam)
+    direct = _direct_power_w(scenario, beam.band, radiation, positions)
     spatial = multipath_covariance(scenario)[beam.band]
-    scattered = np.sum((patterns @ spatial) * np.conj(patterns), axis=1).real
-    ratio = (direct + scattered) / scenario.noise_power_w
-    return scenario.subband_width_hz * np.log2(1 + ratio).sum(axis=1)
+    scattered = np.sum((radiation @ spatial) * np.conj(radiation), axis=1).real
+    snr = (direct + scattered) / scenario.noise_power_w
+    rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=1)
+    return rates
+
+
+def expected_capacity(
+        scenario: Scenario, beam: Beam, mean: np.ndarray, covariance: np.ndarray) -> float:
+    """Average Eq. (10) [bit/s] over a Gaussian posterior of the user's position.
+
+    The posterior has a mean, float64 [3] [m], and a covariance, float64 [3, 3] [m^2].
+
+    Raises
+    ------
+    ValueError
+        If mean or covariance have another shape or are not finite, or the beam does not fit the
+        scenario.
+    """
+    points, weights = posterior_points(scenario, mean, covariance)
+    return float(weights @ capacity(scenario, beam, points))
 
 
 def direct_power_w(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
-    """Power that a beam brings to some positions over the line of sight, as Eq. (10) counts it.
+    """Compute the power of the line-of-sight term of Eq. (10) at positions, float64 [N, 3] [m].
+
+    The result is the sum over the sub-bands, float64 [N] [W]. Errors are those of `capacity`.
+    """
+    power: np.ndarray = _direct_power_w(
+        scenario, beam.band, _radiation(scenario, beam), positions).sum(axis=1)
+    return power
+
+
+def posterior_points(
+        scenario: Scenario, mean: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the nodes and weights of a quadrature over a Gaussian posterior.
+
+    The quadrature is deterministic: a product of Gauss-Hermite rules along the principal axes of
+    the covariance, exact for polynomials up to the fifth degree in each axis. All weights are
+    positive, so that an average of capacities lies between the smallest and the largest of them.
+    An axis without variance has one node. Nodes closer to the surface than both the region of
+    interest and the mean are moved out to the closer of the two, because the tail of a Gaussian
+    behind the surface or among its elements would contribute capacities that cannot occur.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    beam
-        The beam.
-    positions
-        Positions, float64 [N, 3] [m].
+    mean
+        Float64 [3] [m].
+    covariance
+        Float64 [3, 3] [m^2]. Only its symmetric part is used; negative variances count as 0.
 
     Returns
     -------
-    numpy.ndarray
-        Sum over the sub-bands, float64 [N] [W].
+    tuple of numpy.ndarray
+        Positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n].
 
     Raises
     ------
     ValueError
-        If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
+        If mean or covariance have another shape or are not finite.
     """
-    return _direct(scenario, beam.band, _patterns(scenario, beam), positions).sum(axis=1)
+    for name, value, shape in (('mean', mean, (3,)), ('covariance', covariance, (3, 3))):
+        if np.shape(value) != shape or not np.isfinite(value).all():
+            raise ValueError(f'{name}: {value}, expected {list(shape)} finite numbers')
+    # Halve before adding: the sum of two numbers near the largest float is infinite.
+    variances, axes = np.linalg.eigh(np.divide(covariance, 2) + np.divide(covariance, 2).T)
+    spreads = np.minimum(np.sqrt(np.maximum(variances, 0)), _MAX_SPREAD_M)
+    nodes, weights = _standard_rule(tuple(bool(spread > 0) for spread in spreads))
+    points = mean + nodes * spreads @ axes.T
+    points[:, 0] = np.maximum(points[:, 0], min(mean[0], scenario.roi_bounds_m[0][0]))
+    return points, weights
 
 
-def _patterns(scenario: Scenario, beam: Beam) -> np.ndarray:
-    """Weights of the elements, t_j = c . (s_j B_j), complex128 [N_SB, N_E]."""
+@functools.lru_cache(maxsize=8)
+def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes [n, 3] and weights [n] for a Gaussian with unit variance in the axes that vary."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(_N_NODES)
+    weights = weights / weights.sum()
+    rule = list(zip(nodes, weights, strict=True))
+    axes = [rule if axis_varies else [(0.0, 1.0)] for axis_varies in varies]
+    product = np.array(list(itertools.product(*axes)))
+    return product[..., 0], product[..., 1].prod(axis=1)
+
+
+def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
+    """Radiation t_j = c . (s_j B_j) of the elements, complex128 [N_SB, N_E]."""
     check_shape('analog', beam.analog, 'N_E', scenario)
     check_shape('digital', beam.digital, 'N_SB K', scenario)
     if not 0 <= beam.band < scenario.n_bands:
         raise ValueError(f'band: {beam.band}, expected 0 to {scenario.n_bands - 1}')
-    patterns = np.einsum('jk,jkm->jm', beam.digital, onboard_matrix(scenario)[beam.band])
-    return patterns * beam.analog
+    feeds: np.ndarray = np.einsum('jk,jkm->jm', beam.digital, onboard_matrix(scenario)[beam.band])
+    radiation: np.ndarray = feeds * beam.analog
+    return radiation
 
 
-def _direct(
-        scenario: Scenario, band: int, patterns: np.ndarray, positions: np.ndarray) -> np.ndarray:
+def _direct_power_w(
+        scenario: Scenario, band: int, radiation: np.ndarray, positions: np.ndarray
+) -> np.ndarray:
     """Power over the line of sight, float64 [N, N_SB] [W]."""
-    return np.abs(np.einsum('jm,njm->nj', patterns, los_gain(scenario, positions, band)))**2
+    amplitudes: np.ndarray = np.einsum(
+        'jm,njm->nj', radiation, los_gain(scenario, positions, band))
+    power: np.ndarray = np.abs(amplitudes)**2
+    return power

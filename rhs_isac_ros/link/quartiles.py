@@ -1,20 +1,13 @@
-"""Running quartiles of several figures."""
+"""Running quartiles of several values."""
 
 import numpy as np
 
 
 class RunningQuartiles:
-    """Quartiles of the newest rows of figures, exact over a bounded window.
+    """Quartiles of the newest rows of values, exact over a bounded window.
 
-    The window bounds memory and time and lets the quartiles follow a network that changes; up to
-    its length they are those of all rows.
-
-    Parameters
-    ----------
-    n_figures
-        Figures of a row.
-    window
-        Rows that count; older ones are forgotten.
+    The window bounds memory and time, and lets the quartiles follow a changing network.
+    A row has `n_values` values; rows older than the last `window` are discarded.
 
     Raises
     ------
@@ -22,23 +15,18 @@ class RunningQuartiles:
         If a size is not positive.
     """
 
-    def __init__(self, n_figures: int, window: int = 1000) -> None:
-        if n_figures < 1 or window < 1:
-            raise ValueError(f'n_figures, window: {n_figures}, {window}, expected at least 1 each')
-        self._rows = np.empty((window, n_figures))
-        self._added = 0
+    def __init__(self, n_values: int, window: int = 1000) -> None:
+        if n_values < 1 or window < 1:
+            raise ValueError(f'n_values, window: {n_values}, {window}, expected at least 1 each')
+        self._rows = np.empty((window, n_values))
+        self._n_added = 0
 
     def __len__(self) -> int:
-        """Return how many rows count."""
-        return min(self._added, len(self._rows))
+        """Return the number of rows in the window."""
+        return min(self._n_added, len(self._rows))
 
     def add(self, row: np.ndarray) -> None:
-        """Take a row, in place of the oldest where the window is full.
-
-        Parameters
-        ----------
-        row
-            Figures, float64 [n_figures].
+        """Add a row, float64 [n_values]; it replaces the oldest one if the window is full.
 
         Raises
         ------
@@ -47,25 +35,21 @@ class RunningQuartiles:
         """
         row = np.asarray(row, dtype=float)
         if row.shape != self._rows.shape[1:] or not np.isfinite(row).all():
-            raise ValueError(f'row: {row}, expected {self._rows.shape[1]} finite figures')
-        self._rows[self._added % len(self._rows)] = row
-        self._added += 1
+            raise ValueError(f'row: {row}, expected {self._rows.shape[1]} finite values')
+        self._rows[self._n_added % len(self._rows)] = row
+        self._n_added += 1
 
     def quartiles(self) -> np.ndarray:
-        """Return lower quartile, median and upper quartile of each figure.
+        """Return lower quartile, median and upper quartile of each value, float64 [n_values, 3].
 
-        Between two rows they are interpolated linearly.
-
-        Returns
-        -------
-        numpy.ndarray
-            Float64 [n_figures, 3].
+        Quartiles between two rows are interpolated linearly.
 
         Raises
         ------
         ValueError
-            If there is no row yet.
+            If no row has been added yet.
         """
         if not len(self):
-            raise ValueError('quartiles: no row, expected at least one')
-        return np.quantile(self._rows[:len(self)], (0.25, 0.5, 0.75), axis=0).T
+            raise ValueError('quartiles: no rows, expected at least one')
+        result: np.ndarray = np.quantile(self._rows[:len(self)], (0.25, 0.5, 0.75), axis=0).T
+        return result

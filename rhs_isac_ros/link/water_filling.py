@@ -1,23 +1,13 @@
-"""Water-filling: how much power each of several parallel channels gets."""
+"""Water-filling: the optimal division of power among parallel channels."""
 
 import numpy as np
 
 
 def water_filling(gains: np.ndarray, power: float) -> np.ndarray:
-    """Share power over parallel channels so that the sum of log(1 + gain * share) is highest.
+    """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
 
-    Parameters
-    ----------
-    gains
-        Gain over noise of each channel, float64 [N] [1/W]. Without a positive one, all get the
-        same.
-    power
-        Power to share [W].
-
-    Returns
-    -------
-    numpy.ndarray
-        Shares, float64 [N] [W], none negative, with the sum `power`.
+    The gains are over noise, float64 [N] [1/W]. The shares, float64 [N] [W], are not negative and
+    have the sum `power`. If no gain is positive, all shares are equal.
     """
     useful = gains > 0
     if not useful.any():
@@ -27,7 +17,7 @@ def water_filling(gains: np.ndarray, power: float) -> np.ndarray:
     (filled,) = np.nonzero(levels > floors)
     shares = np.zeros(len(gains))
     if not len(filled):
-        # Gains so small that the power is lost in the rounding of the level.
+        # The gains are so small that the power is lost in the rounding of the level.
         shares[np.argmax(gains)] = power
         return shares
     level = levels[filled[-1]]

@@ -1,13 +1,24 @@
-"""Estimators of the user's position from the received signals."""
+"""Estimators of the user's position from the received signals.
 
-from collections.abc import Mapping
+An estimator is an object with the interface of `Estimator`: a string ``name``, and a method
+``estimate`` that takes received signals and returns an `Estimate`. It is created by a call with
+scenario and codebook, `make_estimator`. There are two ways to add one:
+
+* In another package, without changes here: name a class, or a function that returns an
+  estimator, in an entry point of the group ``rhs_isac_ros.estimators`` (`plugins.ESTIMATORS`).
+* In this package: add the class to `ESTIMATORS` below.
+
+`estimate_each` checks the shape of the signals and handles one positioning phase as well as many.
+"""
+
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, plugins
 from rhs_isac_ros.positioning.bayes import BayesEstimator
-from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError
+from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError, estimate_each
 from rhs_isac_ros.positioning.exhaustive import exhaustive_posterior
 from rhs_isac_ros.positioning.ml import MlEstimator
 from rhs_isac_ros.positioning.network import ModelError, Network
@@ -15,54 +26,46 @@ from rhs_isac_ros.positioning.neural import NeuralEstimator
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.training import train
 
-ESTIMATORS: Mapping[str, type] = {
+ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
     kind.name: kind for kind in (BayesEstimator, MlEstimator, NeuralEstimator)}
 
 __all__ = [
     'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator', 'ModelError',
-    'Network', 'NeuralEstimator', 'SignalError', 'exhaustive_posterior', 'file_options',
-    'make_estimator', 'simulate_pairs', 'train',
+    'Network', 'NeuralEstimator', 'SignalError', 'estimate_each', 'exhaustive_posterior',
+    'file_options', 'make_estimator', 'simulate_pairs', 'train',
 ]
 
 
 def make_estimator(
         name: str, scenario: Scenario, codebook: Codebook, **options: Any) -> Estimator:
-    """Make an estimator by its name.
+    """Create an estimator by its name.
 
     Parameters
     ----------
     name
-        One of `ESTIMATORS`, or a plug-in: an entry point of the group `plugins.ESTIMATORS`.
-    scenario
-        The scenario.
-    codebook
-        The codebook with which the signals are taken.
+        A key of `ESTIMATORS`, or an entry point of the group `plugins.ESTIMATORS`.
     **options
-        Options of that estimator: ``table_folder`` of `bayes` and `ml`, where tables are kept;
-        ``model_file`` of `neural`, what `train` returns or its file. A plug-in has its own.
-
-    Returns
-    -------
-    Estimator
-        The estimator, with its tables built.
+        ``table_folder``, a folder that keeps tables, for `bayes` and `ml`; ``model_file``, a
+        `Network` or its file, for `neural`. Plug-ins define their own options.
 
     Raises
     ------
     ValueError
         If there is no estimator of that name.
     PluginError
-        If a plug-in cannot be loaded, fails, or makes no estimator.
+        If a plug-in cannot be loaded, fails, or does not return an estimator.
     ModelError
-        If a model cannot be read or is one of another codebook or scenario.
+        If a model cannot be read or was trained for another codebook or scenario.
     CodebookError
         If the codebook does not fit the scenario.
     """
     if name in ESTIMATORS:
         return ESTIMATORS[name](scenario, codebook, **options)
-    there = plugins.names(plugins.ESTIMATORS)
-    if name not in there:
-        raise ValueError(f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *there})}')
-    estimator = plugins.make(plugins.ESTIMATORS, name, scenario, codebook, **options)
+    installed = plugins.names(plugins.ESTIMATORS)
+    if name not in installed:
+        raise ValueError(
+            f'estimator: {name!r}, expected one of {sorted({*ESTIMATORS, *installed})}')
+    estimator: Estimator = plugins.make(plugins.ESTIMATORS, name, scenario, codebook, **options)
     if not (callable(getattr(estimator, 'estimate', None))
             and isinstance(getattr(estimator, 'name', None), str)):
         raise plugins.PluginError(
@@ -72,21 +75,10 @@ def make_estimator(
 
 
 def file_options(name: str, table_folder: Path, model_file: str | Path) -> dict[str, Any]:
-    """Choose the options of an estimator from the files that there are.
+    """Return the options of `make_estimator` that give an estimator its files.
 
-    Parameters
-    ----------
-    name
-        Name of the estimator.
-    table_folder
-        Where tables are kept.
-    model_file
-        Trained model; empty if there is none.
-
-    Returns
-    -------
-    dict
-        Options for `make_estimator`: a plug-in gets the model if there is one, and nothing else.
+    The table folder is for `bayes` and `ml`; the model file is for `neural` and, unless empty,
+    for plug-ins.
     """
     if name == NeuralEstimator.name or (name not in ESTIMATORS and model_file):
         return {'model_file': model_file}

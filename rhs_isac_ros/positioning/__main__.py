@@ -24,12 +24,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments
-        Command line; by default the process's.
+        Command-line arguments; those of the process if None.
 
     Returns
     -------
     int
-        Exit code: 0; 2 if an argument or a file is wrong; 130 after Ctrl-C, with nothing written.
+        Exit code: 0; 2 if an argument or a file is invalid; 130 after Ctrl-C, with no file
+        written.
     """
     parser = argparse.ArgumentParser(
         prog='python -m rhs_isac_ros.positioning', description=__doc__,
@@ -37,20 +38,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add('--codebook', type=Path, required=True, help='codebook file')
     add('--scenario', type=Path,
-        help="YAML file of the scenario; the paper's Table I if none is given")
+        help="YAML file of the scenario; the paper's Table I if omitted")
     add('--pairs', type=int, default=DEFAULT_PAIRS,
         help='simulated pairs for training, validation and test, 7 : 1.5 : 1.5')
     add('--hidden', type=int, default=DEFAULT_HIDDEN, help='units of the hidden layer')
-    add('--epochs', type=int, default=DEFAULT_EPOCHS, help='passes through the pairs at most')
-    add('--seed', type=int, default=0, help='seeds pairs, first weights and order')
+    add('--epochs', type=int, default=DEFAULT_EPOCHS,
+        help='maximum number of passes through the pairs')
+    add('--seed', type=int, default=0,
+        help='seed of the pairs, the initial weights and the order of the pairs')
     add('--output', type=Path, default=Path('model.npz'),
-        help='file to write; it is replaced at the end')
+        help='file to write; an existing file is replaced at the end')
     add('--quiet', action='store_true', help='show no progress')
     try:
         _run(parser.parse_args(arguments))
     except KeyboardInterrupt:
         return 130
-    # Those of scenario and codebook are among them.
+    # Errors of scenario and codebook are ValueErrors.
     except (ValueError, OSError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
@@ -60,10 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> None:
     output = options.output
     if not os.access(output.parent, os.W_OK):
-        raise OSError(f'{output}: expected a file in a directory that can be written')
+        raise OSError(f'{output}: expected a file in a writable directory')
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     codebook = Codebook.load(options.codebook)
-    with _bar(options) as show:
+    with _progress(options) as show:
         network = train(scenario, codebook, options.pairs, options.seed, options.hidden,
                         options.epochs, show)
     network.save(output)
@@ -74,24 +77,24 @@ def _run(options: argparse.Namespace) -> None:
 
 
 @contextlib.contextmanager
-def _bar(options: argparse.Namespace) -> Iterator[Callable[[Epoch], None] | None]:
-    """Function that shows progress: a bar, or lines where its library is missing."""
+def _progress(options: argparse.Namespace) -> Iterator[Callable[[Epoch], None] | None]:
+    """Yield a callable that shows progress: as a bar, or as lines if tqdm is not installed."""
     if options.quiet:
         yield None
         return
     try:
         from tqdm import tqdm
     except ImportError:
-        yield lambda epoch: print(_text(epoch), file=sys.stderr)
+        yield lambda epoch: print(_describe(epoch), file=sys.stderr)
         return
     with tqdm(total=options.epochs, unit='epoch') as bar:
         def show(epoch: Epoch) -> None:
-            bar.set_description(_text(epoch), refresh=False)
+            bar.set_description(_describe(epoch), refresh=False)
             bar.update(epoch.number - bar.n)
         yield show
 
 
-def _text(epoch: Epoch) -> str:
+def _describe(epoch: Epoch) -> str:
     return f'epoch {epoch.number}: {epoch.validation_mse_m2:.3f} m^2'
 
 

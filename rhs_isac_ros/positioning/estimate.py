@@ -1,4 +1,4 @@
-"""What an estimator returns, and what it must offer."""
+"""The interface of estimators: received signals in, positions with their uncertainty out."""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -10,7 +10,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 
 # Far above any received power [sqrt(W)]; its square still fits single precision after whitening.
-_LARGEST = 1e3
+_MAX_MAGNITUDE = 1e3
 
 
 class SignalError(ValueError):
@@ -19,16 +19,16 @@ class SignalError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Estimate:
-    """Position and its uncertainty, or that there is none.
+    """A position and its uncertainty, or the reason why there is none; or N of them.
 
     Attributes
     ----------
     mean
-        Position, float64 [3] or [N, 3] [m]; NaN where the signals tell none.
+        Position, float64 [3] or [N, 3] [m]; NaN if the signals determine none.
     covariance
-        Its covariance, float64 [3, 3] or [N, 3, 3] [m^2]; NaN where there is no position.
+        Covariance of the position, float64 [3, 3] or [N, 3, 3] [m^2]; NaN without a position.
     reason
-        Why there is no position, and empty where there is one: a string, or N of them.
+        Reason why there is no position, empty if there is one; a string, or N of them.
     """
 
     mean: np.ndarray
@@ -38,31 +38,20 @@ class Estimate:
     @property
     def fix(self) -> np.ndarray:
         """Whether there is a position, bool [] or [N]."""
-        return np.isfinite(self.mean).all(axis=-1)
+        finite: np.ndarray = np.isfinite(self.mean).all(axis=-1)
+        return finite
 
 
 class Estimator(Protocol):
-    """An estimator of positions, made for one scenario and codebook."""
+    """An estimator of positions for one scenario and codebook."""
 
     name: str
 
     def estimate(self, received: np.ndarray) -> Estimate:
-        """Estimate positions from received signals.
+        """Estimate positions from received signals; `SignalError` if they cannot be used.
 
-        Parameters
-        ----------
-        received
-            Complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions; sub-band-major.
-
-        Returns
-        -------
-        Estimate
-            With a leading N if the signals have one; without a position where they tell none.
-
-        Raises
-        ------
-        SignalError
-            If the shape is another one or a value is not finite.
+        The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
+        sub-band-major; the estimate has a leading N if they have one.
         """
         ...
 
@@ -70,29 +59,20 @@ class Estimator(Protocol):
 def estimate_each(
         scenario: Scenario, codebook: Codebook, received: np.ndarray,
         locate: Callable[[np.ndarray], Iterable[tuple[np.ndarray, np.ndarray, str]]]) -> Estimate:
-    """Check signals, locate every phase, and give the result the form of the signals.
+    """Check received signals, locate every phase, and match the result to the signals' shape.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    codebook
-        The codebook they were taken with.
     received
-        Complex128 [N_B, N_SB F] or [N, N_B, N_SB F].
+        Complex128 [N_B, N_SB F] or [N, N_B, N_SB F]; the codebook determines the sizes.
     locate
-        Function of checked signals [N, N_B, N_SB F] that yields mean, covariance and reason of
-        each of them; if there is a reason, the others do not count.
-
-    Returns
-    -------
-    Estimate
-        With a leading N if the signals have one.
+        Callable that takes checked signals [N, N_B, N_SB F] and yields mean [3], covariance
+        [3, 3] and reason for each phase. With a reason, mean and covariance are ignored.
 
     Raises
     ------
     SignalError
-        If the shape is another one or a value is not finite.
+        If the shape is another one, or a value is not finite or exceeds 1000.
     """
     batch = checked_received(scenario, codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
@@ -107,27 +87,7 @@ def estimate_each(
 
 
 def checked_received(scenario: Scenario, codebook: Codebook, received: np.ndarray) -> np.ndarray:
-    """Return received signals as [N, N_B, N_SB F] after checking them.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        The codebook they were taken with; fixes the shape.
-    received
-        Complex128 [N_B, N_SB F] or [N, N_B, N_SB F].
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N, N_B, N_SB F].
-
-    Raises
-    ------
-    SignalError
-        If the shape is another one, or a value is not finite or absurdly large.
-    """
+    """Return received signals as complex128 [N, N_B, N_SB F]; arguments as in `estimate_each`."""
     try:
         received = np.asarray(received, dtype=complex)
     except (TypeError, ValueError) as error:
@@ -137,10 +97,19 @@ def checked_received(scenario: Scenario, codebook: Codebook, received: np.ndarra
     if received.ndim not in (2, 3) or received.shape[-2:] != expected:
         raise SignalError(
             f'received: shape {received.shape}, expected [N_B, N_SB F] = {expected}, '
-            'or more of them')
+            'or [N, N_B, N_SB F]')
     if not np.isfinite(received).all():
         raise SignalError('received: not finite, expected finite signals')
-    if received.size and np.abs(received).max() > _LARGEST:
+    if received.size and np.abs(received).max() > _MAX_MAGNITUDE:
         raise SignalError(
-            f'received: {np.abs(received).max():g}, expected magnitudes up to {_LARGEST:g}')
+            f'received: {np.abs(received).max():g}, expected magnitudes up to {_MAX_MAGNITUDE:g}')
     return received.reshape(-1, *expected)
+
+
+def stack_parts(signals: np.ndarray) -> np.ndarray:
+    """Flatten complex signals [N, N_B, N_SB F] to float64 [N, 2 N_B N_SB F].
+
+    All real parts come first, then all imaginary parts.
+    """
+    flat = signals.reshape(len(signals), -1)
+    return np.hstack([flat.real, flat.imag])

@@ -1,4 +1,4 @@
-"""The most likely position."""
+"""The maximum-likelihood position."""
 
 import numpy as np
 
@@ -8,18 +8,18 @@ from rhs_isac_ros.positioning.search import SearchEstimator
 
 
 class MlEstimator(SearchEstimator):
-    """The most likely position of the region of interest, and its covariance as if it were alone.
+    """The most likely position in the region of interest.
 
-    The covariance comes from the curvature of the likelihood there: it knows nothing of other
-    modes. Parameters and errors are those of `SearchEstimator`.
+    The covariance is the inverse curvature of the log-likelihood there and does not account for
+    other modes. Parameters and errors are those of `SearchEstimator`.
     """
 
     name = 'ml'
 
     def _moments(self, modes: Modes) -> tuple[np.ndarray, np.ndarray]:
-        best = np.argmax(modes.height)
-        inside = modes.inside[best]
-        bend = jacobian(inside[None])[0]
-        covariance = bend @ np.linalg.solve(modes.curvature[best], bend.T)
-        position = np.clip(to_positions(inside), *self._bounds)
+        best = np.argmax(modes.roi_log_likelihood)
+        point = modes.roi_points[best]
+        by_point = jacobian(point[None])[0]
+        covariance = by_point @ np.linalg.solve(modes.curvature[best], by_point.T)
+        position = np.clip(to_positions(point), *self._bounds)
         return position, (covariance + covariance.T) / 2

@@ -1,4 +1,4 @@
-"""The paper's network: one hidden layer from received signals to a position, and its file."""
+"""The paper's network, with one hidden layer from received signals to a position, and its file."""
 
 import dataclasses
 import json
@@ -9,26 +9,29 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.positioning.estimate import stack_parts
 
 _FORMAT = 1
+# Keys of the file that differ from the names of the fields.
+_FILE_KEYS = {'max_energy': 'loudest'}
 
 
 class ModelError(ValueError):
-    """A trained model cannot be read, or is one of another codebook or scenario."""
+    """A trained model cannot be read, or belongs to another codebook or scenario."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Network:
-    """A trained network, and what it was trained for.
+    """A trained network, with the purpose and the result of its training.
 
-    Its input x are real and imaginary parts of the received signals, [D] = [2 N_B N_SB F], each
-    brought to zero mean and unit variance; the position is
+    The input x consists of the real and imaginary parts of the received signals, [D] =
+    [2 N_B N_SB F], each scaled to zero mean and unit variance; the position is
     p = center + w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
 
     Attributes
     ----------
     input_mean, input_scale
-        Mean and standard deviation of the parts in training, float64 [D].
+        Mean and standard deviation of the inputs in training, float64 [D].
     w_in, b_in
         Weights of the hidden layer, float64 [D, H] and [H].
     w_out, b_out
@@ -37,8 +40,8 @@ class Network:
         Centre of the region of interest, float64 [3] [m].
     covariance
         Mean product of the residuals of the validation pairs, float64 [3, 3] [m^2].
-    loudest
-        Largest square norm of the whitened mean signal of a training position.
+    max_energy
+        Largest square norm of the whitened mean signal at a training position.
     about
         ``codebook``, its id; ``scenario``, its changes from Table I; ``seed``, ``pairs``,
         ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
@@ -52,15 +55,16 @@ class Network:
     b_out: np.ndarray
     center: np.ndarray
     covariance: np.ndarray
-    loudest: float
+    max_energy: float
     about: dict[str, Any]
 
     def __post_init__(self) -> None:
         """Check that sizes agree and numbers are finite."""
-        n_parts, n_hidden = np.shape(self.w_in) if np.ndim(self.w_in) == 2 else (0, 0)
-        shapes = {'input_mean': (n_parts,), 'input_scale': (n_parts,), 'w_in': (n_parts, n_hidden),
-                  'b_in': (n_hidden,), 'w_out': (n_hidden, 3), 'b_out': (3,), 'center': (3,),
-                  'covariance': (3, 3), 'loudest': ()}
+        n_inputs, n_hidden = np.shape(self.w_in) if np.ndim(self.w_in) == 2 else (0, 0)
+        shapes: dict[str, tuple[int, ...]] = {
+            'input_mean': (n_inputs,), 'input_scale': (n_inputs,), 'w_in': (n_inputs, n_hidden),
+            'b_in': (n_hidden,), 'w_out': (n_hidden, 3), 'b_out': (3,), 'center': (3,),
+            'covariance': (3, 3), 'max_energy': ()}
         for name, shape in shapes.items():
             value = getattr(self, name)
             if np.shape(value) != shape:
@@ -69,91 +73,52 @@ class Network:
                 raise ModelError(f'{name}: not finite, expected finite numbers')
 
     def positions(self, received: np.ndarray) -> np.ndarray:
-        """Map received signals to positions.
-
-        Parameters
-        ----------
-        received
-            Complex128 [N, N_B, N_SB F].
-
-        Returns
-        -------
-        numpy.ndarray
-            Float64 [N, 3] [m].
-        """
-        parts = (real_parts(received) - self.input_mean) / self.input_scale
-        hidden = np.maximum(parts @ self.w_in + self.b_in, 0.0)
-        return hidden @ self.w_out + self.b_out + self.center
+        """Map received signals, complex128 [N, N_B, N_SB F], to positions, float64 [N, 3] [m]."""
+        inputs = (stack_parts(received) - self.input_mean) / self.input_scale
+        hidden = np.maximum(inputs @ self.w_in + self.b_in, 0.0)
+        positions: np.ndarray = hidden @ self.w_out + self.b_out + self.center
+        return positions
 
     def save(self, path: str | Path) -> None:
-        """Write the model; an old file is replaced at the end.
+        """Write the model to a file of NumPy's format ``.npz``, without pickled objects.
 
-        Parameters
-        ----------
-        path
-            The file, of NumPy's format ``.npz`` without pickled objects.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written; the old one is kept.
+        An existing file is replaced at the end, or kept if there is an `OSError`.
         """
-        arrays = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        arrays = {key: getattr(self, name) for key, name in self._names_by_key().items()}
         arrays['about'] = json.dumps({'format': _FORMAT, **self.about})
         write_whole(path, lambda stream: np.savez(stream, **arrays))
 
     @classmethod
     def load(cls, path: str | Path) -> 'Network':
-        """Read a model.
-
-        Parameters
-        ----------
-        path
-            The file.
-
-        Returns
-        -------
-        Network
-            The model of the file.
+        """Read a model from a file.
 
         Raises
         ------
         ModelError
-            If the file cannot be read, is damaged, or holds no model.
+            If the file cannot be read, is damaged, or contains no model.
         """
         try:
             with open(path, 'rb') as stream:
                 file = np.load(stream, allow_pickle=False)
-                arrays = {name: file[name] for name in getattr(file, 'files', ())}
+                arrays = {key: file[key] for key in getattr(file, 'files', ())}
             about = json.loads(str(arrays.pop('about', '{}')))
-        # Reading checks the sums that the format keeps of every array.
+        # Reading verifies the checksum that the format holds for every array.
         except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError,
                 zipfile.BadZipFile) as error:
             reason = ' '.join(str(error).split())
             raise ModelError(f'{path}: cannot be read: {reason}') from error
-        names = {field.name for field in dataclasses.fields(cls)} - {'about'}
+        names = cls._names_by_key()
         if not isinstance(about, dict) or about.pop('format', 0) != _FORMAT or (
-                arrays.keys() != names):
+                arrays.keys() != names.keys()):
             raise ModelError(f'{path}: no model, expected one of format {_FORMAT}')
         try:
-            return cls(**{name: array.astype(float) for name, array in arrays.items()},
+            return cls(**{names[key]: array.astype(float) for key, array in arrays.items()},
                        about=about)
         except ValueError as error:
             raise ModelError(f'{path}: {error}') from None
 
-
-def real_parts(received: np.ndarray) -> np.ndarray:
-    """Real and imaginary parts of received signals.
-
-    Parameters
-    ----------
-    received
-        Complex128 [N, N_B, N_SB F].
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N, D]: all real parts, then all imaginary parts.
-    """
-    flat = received.reshape(len(received), -1)
-    return np.hstack([flat.real, flat.imag])
+    @classmethod
+    def _names_by_key(cls) -> dict[str, str]:
+        """Map the keys of the arrays in a file to the names of their fields."""
+        names = [field.name for field in dataclasses.fields(cls) if field.name != 'about']
+        return {_FILE_KEYS.get(name, name): name for name in names}

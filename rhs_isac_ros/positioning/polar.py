@@ -1,25 +1,17 @@
 """Positions as range and direction cosines, in which the likelihood is nearly Gaussian.
 
 A point q = (r, u, v) is the position r (w, u, v) with w = sqrt(1 - u^2 - v^2), in front of the
-surface. The range is known to a fraction of a wavelength and the direction to a fraction of a
-beam; in Cartesian coordinates the one bends the other.
+surface. The signals determine the range to a fraction of a wavelength, but the direction only to
+a fraction of a beam. In Cartesian coordinates, the modes of the likelihood are therefore curved.
 """
 
 import numpy as np
 
 
 def to_positions(points: np.ndarray) -> np.ndarray:
-    """Positions of polar points.
+    """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
 
-    Parameters
-    ----------
-    points
-        (r [m], u, v), float64 [..., 3]; directions outside the unit circle are drawn onto it.
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [..., 3] [m].
+    Directions outside the unit circle have x = 0.
     """
     distance, u, v = points[..., 0], points[..., 1], points[..., 2]
     positions = np.empty(points.shape)
@@ -30,18 +22,7 @@ def to_positions(points: np.ndarray) -> np.ndarray:
 
 
 def to_polar(positions: np.ndarray) -> np.ndarray:
-    """Polar points of positions.
-
-    Parameters
-    ----------
-    positions
-        Float64 [..., 3] [m], with x > 0.
-
-    Returns
-    -------
-    numpy.ndarray
-        (r [m], u, v), float64 [..., 3].
-    """
+    """Convert positions with x > 0, float64 [..., 3] [m], to (r [m], u, v), float64 [..., 3]."""
     points = np.empty(positions.shape)
     points[..., 0] = np.sqrt(np.sum(positions**2, axis=-1))
     points[..., 1:] = positions[..., 1:] / points[..., :1]
@@ -49,17 +30,9 @@ def to_polar(positions: np.ndarray) -> np.ndarray:
 
 
 def jacobian(points: np.ndarray) -> np.ndarray:
-    """Derivative of the positions by the polar points.
+    """Compute dp/dq at points (r [m], u, v), float64 [N, 3].
 
-    Parameters
-    ----------
-    points
-        (r [m], u, v), float64 [N, 3].
-
-    Returns
-    -------
-    numpy.ndarray
-        dp/dq, float64 [N, 3, 3], row by coordinate of the position.
+    The result is float64 [N, 3, 3], with the coordinates of the position in rows.
     """
     distance, u, v = points.T
     w = np.sqrt(np.maximum(1 - u**2 - v**2, 1e-9))

@@ -1,60 +1,48 @@
-"""How far modes of the likelihood lie outside the region of interest."""
+"""Offsets from modes of the likelihood to the region of interest, and their cost."""
 
 import numpy as np
 
 from rhs_isac_ros.positioning.polar import to_polar, to_positions
 
-# Projections onto region and sphere in turn, and what they may leave of the way to the sphere.
-_PROJECTIONS = 4
-_RANGE_SLACK_M = 0.02
+# Alternating projections onto the region and onto a sphere, and the distance from the sphere that
+# they may leave.
+_N_PROJECTIONS = 4
+_RANGE_TOLERANCE_M = 0.02
 
 
-def gap_to_region(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Return the way from modes to the nearest place of the region of interest.
+def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Compute the offsets from modes to the nearest points of the region of interest.
 
-    The way leads along the sphere of the mode's range, which is known best, while the range
-    follows the direction as the likelihood has it.
+    The offset follows the sphere of the mode's range, the coordinate that the signals determine
+    best. The range then changes with the direction so that the likelihood is highest.
 
     Parameters
     ----------
     points
-        Modes (r [m], u, v), float64 [M, 3].
+        Modes (r [m], u, v), float64 [M, 3]; the offsets, 0 inside, have the same form.
     curvature
-        Curvature of the log-likelihood at each of them, float64 [M, 3, 3].
+        Curvature of the log-likelihood at each mode, float64 [M, 3, 3].
     bounds
         Lower and upper corner of the region, float64 [2, 3] [m].
-
-    Returns
-    -------
-    numpy.ndarray
-        Steps in (r [m], u, v), float64 [M, 3]; 0 inside.
     """
     positions = to_positions(points)
-    for _ in range(_PROJECTIONS):
+    for _ in range(_N_PROJECTIONS):
         nearest = to_polar(np.clip(positions, *bounds))
-        gap = nearest - points
+        offset: np.ndarray = nearest - points
         nearest[:, 0] = points[:, 0]
         positions = to_positions(nearest)
-    # What the projections leave over does not count; more means that the sphere misses the region.
-    off = np.sign(gap[:, 0]) * np.maximum(np.abs(gap[:, 0]) - _RANGE_SLACK_M, 0.0)
-    follow = np.einsum('mq,mq->m', curvature[:, 0, 1:], gap[:, 1:]) / curvature[:, 0, 0]
-    gap[:, 0] = off - follow
-    return gap
+    # The projections leave a small remainder; a larger one means that the sphere does not
+    # intersect the region.
+    excess = np.sign(offset[:, 0]) * np.maximum(np.abs(offset[:, 0]) - _RANGE_TOLERANCE_M, 0.0)
+    coupling = np.einsum('mq,mq->m', curvature[:, 0, 1:], offset[:, 1:]) / curvature[:, 0, 0]
+    offset[:, 0] = excess - coupling
+    return offset
 
 
-def loss(gap: np.ndarray, curvature: np.ndarray) -> np.ndarray:
-    """Return what modes lose of their log-likelihood over such a gap.
+def likelihood_loss(offset: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    """Compute the decrease of the log-likelihood over offsets from modes, float64 [M].
 
-    Parameters
-    ----------
-    gap
-        Steps in (r [m], u, v), float64 [M, 3].
-    curvature
-        Curvature of the log-likelihood, float64 [M, 3, 3].
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [M], not negative.
+    The arguments have the shapes of `offset_to_roi`.
     """
-    return np.einsum('mp,mpq,mq->m', gap, curvature, gap) / 2
+    loss: np.ndarray = np.einsum('mp,mpq,mq->m', offset, curvature, offset) / 2
+    return loss

@@ -1,4 +1,4 @@
-"""What the estimators that search for modes have in common."""
+"""The common part of the estimators that search for modes."""
 
 import abc
 from collections.abc import Iterator
@@ -10,8 +10,8 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.fit import FitTest
-from rhs_isac_ros.positioning.modes import LONG_SEARCH, Modes, find_modes
-from rhs_isac_ros.positioning.store import table_of
+from rhs_isac_ros.positioning.modes import LONG_SEARCH_STEPS, Modes, find_modes
+from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
@@ -19,16 +19,8 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 class SearchEstimator(abc.ABC):
     """An estimator from the modes of the posterior, for a uniform prior on the region of interest.
 
-    Signals that the model cannot explain at the best mode give no fix; see `fit`.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        The codebook.
-    table_folder
-        Where tables are kept between runs; None: nowhere.
+    Signals that the model cannot explain at the best mode give no fix; see `fit`. Tables are kept
+    in `table_folder` between runs.
 
     Raises
     ------
@@ -40,45 +32,32 @@ class SearchEstimator(abc.ABC):
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None) -> None:
         self._model = WhitenedModel(scenario, codebook)
-        self._table = TemplateTable(scenario, table_of(self._model, table_folder))
+        self._table = TemplateTable(scenario, load_table(self._model, table_folder))
         self._test = FitTest(int(np.prod(self._model.shape)))
         self._bounds = scenario.roi_bounds_m
 
     def estimate(self, received: np.ndarray) -> Estimate:
-        """Estimate positions from received signals.
-
-        Parameters
-        ----------
-        received
-            Complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions; sub-band-major.
-
-        Returns
-        -------
-        Estimate
-            With a leading N if the signals have one; without a position where they tell none.
-
-        Raises
-        ------
-        SignalError
-            If the shape is another one or a value is not finite.
-        """
+        """Estimate positions from received signals, as `Estimator.estimate` describes."""
         model = self._model
         return estimate_each(model.scenario, model.codebook, received, self._locate)
 
     def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
-        nowhere = np.full(3, np.nan), np.full((3, 3), np.nan)
+        no_fix = np.full(3, np.nan), np.full((3, 3), np.nan)
         for whitened in self._model.whiten(batch):
-            reason = self._test.silence(float(np.sum(np.abs(whitened)**2)))
+            reason = self._test.min_energy_test(float(np.sum(np.abs(whitened)**2)))
             if reason:
-                yield *nowhere, reason
+                yield *no_fix, reason
                 continue
             modes = find_modes(self._model, self._table, whitened)
-            if self._test.misfit(-modes.height.max()):
-                # Strong signals may need more steps up to their peak.
-                modes = find_modes(self._model, self._table, whitened, LONG_SEARCH)
-            reason = self._test.misfit(-modes.height.max())
-            yield (*nowhere, reason) if reason else (*self._moments(modes), '')
+            if self._residual_test(modes):
+                # Strong signals may need more steps to reach the maximum.
+                modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
+            reason = self._residual_test(modes)
+            yield (*no_fix, reason) if reason else (*self._moments(modes), '')
+
+    def _residual_test(self, modes: Modes) -> str:
+        return self._test.residual_test(-modes.roi_log_likelihood.max())
 
     @abc.abstractmethod
     def _moments(self, modes: Modes) -> tuple[np.ndarray, np.ndarray]:
-        """Make a position [3] and its covariance [3, 3] of the modes."""
+        """Return a position [3] and its covariance [3, 3] from the modes."""

@@ -1,4 +1,4 @@
-"""Tables on disk: built once for a scenario and codebook, then mapped into memory."""
+"""Tables on disk: computed once for a scenario and codebook, then mapped into memory."""
 
 import contextlib
 import dataclasses
@@ -15,44 +15,29 @@ from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import templates
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
-# Tables that a folder keeps; of more, the oldest go.
-_MOST = 16
+# Number of tables that a folder keeps; the oldest ones beyond it are deleted.
+_MAX_TABLES = 16
 _PREFIX = 'table-'
-# Of what a table holds; another one makes tables of before unknown.
+# Version of the contents of a table; tables of another version are not used.
 _FORMAT = 2
 
 
 def default_folder() -> Path:
-    """Return where tables are kept unless another folder is given.
-
-    Returns
-    -------
-    Path
-        ``rhs_isac_ros`` in the user's folder for caches, by the XDG convention.
-    """
+    """Return ``rhs_isac_ros`` in the user's cache folder, as the XDG convention defines it."""
     base = os.environ.get('XDG_CACHE_HOME', '')
     return (Path(base) if os.path.isabs(base) else Path.home() / '.cache') / 'rhs_isac_ros'
 
 
-def table_of(model: WhitenedModel, folder: Path | None = None) -> Mapping[str, np.ndarray]:
-    """Return the table of a model: from a folder if it is there, or else built and put there.
+def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str, np.ndarray]:
+    """Load the table of a model from a folder, or compute it and keep it there.
 
-    Parameters
-    ----------
-    model
-        The whitened model.
-    folder
-        Where tables are kept; None: nowhere.
-
-    Returns
-    -------
-    Mapping
-        What `tabulate` returns; from a folder, read-only and mapped into memory.
+    The result contains the arrays of `tabulate`; from a folder, they are read-only and mapped
+    into memory. Without a folder, the table is in memory only.
 
     Warns
     -----
     RuntimeWarning
-        If the folder cannot be written; the table then is in memory.
+        If the folder cannot be written; the table is then in memory only.
     """
     if folder is None:
         return templates.tabulate(model)
@@ -71,27 +56,16 @@ def table_of(model: WhitenedModel, folder: Path | None = None) -> Mapping[str, n
 
 
 def table_key(model: WhitenedModel) -> str:
-    """Return what tells tables apart: a hash of all that they depend on.
-
-    Parameters
-    ----------
-    model
-        The whitened model.
-
-    Returns
-    -------
-    str
-        32 hexadecimal digits.
-    """
+    """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
     parts = (dataclasses.astuple(model.scenario), model.codebook.id, __version__, _FORMAT,
              templates.RANGE_CELL_M, templates.DIRECTION_STEP)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
 def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
-    """Write a table aside and rename it: at no time is it there in part."""
-    # One record of an .npy file: key and digest, then the arrays. Wide numbers come first, so
-    # that all are aligned.
+    """Write a table to a temporary file and rename it, so that the file is always complete."""
+    # One record of an .npy file: key and digest, then the arrays, those of the widest numbers
+    # first so that all are aligned.
     names = sorted(table, key=lambda name: -table[name].real.itemsize)
     dtype = np.dtype([('key', 'S32'), ('digest', 'S32')]
                      + [(name, table[name].dtype, table[name].shape) for name in names])
@@ -106,14 +80,14 @@ def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
 
 
 def _read(path: Path, key: str) -> Mapping[str, np.ndarray] | None:
-    """Map a table; None if there is none, or one that is damaged or of something else."""
+    """Map a table into memory; None if the file is missing, damaged or of another key."""
     try:
         record = np.load(path, mmap_mode='r', allow_pickle=False)
         names = record.dtype.names or ()
-        known = record.shape == (1,) and names[:2] == ('key', 'digest')
-        if not known or record['key'][0] != key.encode() or record['digest'][0] != _digest(record):
+        valid = record.shape == (1,) and names[:2] == ('key', 'digest')
+        if not valid or record['key'][0] != key.encode() or record['digest'][0] != _digest(record):
             return None
-        # A table in use is not the oldest.
+        # The time of the last use decides which tables are deleted.
         os.utime(path)
     except (OSError, ValueError, EOFError, SyntaxError, TypeError):
         return None
@@ -123,13 +97,13 @@ def _read(path: Path, key: str) -> Mapping[str, np.ndarray] | None:
 def _digest(record: np.ndarray) -> bytes:
     content = hashlib.blake2b(digest_size=16)
     content.update(repr(record.dtype.descr).encode())
-    content.update(record.view(np.uint8)[64:])
+    content.update(record.view(np.uint8)[64:].data)
     return content.hexdigest().encode()
 
 
 def _prune(folder: Path) -> None:
-    # Another process may be at the same.
+    # Another process may delete the same files.
     with contextlib.suppress(OSError):
         tables = sorted(folder.glob(f'{_PREFIX}*.npy'), key=lambda path: -path.stat().st_mtime)
-        for path in tables[_MOST:]:
+        for path in tables[_MAX_TABLES:]:
             path.unlink(missing_ok=True)

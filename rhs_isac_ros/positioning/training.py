@@ -1,9 +1,9 @@
 """Training of the paper's network: 10^5 simulated pairs, split 7 : 1.5 : 1.5.
 
-What the paper leaves open is chosen here: 512 rectified hidden units, the squared error in metres
-as the loss, and Adam with a step of 10^-3. When the validation error has not fallen for some
-epochs the batches grow, which calms the steps; after the largest ones training stops, and the
-weights of the best epoch count.
+The paper leaves the rest open. Chosen here are 512 rectified hidden units, the squared error in
+metres as the loss, and Adam with a learning rate of 10^-3. When the validation error has not
+decreased for some epochs, the batch size grows, which reduces the noise of the steps. Training
+stops after the largest batches, and the weights of the best epoch are used.
 """
 
 import copy
@@ -16,33 +16,26 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, streams
-from rhs_isac_ros.positioning.network import Network, real_parts
+from rhs_isac_ros.positioning.estimate import stack_parts
+from rhs_isac_ros.positioning.network import Network
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 DEFAULT_PAIRS = 100_000
 DEFAULT_HIDDEN = 512
 DEFAULT_EPOCHS = 150
-_BATCHES = (128, 1024, 8192)
-_STEP = 1e-3
-_PATIENCE = 4
+_BATCH_SIZES = (128, 1024, 8192)
+_LEARNING_RATE = 1e-3
+# Epochs without improvement before the batch size grows.
+_PATIENCE_EPOCHS = 4
 # Per cent of the pairs for training and validation; the rest is the test.
-_TRAINING, _VALIDATION = 70, 15
+_TRAINING_PERCENT, _VALIDATION_PERCENT = 70, 15
 
 
 class Epoch(NamedTuple):
-    """How far a training has come.
+    """Progress of a training after `number` epochs.
 
-    Attributes
-    ----------
-    number
-        Epochs done.
-    validation_mse_m2
-        Mean squared error of the validation pairs [m^2].
-    best_mse_m2
-        The least so far [m^2].
-    elapsed_s
-        Time since the simulation began [s].
+    The best error is the smallest validation error so far; the time includes the simulation.
     """
 
     number: int
@@ -57,27 +50,18 @@ def train(
         progress: Callable[[Epoch], None] | None = None) -> Network:
     """Train a network for a scenario and codebook.
 
+    Returns the network of the epoch with the smallest validation error.
+
     Parameters
     ----------
-    scenario
-        The scenario.
-    codebook
-        The codebook.
     n_pairs
-        Pairs of positions and received signals, all together; at least 20.
+        Total number of pairs of positions and received signals, at least 20.
     seed
-        Seeds the pairs, the first weights, and the order of the pairs.
+        Seed of the pairs, the initial weights and the order of the pairs.
     n_hidden
         Units of the hidden layer.
-    max_epochs
-        Passes through the training pairs at most.
     progress
         Called after every epoch.
-
-    Returns
-    -------
-    Network
-        The network of the epoch with the least validation error.
 
     Raises
     ------
@@ -86,74 +70,85 @@ def train(
     ValueError
         If a number is too small, or scikit-learn is not installed.
     """
-    for name, value, least in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
-                               ('max_epochs', max_epochs, 1)):
-        if value < least:
-            raise ValueError(f'{name}: {value}, expected at least {least}')
-    begin = time.monotonic()
+    for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
+                                 ('max_epochs', max_epochs, 1)):
+        if value < minimum:
+            raise ValueError(f'{name}: {value}, expected at least {minimum}')
+    start_s = time.monotonic()
     regressor, limit_threads = _regressor(n_hidden, seed)
     positions, received = simulate_pairs(scenario, codebook, n_pairs, seed)
-    first, second = n_pairs * _TRAINING // 100, n_pairs * (_TRAINING + _VALIDATION) // 100
-    parts, center = real_parts(received), scenario.roi_bounds_m.mean(axis=0)
-    mean, scale = parts[:first].mean(axis=0), parts[:first].std(axis=0)
+    training, validation, test = _split(n_pairs)
+    parts, center = stack_parts(received), scenario.roi_bounds_m.mean(axis=0)
+    mean, scale = parts[training].mean(axis=0), parts[training].std(axis=0)
     # One unit for all coordinates, so that the loss is the squared error.
-    unit = np.sqrt(np.mean((positions[:first] - center)**2))
+    unit_m = np.sqrt(np.mean((positions[training] - center)**2))
     inputs = ((parts - mean) / scale).astype(np.float32)
-    targets = ((positions - center) / unit).astype(np.float32)
+    targets = ((positions - center) / unit_m).astype(np.float32)
 
     def residuals(subset: slice) -> np.ndarray:
-        return (regressor.predict(inputs[subset]) - targets[subset]).astype(float) * unit
+        errors: np.ndarray = regressor.predict(inputs[subset]) - targets[subset]
+        errors_m: np.ndarray = errors.astype(float) * unit_m
+        return errors_m
 
-    def after_epoch(number: int, best: float) -> float:
-        mse = _mean_square(residuals(slice(first, second)))
+    def after_epoch(number: int, best_mse: float) -> float:
+        mse = _mean_square(residuals(validation))
         if progress:
-            progress(Epoch(number, mse, min(mse, best), time.monotonic() - begin))
+            progress(Epoch(number, mse, min(mse, best_mse), time.monotonic() - start_s))
         return mse
 
-    # One thread: more of them round otherwise, and hinder each other on such small products.
+    # A single thread: more threads change the rounding and do not speed up such small products.
     with limit_threads(1):
         best_epoch, best_mse = _descend(
-            regressor, inputs[:first], targets[:first], max_epochs, after_epoch)
-    errors, tests = residuals(slice(first, second)), residuals(slice(second, None))
+            regressor, inputs[training], targets[training], max_epochs, after_epoch)
+    errors, test_errors = residuals(validation), residuals(test)
     (w_in, w_out), (b_in, b_out) = (
         [array.astype(float) for array in arrays]
         for arrays in (regressor.coefs_, regressor.intercepts_))
     return Network(
-        input_mean=mean, input_scale=scale, w_in=w_in, b_in=b_in, w_out=w_out * unit,
-        b_out=b_out * unit, center=center, covariance=errors.T @ errors / len(errors),
-        loudest=_loudest(scenario, codebook, positions), about={
+        input_mean=mean, input_scale=scale, w_in=w_in, b_in=b_in, w_out=w_out * unit_m,
+        b_out=b_out * unit_m, center=center, covariance=errors.T @ errors / len(errors),
+        max_energy=_max_energy(scenario, codebook, positions), about={
             'codebook': codebook.id, 'scenario': scenario.changes(), 'seed': seed,
             'pairs': n_pairs, 'epochs': best_epoch, 'version': __version__,
-            'validation_mse_m2': best_mse, 'test_mse_m2': _mean_square(tests)})
+            'validation_mse_m2': best_mse, 'test_mse_m2': _mean_square(test_errors)})
+
+
+def _split(n_pairs: int) -> tuple[slice, slice, slice]:
+    """Return the pairs for training, validation and test."""
+    first = n_pairs * _TRAINING_PERCENT // 100
+    second = n_pairs * (_TRAINING_PERCENT + _VALIDATION_PERCENT) // 100
+    return slice(first), slice(first, second), slice(second, None)
 
 
 def _descend(
         regressor: Any, inputs: np.ndarray, targets: np.ndarray, max_epochs: int,
         after_epoch: Callable[[int, float], float]) -> tuple[int, float]:
-    """Fit epoch after epoch and leave the best weights; returns their epoch and error.
+    """Fit epoch after epoch and leave the best weights; return their epoch and error.
 
-    `after_epoch` takes number and least error so far, and returns the epoch's.
+    `after_epoch` takes an epoch's number and the smallest error so far, and returns the epoch's
+    error.
     """
-    best, best_mse, best_epoch, since = None, np.inf, 0, 0
-    sizes = [min(size, len(inputs)) for size in _BATCHES]
+    best_weights: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+    best_mse, best_epoch, reference_epoch = np.inf, 0, 0
+    sizes = [min(size, len(inputs)) for size in _BATCH_SIZES]
     regressor.set_params(batch_size=sizes.pop(0))
     for number in range(1, max_epochs + 1):
         regressor.partial_fit(inputs, targets)
         mse = after_epoch(number, best_mse)
         if mse < best_mse:
-            best = copy.deepcopy((regressor.coefs_, regressor.intercepts_))
-            best_mse, best_epoch, since = mse, number, number
-        if number - since >= _PATIENCE:
+            best_weights = copy.deepcopy((regressor.coefs_, regressor.intercepts_))
+            best_mse, best_epoch, reference_epoch = mse, number, number
+        if number - reference_epoch >= _PATIENCE_EPOCHS:
             if not sizes:
                 break
             regressor.set_params(batch_size=sizes.pop(0))
-            since = number
-    regressor.coefs_, regressor.intercepts_ = best
+            reference_epoch = number
+    regressor.coefs_, regressor.intercepts_ = best_weights
     return best_epoch, best_mse
 
 
 def _regressor(n_hidden: int, seed: int) -> tuple[Any, Any]:
-    """Return the untrained network, and what limits the threads of its products."""
+    """Return the untrained network, and the context manager that limits its threads."""
     try:
         from sklearn.neural_network import MLPRegressor
         from threadpoolctl import threadpool_limits
@@ -163,7 +158,7 @@ def _regressor(n_hidden: int, seed: int) -> tuple[Any, Any]:
     state = int(streams.generator(seed, streams.TRAINING).integers(2**32))
     regressor = MLPRegressor(
         hidden_layer_sizes=(n_hidden,), activation='relu', solver='adam', alpha=0.0,
-        learning_rate_init=_STEP, random_state=state)
+        learning_rate_init=_LEARNING_RATE, random_state=state)
     return regressor, threadpool_limits
 
 
@@ -171,6 +166,6 @@ def _mean_square(errors: np.ndarray) -> float:
     return float(np.mean(np.sum(errors**2, axis=1)))
 
 
-def _loudest(scenario: Scenario, codebook: Codebook, positions: np.ndarray) -> float:
+def _max_energy(scenario: Scenario, codebook: Codebook, positions: np.ndarray) -> float:
     model = WhitenedModel(scenario, codebook)
     return float(np.sum(np.abs(model.mean(positions))**2, axis=(1, 2)).max())

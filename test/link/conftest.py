@@ -1,4 +1,4 @@
-"""The transmission phase written out by loops, from the paper's equations."""
+"""Reference implementation of the transmission phase: the paper's equations as plain loops."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,8 @@ import pytest
 from rhs_isac_ros.link import Beam
 
 
-class PlainLink:
-    """One band's link, one index at a time; V comes from outside.
-
-    The direct parts of Eq. (10) and the K x K channels behind it, for one scenario and band.
-    """
+class ReferenceLink:
+    """The link of one band, computed one index at a time from a given covariance V."""
 
     def __init__(self, plain, spatial, band=0):
         self.plain, self.spatial, self.band = plain, spatial, band
@@ -22,7 +19,7 @@ class PlainLink:
                                  for j in range(scenario.n_subbands)])
 
     def los(self, position):
-        """Gains of the line of sight, [N_SB, N_E]."""
+        """Line-of-sight gains, [N_SB, N_E]."""
         return np.array([[self.plain.los(position, self.band, j, m) for m in self.elements]
                          for j in range(self.plain.scenario.n_subbands)])
 
@@ -37,24 +34,24 @@ class PlainLink:
             total += np.log2(1 + (direct + scattered) / self.noise)
         return scenario.subband_width_hz * total
 
-    def best_digital(self, analog, position):
-        """Digital part of the highest capacity for a configuration."""
+    def best_beam(self, analog, position):
+        """Beam of the highest capacity with a given configuration."""
         scenario, los = self.plain.scenario, self.los(position)
         gains, directions = [], []
         for j in range(scenario.n_subbands):
             configured = self.onboard[j] * analog
-            toward = configured @ los[j]
-            channel = np.outer(toward, toward.conj())
+            direct = configured @ los[j]
+            channel = np.outer(direct, direct.conj())
             channel += configured @ self.spatial @ configured.conj().T
             values, vectors = np.linalg.eigh(channel)
             gains.append(values[-1] / self.noise)
             directions.append(vectors[:, -1].conj())
-        shares = fill_by_bisection(np.array(gains), scenario.max_power_w)
+        shares = water_filling_by_bisection(np.array(gains), scenario.max_power_w)
         return Beam(analog, np.array(directions) * np.sqrt(shares)[:, None], self.band)
 
 
-def fill_by_bisection(gains, power):
-    """Water-filling: halve the interval of the water's level until it is a point."""
+def water_filling_by_bisection(gains, power):
+    """Water-filling by bisection of the water level."""
     floors = np.array([1 / g if g > 0 else np.inf for g in gains])
     low, high = floors.min(), floors.min() + power
     for _ in range(200):
@@ -68,12 +65,12 @@ def fill_by_bisection(gains, power):
 
 @pytest.fixture(scope='session')
 def bisection():
-    return fill_by_bisection
+    return water_filling_by_bisection
 
 
 @pytest.fixture(scope='session')
-def link_of(plain):
-    """Function of a case and a band: its link by loops."""
+def reference_link(plain):
+    """Callable that takes a case and a band and returns the reference link."""
     def make(case, band=0):
-        return PlainLink(plain(case.scenario), case.vectors['V'][band], band)
+        return ReferenceLink(plain(case.scenario), case.vectors['V'][band], band)
     return make

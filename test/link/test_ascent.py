@@ -1,4 +1,4 @@
-"""The ascent from a configuration to a maximum nearby."""
+"""Ascent from a configuration to a maximum nearby."""
 
 import numpy as np
 import pytest
@@ -8,15 +8,15 @@ from rhs_isac_ros.link.ascent import ascend
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.model import Scenario
 
-PLACE = np.array([7.0, 3.0, -0.5])
-# Sub-bands that differ, and so little power that not all of them get some.
+POSITION = np.array([7.0, 3.0, -0.5])
+# The sub-bands differ, and the power is too low for all of them to receive some.
 WIDE = Scenario(
     center_frequencies_hz=(2.5e9,), n_subbands=4, subband_width_hz=4e8, n_feeds=2,
     elements_per_side=4, max_power_w=5e-9)
 
 
 def rate(scenario, analog, digital):
-    return capacity(scenario, Beam(analog, digital), PLACE[None])[0]
+    return capacity(scenario, Beam(analog, digital), POSITION[None])[0]
 
 
 @pytest.fixture(params=['small', 'table1', 'wide'])
@@ -26,7 +26,7 @@ def scenario(request):
 
 @pytest.fixture
 def link(scenario):
-    return BandLink.to(scenario, PLACE, 0)
+    return BandLink.to(scenario, POSITION, 0)
 
 
 def starts(scenario, n=10):
@@ -36,7 +36,7 @@ def starts(scenario, n=10):
             np.zeros(scenario.n_elements)]
 
 
-def test_the_end_is_not_below_the_start(scenario, link):
+def test_the_capacity_never_decreases(scenario, link):
     for start in starts(scenario):
         analog, digital = ascend(link, start)
         assert analog.min() >= 0
@@ -45,20 +45,20 @@ def test_the_end_is_not_below_the_start(scenario, link):
             scenario, start, link.best_digital(start)) * (1 - 1e-12)
 
 
-def test_the_start_is_left_as_it_is(scenario, link):
+def test_the_start_is_not_modified(scenario, link):
     for start in starts(scenario, 2):
         before = start.copy()
         ascend(link, start)
         np.testing.assert_array_equal(start, before)
 
 
-def test_the_digital_part_is_the_best_for_the_end(scenario, link):
+def test_the_digital_part_is_optimal_for_the_configuration(scenario, link):
     for start in starts(scenario, 3):
         analog, digital = ascend(link, start)
         np.testing.assert_array_equal(digital, link.best_digital(analog))
 
 
-def test_no_single_element_at_an_end_of_its_range_carries_more(scenario, link):
+def test_no_single_element_gains_at_an_end_of_its_range(scenario, link):
     for start in starts(scenario, 3):
         if not start.any():
             continue
@@ -71,12 +71,12 @@ def test_no_single_element_at_an_end_of_its_range_carries_more(scenario, link):
                 assert rate(scenario, other, digital) <= found * (1 + 1e-8)
 
 
-def test_most_random_configurations_gain(scenario, link):
+def test_random_configurations_gain(scenario, link):
     gained = [rate(scenario, *ascend(link, start)) / rate(
         scenario, start, link.best_digital(start)) for start in starts(scenario)[:10]]
     assert min(gained) > 1.0001
 
 
-def test_a_surface_that_is_off_still_gives_a_beam(scenario, link):
+def test_a_surface_that_is_off_still_uses_the_full_power(scenario, link):
     _, digital = ascend(link, np.zeros(scenario.n_elements))
     assert np.sum(np.abs(digital)**2) == pytest.approx(scenario.max_power_w)

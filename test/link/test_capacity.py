@@ -1,12 +1,17 @@
-"""Eq. (10) against independent values and against plain loops."""
+"""Eq. (10) at a position and over a posterior, compared with reference values and plain loops."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link import Beam, capacity
+from rhs_isac_ros.link import Beam, capacity, expected_capacity, steer
+from rhs_isac_ros.link.capacity import posterior_points
 from rhs_isac_ros.model import Scenario
+
+POSITION = np.array([9.0, 1.5, -0.4])
+# Long in range and short across, as are the posteriors of the shipped codebook.
+LONG = np.diag([0.9, 0.2, 0.12])**2
 
 
 def random_beam(scenario, rng, band=0):
@@ -15,15 +20,15 @@ def random_beam(scenario, rng, band=0):
     return Beam(rng.uniform(size=scenario.n_elements), digital, band)
 
 
-def test_capacity_is_the_vectors(case):
+def test_capacity_matches_the_reference_values(case):
     beam = Beam(case.vectors['tx_analog'], case.vectors['tx_digital'], 0)
     values = capacity(case.scenario, beam, case.vectors['positions'])
     assert values.shape == case.vectors['capacity_band1'].shape
     np.testing.assert_allclose(values, case.vectors['capacity_band1'], rtol=1e-8)
 
 
-def test_capacity_is_that_of_plain_loops(small, link_of):
-    link, rng = link_of(small), np.random.default_rng(0)
+def test_capacity_matches_plain_loops(small, reference_link):
+    link, rng = reference_link(small), np.random.default_rng(0)
     for _ in range(3):
         beam = random_beam(small.scenario, rng)
         positions = small.scenario.sample_positions(2, rng)
@@ -33,44 +38,43 @@ def test_capacity_is_that_of_plain_loops(small, link_of):
 
 
 @pytest.mark.parametrize('band', [0, 1])
-def test_each_band_has_its_own_capacity(table1, link_of, band):
+def test_each_band_has_its_own_capacity(table1, reference_link, band):
     rng = np.random.default_rng(band)
     beam, position = random_beam(table1.scenario, rng, band), np.array([7.0, 2.0, -0.4])
     value = capacity(table1.scenario, beam, position[None])[0]
-    assert value == pytest.approx(link_of(table1, band).capacity(beam, position), rel=1e-8)
+    assert value == pytest.approx(reference_link(table1, band).capacity(beam, position), rel=1e-8)
     other = dataclasses.replace(beam, band=1 - band)
     assert capacity(table1.scenario, other, position[None])[0] != pytest.approx(value, rel=1e-4)
 
 
-def test_positions_do_not_influence_each_other(small):
+def test_a_batch_gives_the_same_as_single_positions(small):
     rng = np.random.default_rng(1)
     beam, positions = random_beam(small.scenario, rng), small.scenario.sample_positions(5, rng)
-    together = capacity(small.scenario, beam, positions)
-    alone = [capacity(small.scenario, beam, p[None])[0] for p in positions]
-    np.testing.assert_allclose(together, alone, rtol=1e-12)
+    batch = capacity(small.scenario, beam, positions)
+    single = [capacity(small.scenario, beam, p[None])[0] for p in positions]
+    np.testing.assert_allclose(batch, single, rtol=1e-12)
     assert capacity(small.scenario, beam, np.zeros((0, 3))).shape == (0,)
 
 
-def test_a_beam_that_is_off_carries_nothing(small):
+def test_a_beam_that_is_off_has_no_capacity(small):
     scenario = small.scenario
     positions = scenario.sample_positions(3, np.random.default_rng(2))
     beam = random_beam(scenario, np.random.default_rng(2))
-    for dark in (Beam(np.zeros(16), beam.digital), Beam(beam.analog, np.zeros((3, 2), complex))):
-        assert (capacity(scenario, dark, positions) == 0).all()
+    for off in (Beam(np.zeros(16), beam.digital), Beam(beam.analog, np.zeros((3, 2), complex))):
+        assert (capacity(scenario, off, positions) == 0).all()
 
 
-def test_sub_bands_add_up(small):
+def test_capacity_is_the_sum_over_the_sub_bands(small):
     scenario = small.scenario
     beam = random_beam(scenario, np.random.default_rng(3))
     position = np.array([[9.0, 1.0, 0.5]])
-    alone = [Beam(beam.analog, beam.digital * (np.arange(3) == j)[:, None]) for j in range(3)]
-    parts = [capacity(scenario, part, position)[0] for part in alone]
+    single = [Beam(beam.analog, beam.digital * (np.arange(3) == j)[:, None]) for j in range(3)]
+    parts = [capacity(scenario, part, position)[0] for part in single]
     assert min(parts) > 0
     assert sum(parts) == pytest.approx(capacity(scenario, beam, position)[0])
 
 
-def test_ten_times_the_power_adds_log2_of_ten(small):
-    """At a high ratio of signal to noise."""
+def test_ten_times_the_power_adds_log2_of_ten_at_a_high_snr(small):
     scenario = small.scenario
     beam = random_beam(scenario, np.random.default_rng(4))
     position = np.array([[9.0, 1.0, 0.5]])
@@ -81,7 +85,7 @@ def test_ten_times_the_power_adds_log2_of_ten(small):
     assert values[2] == pytest.approx(values[0])
 
 
-def test_closer_users_get_more(small):
+def test_capacity_decreases_with_distance(small):
     beam = Beam(small.vectors['tx_analog'], small.vectors['tx_digital'])
     scenario = dataclasses.replace(small.scenario, roi_center_m=(10.0, 0.0, 0.0))
     direction = np.array([1.0, 0.1, 0.05])
@@ -98,7 +102,7 @@ def test_closer_users_get_more(small):
     ({'band': 1}, ['band: 1', 'expected 0 to 0']),
     ({'band': -1}, ['band: -1', 'expected 0 to 0']),
 ])
-def test_a_beam_that_does_not_fit_is_an_error(small, changes, words):
+def test_a_beam_that_does_not_fit_the_scenario_is_an_error(small, changes, words):
     beam = dataclasses.replace(
         Beam(small.vectors['tx_analog'], small.vectors['tx_digital']), **changes)
     with pytest.raises(ValueError, match='expected') as caught:
@@ -109,22 +113,108 @@ def test_a_beam_that_does_not_fit_is_an_error(small, changes, words):
 
 @pytest.mark.parametrize('positions', [
     np.zeros(3), np.zeros((2, 2)), [[9.0, np.nan, 0.0]], [[9.0, 0.0, np.inf]]])
-def test_positions_that_are_none_are_an_error(small, positions):
+def test_invalid_positions_are_an_error(small, positions):
     beam = Beam(small.vectors['tx_analog'], small.vectors['tx_digital'])
     with pytest.raises(ValueError, match='positions'):
         capacity(small.scenario, beam, positions)
 
 
-def test_a_beam_cannot_be_changed(small):
+def test_a_beam_is_immutable(small):
     beam = Beam(small.vectors['tx_analog'], small.vectors['tx_digital'])
     assert beam.band == 0
     with pytest.raises(dataclasses.FrozenInstanceError):
         beam.band = 1
 
 
-def test_table_1_carries_what_the_paper_says_in_order_of_magnitude():
-    """A few ten Mbit/s over 1 MHz at 1 mW: some 20 to 30 bit/s/Hz."""
+def test_capacity_of_table_1_has_the_order_of_magnitude_of_the_paper():
+    """The paper has tens of Mbit/s over 1 MHz at 1 mW: about 20 to 30 bit/s/Hz."""
     scenario = Scenario()
     beam = random_beam(scenario, np.random.default_rng(5))
     value = capacity(scenario, beam, np.array([[10.0, 0.0, 0.0]]))[0]
     assert 10 < value / (scenario.n_subbands * scenario.subband_width_hz) < 40
+
+
+def rotated(covariance, seed=0):
+    axes, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return axes @ covariance @ axes.T
+
+
+@pytest.mark.parametrize('covariance', [LONG, rotated(LONG), 0.3**2 * np.eye(3)],
+                         ids=['aligned', 'rotated', 'isotropic'])
+@pytest.mark.parametrize('band', [0, 1])
+def test_expected_capacity_matches_random_draws(table1, covariance, band):
+    scenario = table1.scenario
+    beam = steer(scenario, POSITION, band)
+    draws = np.random.default_rng(1).multivariate_normal(POSITION, covariance, 4000)
+    rates = capacity(scenario, beam, draws)
+    expected = expected_capacity(scenario, beam, POSITION, covariance)
+    assert expected == pytest.approx(rates.mean(), abs=4 * rates.std() / np.sqrt(len(rates)))
+    assert expected < capacity(scenario, beam, POSITION[None])[0]
+
+
+def test_expected_capacity_without_variance_is_the_capacity_at_the_mean(table1):
+    scenario = table1.scenario
+    beam = steer(scenario, POSITION)
+    assert expected_capacity(scenario, beam, POSITION, np.zeros((3, 3))) == capacity(
+        scenario, beam, POSITION[None])[0]
+
+
+@pytest.mark.parametrize('covariance', [LONG, rotated(LONG), rotated(np.diag([1.0, 0.3, 0.0]))])
+def test_points_have_the_moments_of_the_posterior(table1, covariance):
+    points, weights = posterior_points(table1.scenario, POSITION, covariance)
+    assert len(points) <= 27
+    assert weights.min() > 0
+    assert weights.sum() == pytest.approx(1, rel=1e-12)
+    offsets = points - POSITION
+    np.testing.assert_allclose(weights @ offsets, 0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.einsum('n,na,nb->ab', weights, offsets, offsets), covariance, atol=1e-9)
+    direction = np.array([0.6, -0.5, 0.4])
+    variance = direction @ covariance @ direction
+    fourth = weights @ (offsets @ direction)**4
+    assert fourth == pytest.approx(3 * variance**2, rel=1e-9)
+
+
+def test_axes_without_variance_have_one_node(table1):
+    points, weights = posterior_points(table1.scenario, POSITION, np.zeros((3, 3)))
+    np.testing.assert_array_equal(points, [POSITION])
+    np.testing.assert_array_equal(weights, [1])
+    points, _ = posterior_points(table1.scenario, POSITION, np.diag([0, 1.0, 0]))
+    assert len(points) == 3
+    assert (points[:, [0, 2]] == POSITION[[0, 2]]).all()
+
+
+def test_no_point_is_closer_to_the_surface_than_region_and_mean(table1):
+    scenario = table1.scenario
+    low_m = scenario.roi_bounds_m[0][0]
+    points, _ = posterior_points(scenario, np.array([6.0, 0, 0]), 25 * np.eye(3))
+    assert points[:, 0].min() == low_m
+    # The mean itself is never moved.
+    points, _ = posterior_points(scenario, np.array([2.0, 0, 0]), 25 * np.eye(3))
+    assert points[:, 0].min() == 2.0
+    assert points[:, 0].max() > 6
+
+
+def test_points_are_deterministic(table1):
+    first, second = (posterior_points(table1.scenario, POSITION, rotated(LONG)) for _ in range(2))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize('covariance', [
+    -np.eye(3), np.arange(9.0).reshape(3, 3), np.full((3, 3), 1e300), 1e308 * np.eye(3),
+    np.full((3, 3), 1.7e308), np.full((3, 3), 5e-324)])
+def test_an_invalid_covariance_still_gives_a_finite_capacity(table1, covariance):
+    scenario = table1.scenario
+    beam = steer(scenario, POSITION)
+    expected = expected_capacity(scenario, beam, POSITION, covariance)
+    assert 0 < expected <= capacity(scenario, beam, POSITION[None])[0] * 1.1
+
+
+@pytest.mark.parametrize(('mean', 'covariance', 'name'), [
+    (np.zeros(2), np.eye(3), 'mean'), (np.array([9, np.nan, 0]), np.eye(3), 'mean'),
+    (POSITION, np.eye(2), 'covariance'), (POSITION, np.ones(9), 'covariance'),
+    (POSITION, np.full((3, 3), np.inf), 'covariance')])
+def test_invalid_moments_are_errors_that_name_the_field(table1, mean, covariance, name):
+    with pytest.raises(ValueError, match=rf'(?s)^{name}: .* expected \[3.* finite'):
+        posterior_points(table1.scenario, mean, covariance)

@@ -1,4 +1,4 @@
-"""Running quartiles against sorting by hand."""
+"""Running quartiles, compared with explicit sorting."""
 
 import numpy as np
 import pytest
@@ -10,10 +10,10 @@ def by_sorting(values):
     """Quartiles by linear interpolation between the sorted values."""
     ordered, result = sorted(values), []
     for share in (0.25, 0.5, 0.75):
-        place = share * (len(ordered) - 1)
-        low = int(place)
+        rank = share * (len(ordered) - 1)
+        low = int(rank)
         high = min(low + 1, len(ordered) - 1)
-        result.append(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
+        result.append(ordered[low] + (rank - low) * (ordered[high] - ordered[low]))
     return result
 
 
@@ -30,35 +30,35 @@ def test_quartiles_are_exact_over_the_newest_rows(window):
         np.testing.assert_allclose(running.quartiles(), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_one_row_is_all_of_its_quartiles():
+def test_all_quartiles_of_one_row_equal_the_row():
     running = RunningQuartiles(2)
     running.add([3.0, -1.0])
     np.testing.assert_array_equal(running.quartiles(), [[3, 3, 3], [-1, -1, -1]])
 
 
-def test_a_row_that_is_changed_later_counts_as_it_was():
+def test_rows_are_copied():
     running, row = RunningQuartiles(1), np.array([1.0])
     running.add(row)
     row[0] = 2
     assert running.quartiles()[0, 1] == 1
 
 
-def test_quartiles_of_nothing_are_an_error():
+def test_quartiles_of_no_rows_are_an_error():
     running = RunningQuartiles(2)
     assert len(running) == 0
-    with pytest.raises(ValueError, match='no row'):
+    with pytest.raises(ValueError, match='no rows'):
         running.quartiles()
 
 
 @pytest.mark.parametrize('row', [[1.0], [1.0, 2.0, 3.0], 1.0, [1.0, np.nan], [np.inf, 0.0]])
-def test_what_is_no_row_is_an_error_and_counts_nothing(row):
+def test_an_invalid_row_is_an_error_and_is_not_added(row):
     running = RunningQuartiles(2)
-    with pytest.raises(ValueError, match='^row: .*expected 2 finite figures'):
+    with pytest.raises(ValueError, match='^row: .*expected 2 finite values'):
         running.add(row)
     assert len(running) == 0
 
 
-@pytest.mark.parametrize(('n_figures', 'window'), [(0, 5), (2, 0), (-1, -1)])
-def test_sizes_that_are_none_are_an_error(n_figures, window):
-    with pytest.raises(ValueError, match=f'{n_figures}, {window}, expected at least 1'):
-        RunningQuartiles(n_figures, window)
+@pytest.mark.parametrize(('n_values', 'window'), [(0, 5), (2, 0), (-1, -1)])
+def test_sizes_below_one_are_errors(n_values, window):
+    with pytest.raises(ValueError, match=f'{n_values}, {window}, expected at least 1'):
+        RunningQuartiles(n_values, window)

@@ -1,4 +1,4 @@
-"""Water-filling against bisection and its conditions of optimality."""
+"""Water-filling, compared with bisection and checked for optimality."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ CASES = {
     'just below the second': (np.array([2.0, 1.0]), 0.5 - 1e-9),
     'just above the second': (np.array([2.0, 1.0]), 0.5 + 1e-9),
     'one without gain': (np.array([0.0, 2.0, 3.0]), 1.0),
-    'of a link': (np.array([1e9, 1.1e9, 0.9e9, 3e8]), 1e-3),
+    'realistic link': (np.array([1e9, 1.1e9, 0.9e9, 3e8]), 1e-3),
     **{f'random {n}': (10**RNG.uniform(-4, 4, n), 10**RNG.uniform(-3, 3))
        for n in (2, 3, 8, 64, 500)},
 }
@@ -30,13 +30,13 @@ def rate(gains, shares):
     return np.log1p(gains * shares).sum()
 
 
-def test_shares_are_those_of_bisection(channels, bisection):
+def test_shares_match_bisection(channels, bisection):
     gains, power = channels
     np.testing.assert_allclose(
         water_filling(gains, power), bisection(gains, power), rtol=1e-9, atol=1e-9 * power)
 
 
-def test_shares_use_the_power_and_are_not_negative(channels):
+def test_shares_are_not_negative_and_sum_to_the_power(channels):
     gains, power = channels
     shares = water_filling(gains, power)
     assert shares.shape == gains.shape
@@ -44,8 +44,8 @@ def test_shares_use_the_power_and_are_not_negative(channels):
     assert shares.sum() == pytest.approx(power, rel=1e-9)
 
 
-def test_the_conditions_of_karush_kuhn_and_tucker_hold(channels):
-    """The slope of the rate is the same where power goes, and not higher elsewhere."""
+def test_the_karush_kuhn_tucker_conditions_hold(channels):
+    """The slope of the rate is equal in all channels with power, and not higher in others."""
     gains, power = channels
     shares = water_filling(gains, power)
     slopes = gains / (1 + gains * shares)
@@ -54,7 +54,7 @@ def test_the_conditions_of_karush_kuhn_and_tucker_hold(channels):
     assert (slopes[~used] <= slopes[used].max() * (1 + 1e-9)).all()
 
 
-def test_no_other_shares_are_better(channels):
+def test_random_shares_are_not_better(channels):
     gains, power = channels
     best = rate(gains, water_filling(gains, power))
     rng = np.random.default_rng(1)
@@ -63,7 +63,7 @@ def test_no_other_shares_are_better(channels):
             assert rate(gains, shares) <= best * (1 + 1e-12)
 
 
-def test_the_order_of_channels_does_not_matter(channels):
+def test_shares_do_not_depend_on_the_order_of_channels(channels):
     gains, power = channels
     order = np.random.default_rng(2).permutation(len(gains))
     np.testing.assert_allclose(
@@ -71,30 +71,30 @@ def test_the_order_of_channels_does_not_matter(channels):
         atol=1e-12 * power)
 
 
-def test_more_power_lowers_no_share(channels):
+def test_more_power_decreases_no_share(channels):
     gains, power = channels
     assert (water_filling(gains, 2 * power) >= water_filling(gains, power) - 1e-9 * power).all()
 
 
-def test_what_has_no_gain_gets_nothing():
+def test_channels_without_gain_get_no_power():
     shares = water_filling(np.array([0.0, 2.0, -1e-20, 3.0]), 1.0)
     assert shares[0] == shares[2] == 0
     assert shares.sum() == pytest.approx(1.0)
 
 
-def test_many_without_gain_get_nothing():
+def test_one_useful_channel_gets_all_the_power():
     shares = water_filling(np.array([1.0] + [0.0] * 7), 1.0)
     np.testing.assert_array_equal(shares, [1.0] + [0.0] * 7)
 
 
 @pytest.mark.parametrize('gains', [[0.0], [0.0] * 8, [-1e-20, 0.0]])
-def test_without_any_gain_the_power_is_still_used(gains):
+def test_without_any_gain_the_shares_are_equal(gains):
     np.testing.assert_allclose(water_filling(np.array(gains), 3.0), 3.0 / len(gains))
 
 
 @pytest.mark.parametrize('gains', [[1e-15], [1e-15, 3e-15], [1e-200, 0.0, 1e-15]])
-def test_gains_of_rounding_alone_still_get_the_power(gains):
-    """A configuration that lets nothing through has such gains."""
+def test_gains_near_rounding_errors_still_get_the_power(gains):
+    """A configuration that passes no signal has such gains."""
     shares = water_filling(np.array(gains), 1e-3)
     assert shares.sum() == 1e-3
     assert shares[np.argmax(gains)] == 1e-3

@@ -1,4 +1,4 @@
-"""The posterior by weighing points everywhere."""
+"""The posterior as a weighted sum over the whole region."""
 
 import numpy as np
 from scipy.stats import qmc
@@ -8,7 +8,7 @@ from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning import exhaustive_posterior, simulate_pairs
 
 
-def test_moments_are_those_of_the_plain_likelihood(plain, random_beams):
+def test_moments_match_the_plain_likelihood(plain, random_beams):
     scenario = Scenario(n_subbands=2, elements_per_side=4, roi_center_m=(4, 0, 0),
                         roi_size_m=(1, 1, 0.5))
     codebook = random_beams(scenario, np.random.default_rng(1))
@@ -19,12 +19,12 @@ def test_moments_are_those_of_the_plain_likelihood(plain, random_beams):
 
     p, spatial = plain(scenario, codebook.analog, codebook.digital), multipath_covariance(scenario)
     points = qmc.Sobol(3, seed=0).random(2**13) * [1, 1, 0.5] + [3.5, -0.5, -0.25]
-    logarithm = np.zeros((5, 2**13))
+    log_likelihood = np.zeros((5, 2**13))
     for band in range(2):
         residual = received[:, None, band] - p.mean(points, band)
-        weighed = np.linalg.solve(p.covariance(band, spatial[band]), residual[..., None])[..., 0]
-        logarithm -= np.sum(residual.conj() * weighed, axis=2).real
-    weights = np.exp(logarithm - logarithm.max(axis=1, keepdims=True))
+        solved = np.linalg.solve(p.covariance(band, spatial[band]), residual[..., None])[..., 0]
+        log_likelihood -= np.sum(residual.conj() * solved, axis=2).real
+    weights = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
     for row, weight in enumerate(weights):
         expected = np.average(points, axis=0, weights=weight)
         np.testing.assert_allclose(estimate.mean[row], expected, atol=1e-3)

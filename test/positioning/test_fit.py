@@ -1,4 +1,4 @@
-"""Signals that no position explains give no fix."""
+"""Signals that the model cannot explain at any position give no fix."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from rhs_isac_ros.positioning.fit import FALSE_ALARM, FitTest
 
 @pytest.fixture(scope='module', params=['bayes', 'ml'])
 def setting(request, random_beams):
-    """Scenario with strong signals, codebook, estimator."""
+    """A scenario with strong signals, a codebook and an estimator."""
     scenario = Scenario(
         center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
         roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
@@ -19,53 +19,53 @@ def setting(request, random_beams):
     return scenario, codebook, make_estimator(request.param, scenario, codebook)
 
 
-def assert_no_fix(estimate, words):
+def assert_no_fix(estimate, message):
     assert not estimate.fix.any()
     assert np.isnan(estimate.mean).all()
     assert np.isnan(estimate.covariance).all()
     reasons = [estimate.reason] if isinstance(estimate.reason, str) else estimate.reason
     assert len(reasons) == np.size(estimate.fix)
     for reason in reasons:
-        assert words in reason
+        assert message in reason
         assert 'expected at ' in reason
 
 
-def test_limits_are_quantiles_of_chi_square():
+def test_limits_are_quantiles_of_the_chi_square_distribution():
     test = FitTest(64)
-    assert 2 * test.least_energy == pytest.approx(chi2.ppf(FALSE_ALARM, 128))
-    assert 2 * test.most_misfit == pytest.approx(chi2.isf(FALSE_ALARM, 128))
-    for check, limit, sign in ((test.silence, test.least_energy, -1),
-                               (test.misfit, test.most_misfit, 1)):
+    assert 2 * test.min_energy == pytest.approx(chi2.ppf(FALSE_ALARM, 128))
+    assert 2 * test.max_residual == pytest.approx(chi2.isf(FALSE_ALARM, 128))
+    for check, limit, sign in ((test.min_energy_test, test.min_energy, -1),
+                               (test.residual_test, test.max_residual, 1)):
         assert check(limit * (1 - 1e-6 * sign)) == ''
         assert check(limit * (1 + 1e-6 * sign)) != ''
 
 
-def test_the_loudest_signals_are_those_of_the_strongest_position_and_noise():
+def test_the_largest_energy_is_that_of_the_strongest_position_with_noise():
     test = FitTest(64)
-    most = (np.sqrt(500.0) + np.sqrt(test.most_misfit))**2
-    assert test.loudness(most * 0.999, 500.0) == ''
-    assert f'expected at most {most:.3g}' in test.loudness(most * 1.001, 500.0)
+    limit = (np.sqrt(500.0) + np.sqrt(test.max_residual))**2
+    assert test.max_energy_test(limit * 0.999, 500.0) == ''
+    assert f'expected at most {limit:.3g}' in test.max_energy_test(limit * 1.001, 500.0)
 
 
 @pytest.mark.parametrize('factor', [0.0, 1e-30, 1e-3], ids=str)
-def test_silence_gives_no_fix(setting, factor):
+def test_signals_weaker_than_noise_give_no_fix(setting, factor):
     scenario, codebook, estimator = setting
     received = factor * simulate_pairs(scenario, codebook, 1, 0)[1][0]
     assert_no_fix(estimator.estimate(received), 'energy')
 
 
-@pytest.mark.parametrize('place', [(4.0, 0.0, 1.5), (4.0, -3.0, 0.0), (2.0, 0.0, 0.0)], ids=str)
-def test_a_user_far_outside_the_region_gives_no_fix(setting, place):
+@pytest.mark.parametrize('position', [(4.0, 0.0, 1.5), (4.0, -3.0, 0.0), (2.0, 0.0, 0.0)], ids=str)
+def test_a_user_far_outside_the_region_gives_no_fix(setting, position):
     scenario, codebook, estimator = setting
     received = simulate_received(
-        scenario, codebook, np.tile(place, (4, 1)), np.random.default_rng(0))
-    assert_no_fix(estimator.estimate(received), 'misfit')
+        scenario, codebook, np.tile(position, (4, 1)), np.random.default_rng(0))
+    assert_no_fix(estimator.estimate(received), 'residual')
 
 
 def test_signals_of_another_codebook_give_no_fix(setting, random_beams):
     scenario, _, estimator = setting
     other = random_beams(scenario, np.random.default_rng(2))
-    assert_no_fix(estimator.estimate(simulate_pairs(scenario, other, 20, 0)[1]), 'misfit')
+    assert_no_fix(estimator.estimate(simulate_pairs(scenario, other, 20, 0)[1]), 'residual')
 
 
 @pytest.mark.parametrize('change', [
@@ -73,26 +73,26 @@ def test_signals_of_another_codebook_give_no_fix(setting, random_beams):
     lambda received: received.conj(),
     lambda received: received[:, ::-1],
     lambda received: received * np.exp(2j * np.pi * np.arange(received.shape[2]) / 7),
-], ids=['too loud', 'conjugate', 'bands swapped', 'turning phase'])
+], ids=['amplified', 'conjugate', 'bands swapped', 'rotating phase'])
 def test_distorted_signals_give_no_fix(setting, change):
     scenario, codebook, estimator = setting
     received = simulate_pairs(scenario, codebook, 20, 0)[1]
-    assert_no_fix(estimator.estimate(change(received)), 'misfit')
+    assert_no_fix(estimator.estimate(change(received)), 'residual')
 
 
-def test_good_signals_beside_bad_ones_are_located(setting):
+def test_valid_signals_are_located_beside_invalid_ones(setting):
     scenario, codebook, estimator = setting
     positions, received = simulate_pairs(scenario, codebook, 6, 0)
-    alone = estimator.estimate(received)
+    expected = estimator.estimate(received)
     received[[1, 4]] = 0
     estimate = estimator.estimate(received)
     assert estimate.fix.tolist() == [True, False, True, True, False, True]
-    np.testing.assert_array_equal(estimate.mean[estimate.fix], alone.mean[estimate.fix])
+    np.testing.assert_array_equal(estimate.mean[estimate.fix], expected.mean[estimate.fix])
     assert [bool(reason) for reason in estimate.reason] == (~estimate.fix).tolist()
     assert np.linalg.norm(estimate.mean - positions, axis=1)[estimate.fix].max() < 0.1
 
 
-def test_all_good_signals_are_located(table1_estimator, shipped):
-    """Weak and strong signals of Table I; the test refuses one in 10^9."""
+def test_all_valid_signals_are_located(table1_estimator, shipped):
+    """Signals of Table I are weak or strong; each test rejects one in 10^9."""
     received = simulate_pairs(Scenario(), shipped, 300, 5)[1]
     assert table1_estimator.estimate(received).fix.all()

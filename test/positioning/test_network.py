@@ -1,4 +1,4 @@
-"""The network's arithmetic and its file."""
+"""The network and its file."""
 
 import dataclasses
 import io
@@ -19,7 +19,7 @@ def network():
         {'codebook': 'cb0', 'scenario': {'n_feeds': 2}, 'seed': 3, 'test_mse_m2': 1.25})
 
 
-def test_positions_are_those_of_the_formula(network):
+def test_positions_match_the_formula(network):
     rng = np.random.default_rng(1)
     received = rng.normal(size=(6, 2, 2, 2)) @ [1, 1j]
     expected = []
@@ -34,16 +34,26 @@ def test_positions_are_those_of_the_formula(network):
     np.testing.assert_allclose(network.positions(received), expected, rtol=1e-12)
 
 
-def test_a_file_gives_the_model_back(network, tmp_path):
+def test_a_saved_model_can_be_loaded(network, tmp_path):
     path = tmp_path / 'model.npz'
     network.save(path)
-    again = Network.load(path)
+    loaded = Network.load(path)
     for field in dataclasses.fields(Network):
-        np.testing.assert_array_equal(getattr(again, field.name), getattr(network, field.name))
+        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(network, field.name))
     assert [p.name for p in tmp_path.iterdir()] == ['model.npz']
 
 
-def test_a_write_that_fails_keeps_the_old_file(network, tmp_path, monkeypatch):
+def test_the_keys_of_the_file_do_not_change(network, tmp_path):
+    """Files of format 1 remain readable when a field has another name."""
+    path = tmp_path / 'model.npz'
+    network.save(path)
+    with np.load(path) as file:
+        assert file.files == ['input_mean', 'input_scale', 'w_in', 'b_in', 'w_out', 'b_out',
+                              'center', 'covariance', 'loudest', 'about']
+        assert file['loudest'] == network.max_energy
+
+
+def test_a_failed_write_keeps_the_old_file(network, tmp_path, monkeypatch):
     path = tmp_path / 'model.npz'
     path.write_text('old')
 
@@ -56,9 +66,9 @@ def test_a_write_that_fails_keeps_the_old_file(network, tmp_path, monkeypatch):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def damaged(path, place):
+def flip_bit(path, share):
     content = bytearray(path.read_bytes())
-    content[int(place * len(content))] ^= 1
+    content[int(share * len(content))] ^= 1
     path.write_bytes(content)
 
 
@@ -77,8 +87,8 @@ def bytes_of(array):
     lambda path: path.write_bytes(bytes_of(np.zeros(3))),
     lambda path: np.savez(path, about=np.array([{}], object)),
     lambda path: (path.unlink(), path.mkdir()),
-], ids=['missing', 'empty', 'text', 'truncated', 'others', 'array', 'pickle', 'folder'])
-def test_what_is_no_model_is_an_error_that_names_the_file(network, tmp_path, damage):
+], ids=['missing', 'empty', 'text', 'truncated', 'other arrays', 'array', 'pickle', 'folder'])
+def test_the_error_for_an_invalid_file_names_it(network, tmp_path, damage):
     path = tmp_path / 'model.npz'
     network.save(path)
     damage(path)
@@ -86,24 +96,24 @@ def test_what_is_no_model_is_an_error_that_names_the_file(network, tmp_path, dam
         Network.load(path)
 
 
-@pytest.mark.parametrize('place', np.linspace(0.02, 0.98, 25))
-def test_a_changed_byte_is_an_error_or_changes_nothing(network, tmp_path, place):
+@pytest.mark.parametrize('share', np.linspace(0.02, 0.98, 25))
+def test_a_flipped_bit_is_an_error_or_has_no_effect(network, tmp_path, share):
     path = tmp_path / 'model.npz'
     network.save(path)
-    damaged(path, place)
+    flip_bit(path, share)
     try:
-        again = Network.load(path)
+        loaded = Network.load(path)
     except ModelError:
         return
     for field in dataclasses.fields(Network):
-        np.testing.assert_array_equal(getattr(again, field.name), getattr(network, field.name))
+        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(network, field.name))
 
 
-@pytest.mark.parametrize(('field', 'value', 'words'), [
+@pytest.mark.parametrize(('field', 'value', 'message'), [
     ('b_in', np.zeros(4), r'b_in: shape \(4,\), expected \(5,\)'),
     ('w_in', np.zeros(8), 'expected'),
     ('w_out', np.zeros((5, 2)), r'w_out: shape \(5, 2\), expected \(5, 3\)'),
     ('center', np.array([0, np.nan, 0]), 'center: not finite')])
-def test_arrays_that_contradict_each_other_are_errors(network, field, value, words):
-    with pytest.raises(ModelError, match=words):
+def test_inconsistent_arrays_are_errors(network, field, value, message):
+    with pytest.raises(ModelError, match=message):
         dataclasses.replace(network, **{field: value})

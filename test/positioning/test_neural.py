@@ -25,7 +25,7 @@ PAIRS = 6000
 
 @pytest.fixture(scope='module')
 def scenario() -> Scenario:
-    """A region so small that there is but one range, and strong signals: soon learnt."""
+    """A region with nearly one range, and strong signals, which is quick to learn."""
     return Scenario(n_subbands=2, n_frames=4, elements_per_side=4, angular_spread_deg=2.0,
                     roi_center_m=(3, 0, 0), roi_size_m=(0.1, 1, 0.5))
 
@@ -37,7 +37,7 @@ def codebook(scenario, random_beams):
 
 @pytest.fixture(scope='module')
 def training(scenario, codebook):
-    """A trained network, and what was told meanwhile."""
+    """A trained network, and the epochs that were reported."""
     epochs = []
     network = train(scenario, codebook, PAIRS, 1, 32, 30, epochs.append)
     return network, epochs
@@ -49,12 +49,12 @@ def mse(network, scenario, codebook, first, n):
     return np.mean(np.sum((estimate.mean - positions)[estimate.fix]**2, axis=1))
 
 
-def test_it_learns_the_positions(scenario, codebook, training):
+def test_training_reduces_the_error(scenario, codebook, training):
     network, epochs = training
     spread = np.sum(np.array(scenario.roi_size_m)**2) / 12
-    fresh = mse(network, scenario, codebook, PAIRS, 2000)
-    assert fresh < 0.25 * spread
-    assert network.about['test_mse_m2'] == pytest.approx(fresh, rel=0.25)
+    error = mse(network, scenario, codebook, PAIRS, 2000)
+    assert error < 0.25 * spread
+    assert network.about['test_mse_m2'] == pytest.approx(error, rel=0.25)
     assert [epoch.number for epoch in epochs] == list(range(1, len(epochs) + 1))
     assert epochs[-1].validation_mse_m2 < 0.5 * epochs[0].validation_mse_m2
 
@@ -75,7 +75,7 @@ def test_the_pairs_are_split_7_to_1_5_to_1_5(scenario, codebook, training):
     assert about['validation_mse_m2'] == best.validation_mse_m2 == epochs[-1].best_mse_m2
 
 
-def test_the_covariance_is_that_of_the_validation_residuals(scenario, codebook, training):
+def test_the_covariance_matches_the_validation_residuals(scenario, codebook, training):
     first, n = int(0.7 * PAIRS), int(0.85 * PAIRS) - int(0.7 * PAIRS)
     positions, received = simulate_pairs(scenario, codebook, n, 1, first)
     estimate = make_estimator(
@@ -86,10 +86,10 @@ def test_the_covariance_is_that_of_the_validation_residuals(scenario, codebook, 
     assert (estimate.covariance == estimate.covariance[0]).all()
 
 
-def test_a_seed_gives_the_same_network_again_and_another_one_another(scenario, codebook):
-    first, again, other = (train(scenario, codebook, 600, seed, 8, 2) for seed in (4, 4, 5))
-    np.testing.assert_array_equal(first.w_in, again.w_in)
-    np.testing.assert_array_equal(first.w_out, again.w_out)
+def test_networks_are_reproducible_by_their_seed(scenario, codebook):
+    first, same, other = (train(scenario, codebook, 600, seed, 8, 2) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(first.w_in, same.w_in)
+    np.testing.assert_array_equal(first.w_out, same.w_out)
     assert not np.isclose(first.w_in, other.w_in).all()
 
 
@@ -99,51 +99,51 @@ def test_training_stops_when_the_validation_error_does_not_fall(scenario, codebo
     assert network.about['epochs'] + 4 <= len(epochs) < 2000
 
 
-def test_one_phase_gives_the_same_as_in_a_batch(scenario, codebook, training):
+def test_a_single_phase_gives_the_same_as_in_a_batch(scenario, codebook, training):
     received = simulate_pairs(scenario, codebook, 20, 9)[1]
     estimator = NeuralEstimator(scenario, codebook, training[0])
-    batch, alone = estimator.estimate(received), estimator.estimate(received[7])
-    np.testing.assert_allclose(alone.mean, batch.mean[7], rtol=1e-12)
-    assert alone.mean.shape == (3,)
-    assert alone.covariance.shape == (3, 3)
-    assert (alone.reason, alone.fix) == ('', True)
+    batch, single = estimator.estimate(received), estimator.estimate(received[7])
+    np.testing.assert_allclose(single.mean, batch.mean[7], rtol=1e-12)
+    assert single.mean.shape == (3,)
+    assert single.covariance.shape == (3, 3)
+    assert (single.reason, single.fix) == ('', True)
 
 
-@pytest.mark.parametrize(('factor', 'words'), [
+@pytest.mark.parametrize(('factor', 'message'), [
     (0.0, 'expected at least'), (1e-3, 'expected at least'), (100.0, 'expected at most')])
-def test_signals_without_use_give_no_fix(scenario, codebook, training, factor, words):
+def test_signals_too_weak_or_too_strong_give_no_fix(scenario, codebook, training, factor, message):
     received = factor * simulate_pairs(scenario, codebook, 5, 9)[1]
     estimate = NeuralEstimator(scenario, codebook, training[0]).estimate(received)
     assert not estimate.fix.any()
     assert np.isnan(estimate.mean).all()
     assert np.isnan(estimate.covariance).all()
-    assert all(words in reason for reason in estimate.reason)
+    assert all(message in reason for reason in estimate.reason)
 
 
-def test_all_good_signals_are_located(scenario, codebook, training):
+def test_all_valid_signals_are_located(scenario, codebook, training):
     received = simulate_pairs(scenario, codebook, 2000, 9)[1]
     assert NeuralEstimator(scenario, codebook, training[0]).estimate(received).fix.all()
 
 
 @pytest.mark.parametrize(
     'signals', [np.zeros((2, 9)), np.full((2, 8), np.nan)], ids=['shape', 'nan'])
-def test_signals_that_are_none_are_errors(scenario, codebook, training, signals):
+def test_invalid_signals_are_errors(scenario, codebook, training, signals):
     with pytest.raises(SignalError, match='^received: '):
         NeuralEstimator(scenario, codebook, training[0]).estimate(signals)
 
 
-def test_a_model_of_something_else_is_refused(
+def test_a_model_of_another_purpose_is_refused(
         scenario, codebook, training, random_beams, tmp_path):
     network = training[0]
     other = random_beams(scenario, np.random.default_rng(1))
     network.save(tmp_path / 'model.npz')
-    for model, words in ((network, '^model: trained for codebook'),
-                         (tmp_path / 'model.npz', 'model.npz: trained for codebook')):
-        with pytest.raises(ModelError, match=f'{words} {codebook.id}, expected {other.id}'):
+    for model, message in ((network, '^model: trained for codebook'),
+                           (tmp_path / 'model.npz', 'model.npz: trained for codebook')):
+        with pytest.raises(ModelError, match=f'{message} {codebook.id}, expected {other.id}'):
             make_estimator('neural', scenario, other, model_file=model)
-    louder = dataclasses.replace(scenario, noise_psd_dbm_hz=-160.0)
+    noisier = dataclasses.replace(scenario, noise_psd_dbm_hz=-160.0)
     with pytest.raises(ModelError, match='trained for the scenario .*expected .*-160'):
-        make_estimator('neural', louder, codebook, model_file=network)
+        make_estimator('neural', noisier, codebook, model_file=network)
     short = Network(network.input_mean[1:], network.input_scale[1:], network.w_in[1:],
                     *(getattr(network, f.name) for f in dataclasses.fields(network)[3:]))
     with pytest.raises(ModelError, match='31 inputs, expected 32'):
@@ -152,15 +152,15 @@ def test_a_model_of_something_else_is_refused(
         make_estimator('neural', scenario, codebook)
 
 
-@pytest.mark.parametrize(('options', 'words'), [
+@pytest.mark.parametrize(('options', 'message'), [
     ({'n_pairs': 19}, 'n_pairs: 19, expected at least 20'),
     ({'n_hidden': 0}, 'n_hidden: 0'), ({'max_epochs': 0}, 'max_epochs: 0')])
-def test_numbers_that_are_too_small_are_errors(scenario, codebook, options, words):
-    with pytest.raises(ValueError, match=words):
+def test_numbers_below_the_minimum_are_errors(scenario, codebook, options, message):
+    with pytest.raises(ValueError, match=message):
         train(scenario, codebook, **options)
 
 
-def test_without_scikit_learn_training_says_what_is_missing(scenario, codebook, monkeypatch):
+def test_training_without_scikit_learn_is_an_error_that_names_it(scenario, codebook, monkeypatch):
     for name in [name for name in sys.modules if name.partition('.')[0] == 'sklearn']:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'sklearn', None)
@@ -175,7 +175,7 @@ def files(tmp_path, scenario, codebook):
     return tmp_path
 
 
-def test_the_command_writes_what_the_library_trains(files, scenario, codebook, capsys):
+def test_the_command_writes_the_network_that_train_returns(files, scenario, codebook, capsys):
     arguments = ['--codebook', files / 'codebook.yaml', '--scenario', files / 'scenario.yaml',
                  '--pairs', 600, '--hidden', 8, '--epochs', 2, '--seed', 4, '--output',
                  files / 'model.npz']
@@ -189,15 +189,15 @@ def test_the_command_writes_what_the_library_trains(files, scenario, codebook, c
     assert 'epoch 2' in err
 
 
-@pytest.mark.parametrize(('arguments', 'words'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     (['--codebook', 'no.yaml'], 'no.yaml'),
     (['--codebook', 'codebook.yaml', '--scenario', 'scenario.yaml', '--pairs', '3'], 'n_pairs'),
     (['--codebook', 'codebook.yaml'], 'analog: shape'),
     (['--codebook', 'codebook.yaml', '--output', 'no/model.npz'], 'no/model.npz: expected')])
-def test_the_command_says_what_is_wrong(files, monkeypatch, capsys, arguments, words):
+def test_the_command_reports_errors(files, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(files)
     assert main([*arguments, '--quiet']) == 2
     err = capsys.readouterr().err
     assert err.startswith('error: ')
-    assert words in err
+    assert message in err
     assert not (files / 'model.npz').exists()

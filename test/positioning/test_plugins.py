@@ -1,4 +1,4 @@
-"""Estimators of other packages."""
+"""Estimators from other packages."""
 
 import re
 from pathlib import Path
@@ -23,7 +23,7 @@ class Centre:
     def estimate(self, received):
         return self._estimate
 
-def nothing(scenario, codebook):
+def no_estimator(scenario, codebook):
     return None
 
 class Nameless(Centre):
@@ -35,12 +35,12 @@ bayes = Centre
 
 @pytest.fixture(autouse=True)
 def installed(install):
-    names = {'centre': 'Centre', 'nothing': 'nothing', 'nameless': 'Nameless', 'bayes': 'Centre',
-             'absent': 'Absent'}
+    names = {'centre': 'Centre', 'no_estimator': 'no_estimator', 'nameless': 'Nameless',
+             'bayes': 'Centre', 'absent': 'Absent'}
     install('guesses', CODE, {plugins.ESTIMATORS: names})
 
 
-def test_a_plug_in_is_made_by_its_name(small):
+def test_a_plug_in_is_created_by_its_name(small):
     estimator = make_estimator('centre', small.scenario, small.codebook)
     estimate = estimator.estimate(np.zeros((1, 6)))
     assert isinstance(estimate, Estimate)
@@ -50,26 +50,27 @@ def test_a_plug_in_is_made_by_its_name(small):
         doubled.estimate(np.zeros((1, 6))).mean, 2 * np.array(small.scenario.roi_center_m))
 
 
-def test_the_built_in_ones_cannot_be_replaced(small):
+def test_built_in_estimators_cannot_be_replaced(small):
     assert type(make_estimator('bayes', small.scenario, small.codebook)).__module__.startswith(
         'rhs_isac_ros.')
 
 
-def test_an_unknown_name_lists_all_that_are_there(small):
+def test_the_error_for_an_unknown_name_lists_all_estimators(small):
     with pytest.raises(ValueError, match=re.escape(
             "estimator: 'best', expected one of ['absent', 'bayes', 'centre', 'ml', 'nameless', "
-            "'neural', 'nothing']")):
+            "'neural', 'no_estimator']")):
         make_estimator('best', small.scenario, small.codebook)
 
 
-@pytest.mark.parametrize(('name', 'options', 'words'), [
+@pytest.mark.parametrize(('name', 'options', 'message'), [
     ('absent', {}, 'absent = guesses:Absent of guesses: cannot be loaded: AttributeError'),
-    ('nothing', {}, 'nothing = guesses:nothing of guesses: made None, expected an estimator'),
+    ('no_estimator', {},
+     'no_estimator = guesses:no_estimator of guesses: made None, expected an estimator'),
     ('nameless', {}, r'nameless = guesses:Nameless of guesses: made <.*>, expected an estimator'),
     ('centre', {'table': 1}, 'centre = guesses:Centre of guesses: failed: TypeError: .*table'),
 ])
-def test_what_is_no_estimator_is_named(small, name, options, words):
-    with pytest.raises(PluginError, match=f'entry point {plugins.ESTIMATORS}: {words}'):
+def test_the_error_for_an_invalid_plug_in_names_its_entry_point(small, name, options, message):
+    with pytest.raises(PluginError, match=f'entry point {plugins.ESTIMATORS}: {message}'):
         make_estimator(name, small.scenario, small.codebook, **options)
 
 
@@ -78,5 +79,5 @@ def test_what_is_no_estimator_is_named(small, name, options, words):
     ('ml', '', {'table_folder': Path('t')}), ('neural', '', {'model_file': ''}),
     ('neural', 'm', {'model_file': 'm'}), ('centre', '', {}),
     ('centre', 'm', {'model_file': 'm'})])
-def test_each_gets_the_files_that_it_can_use(name, model, options):
+def test_file_options_depend_on_the_estimator(name, model, options):
     assert file_options(name, Path('t'), model) == options

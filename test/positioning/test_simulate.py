@@ -1,4 +1,4 @@
-"""Pairs of positions and signals."""
+"""Simulated pairs of positions and signals."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def setting(random_beams):
     return scenario, random_beams(scenario, np.random.default_rng(0))
 
 
-def test_a_seed_stands_for_one_sequence_however_it_is_cut(setting):
+def test_a_sequence_is_the_same_however_it_is_divided(setting):
     positions, received = simulate_pairs(*setting, 1500, 3)
     for size in (1, 400, 512, 700):
         parts = [simulate_pairs(*setting, min(size, 1500 - first), 3, first)
@@ -24,21 +24,21 @@ def test_a_seed_stands_for_one_sequence_however_it_is_cut(setting):
             assert part.tobytes() == whole[:len(part)].tobytes()
 
 
-def test_pairs_are_the_same_in_later_versions(setting):
-    """What a seed means may not change: the first draws of NumPy's generator say what it is."""
+def test_pairs_do_not_change_between_versions(setting):
+    """The expected positions are the first draws of NumPy's generator."""
     scenario = setting[0]
     rng = np.random.default_rng([11, 10, 0])
     expected = rng.uniform(*scenario.roi_bounds_m, (512, 3))
     np.testing.assert_array_equal(simulate_pairs(*setting, 5, 11)[0], expected[:5])
 
 
-def test_seeds_and_chunks_differ(setting):
+def test_seeds_and_chunks_give_different_pairs(setting):
     first, second = simulate_pairs(*setting, 1024, 0)[0], simulate_pairs(*setting, 1024, 1)[0]
     assert len(np.unique(np.concatenate([first, second]), axis=0)) == 2048
 
 
 def test_signals_have_the_distribution_of_eq_8(setting):
-    """Noise and multipath against those that `simulate_received` draws element by element."""
+    """The reference is `simulate_received`, which draws multipath element by element."""
     positions, received = simulate_pairs(*setting, 20_000, 0)
     scattered = received - mean_received(*setting, positions)
     fixed = np.tile(positions[:1], (20_000, 1))
@@ -50,13 +50,13 @@ def test_signals_have_the_distribution_of_eq_8(setting):
         moments.append((flat.T @ flat.conj() / len(flat), flat.T @ flat / len(flat),
                         flat.mean(axis=0)))
     scale = np.sqrt(np.diag(moments[1][0]).real)
-    for own, expected in zip(*moments, strict=True):
-        unit = np.multiply.outer(scale, scale) if own.ndim == 2 else scale
-        # Twice the 1 / sqrt(20 000) of either side, times five.
-        assert np.abs((own - expected) / unit).max() < 0.05
+    for found, expected in zip(*moments, strict=True):
+        unit = np.multiply.outer(scale, scale) if found.ndim == 2 else scale
+        # Five standard deviations of a difference: 1 / sqrt(20 000) on either side.
+        assert np.abs((found - expected) / unit).max() < 0.05
 
 
-def test_positions_fill_the_region(setting):
+def test_positions_are_uniform_in_the_region(setting):
     low, high = setting[0].roi_bounds_m
     unit = (simulate_pairs(*setting, 20_000, 0)[0] - low) / (high - low)
     assert unit.min() > 0
@@ -65,14 +65,14 @@ def test_positions_fill_the_region(setting):
     np.testing.assert_allclose(np.cov(unit.T), np.eye(3) / 12, atol=0.003)
 
 
-@pytest.mark.parametrize(('arguments', 'words'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     ((-1, 0), 'n: -1, expected 0 or more'), ((1, -2), 'seed: -2'), ((1, 0, -3), 'first: -3')])
-def test_negative_numbers_are_errors(setting, arguments, words):
-    with pytest.raises(ValueError, match=words):
+def test_negative_numbers_are_errors(setting, arguments, message):
+    with pytest.raises(ValueError, match=message):
         simulate_pairs(*setting, *arguments)
 
 
-def test_no_pairs_and_a_codebook_that_does_not_fit(setting, small):
+def test_no_pairs_are_empty_and_another_codebook_is_an_error(setting, small):
     positions, received = simulate_pairs(*setting, 0, 0)
     assert (positions.shape, received.shape) == ((0, 3), (0, 2, 4))
     with pytest.raises(CodebookError):

@@ -24,13 +24,13 @@ def model(scenario, random_beams) -> WhitenedModel:
 
 
 @pytest.fixture
-def built(monkeypatch):
-    """Ids of the codebooks that tables were built for."""
-    ids, build = [], templates.tabulate
+def computed(monkeypatch):
+    """Ids of the codebooks for which tables were computed."""
+    ids, original = [], templates.tabulate
 
     def tabulate(model):
         ids.append(model.codebook.id)
-        return build(model)
+        return original(model)
     monkeypatch.setattr(templates, 'tabulate', tabulate)
     return ids
 
@@ -48,24 +48,24 @@ def assert_same(table, model):
         np.testing.assert_array_equal(table[name], array)
 
 
-def test_a_table_is_built_once_then_mapped(tmp_path, model, built):
+def test_a_table_is_computed_once_and_then_mapped(tmp_path, model, computed):
     for _ in range(3):
-        table = store.table_of(model, tmp_path / 'new' / 'folder')
+        table = store.load_table(model, tmp_path / 'new' / 'folder')
         for array in table.values():
             assert array.flags.aligned
             assert not array.flags.writeable
             while not isinstance(array, np.memmap):
                 array = array.base
-    assert built == [model.codebook.id]
+    assert computed == [model.codebook.id]
     assert_same(table, model)
     assert only_file(tmp_path / 'new' / 'folder').name == f'table-{store.table_key(model)}.npy'
 
 
-def test_without_a_folder_nothing_is_kept(tmp_path, model, built, monkeypatch):
+def test_without_a_folder_no_table_is_kept(tmp_path, model, computed, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    store.table_of(model)
-    store.table_of(model)
-    assert len(built) == 2
+    store.load_table(model)
+    store.load_table(model)
+    assert len(computed) == 2
     assert not list(tmp_path.iterdir())
 
 
@@ -73,16 +73,16 @@ def truncate(path):
     os.truncate(path, path.stat().st_size * 2 // 3)
 
 
-def flip(place):
+def flip_bit(share):
     def damage(path):
         content = bytearray(path.read_bytes())
-        content[int(place * len(content))] ^= 1
+        content[int(share * len(content))] ^= 1
         path.write_bytes(content)
     return damage
 
 
 @pytest.mark.parametrize('damage', [
-    truncate, flip(0), flip(0.002), flip(0.5), flip(0.999),
+    truncate, flip_bit(0), flip_bit(0.002), flip_bit(0.5), flip_bit(0.999),
     lambda path: path.write_bytes(b''),
     lambda path: path.write_bytes(b'no table'),
     lambda path: np.save(path, np.zeros(7)),
@@ -90,28 +90,27 @@ def flip(place):
     lambda path: (path.unlink(), path.mkdir()),
 ], ids=['truncated', 'magic', 'header', 'middle', 'end', 'empty', 'text', 'array', 'pickle',
         'folder'])
-def test_a_damaged_file_is_built_again(tmp_path, model, built, damage, recwarn):
-    store.table_of(model, tmp_path)
+def test_a_damaged_table_is_computed_again(tmp_path, model, computed, damage, recwarn):
+    store.load_table(model, tmp_path)
     damage(only_file(tmp_path))
-    assert_same(store.table_of(model, tmp_path), model)
-    assert built[:2] == [model.codebook.id] * 2
+    assert_same(store.load_table(model, tmp_path), model)
+    assert computed[:2] == [model.codebook.id] * 2
 
 
-def test_a_table_of_another_codebook_or_scenario_is_not_used(
-        tmp_path, scenario, model, built, random_beams):
-    """Also under the wrong name."""
+def test_a_table_of_another_codebook_or_scenario_is_not_used_under_a_wrong_name(
+        tmp_path, scenario, model, computed, random_beams):
     others = [WhitenedModel(scenario, random_beams(scenario, np.random.default_rng(1))),
               WhitenedModel(Scenario(**scenario.changes() | {'noise_psd_dbm_hz': -170.0}),
                             model.codebook)]
-    store.table_of(model, tmp_path)
+    store.load_table(model, tmp_path)
     first = only_file(tmp_path)
     for other in others:
         shutil.copy(first, tmp_path / f'table-{store.table_key(other)}.npy')
-        assert_same(store.table_of(other, tmp_path), other)
+        assert_same(store.load_table(other, tmp_path), other)
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_an_estimator_with_a_table_from_disk_gives_the_very_same(tmp_path, scenario, model):
+def test_estimates_with_a_table_from_disk_are_identical(tmp_path, scenario, model):
     received = simulate_pairs(scenario, model.codebook, 10, 0)[1]
     estimates = [
         make_estimator('bayes', scenario, model.codebook, **options).estimate(received)
@@ -121,29 +120,29 @@ def test_an_estimator_with_a_table_from_disk_gives_the_very_same(tmp_path, scena
         np.testing.assert_array_equal(other.covariance, estimates[0].covariance)
 
 
-def test_a_folder_that_cannot_be_written_costs_a_warning_only(tmp_path, model):
+def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, model):
     (tmp_path / 'file').write_text('')
     with pytest.warns(RuntimeWarning, match='the table is not kept: .*file'):
-        assert_same(store.table_of(model, tmp_path / 'file'), model)
+        assert_same(store.load_table(model, tmp_path / 'file'), model)
 
 
-def test_a_write_that_fails_leaves_nothing(tmp_path, model, monkeypatch):
+def test_a_failed_write_leaves_no_file(tmp_path, model, monkeypatch):
     def replace(source, target):
         raise OSError('disk full')
     monkeypatch.setattr(os, 'replace', replace)
     with pytest.warns(RuntimeWarning, match='disk full'):
-        store.table_of(model, tmp_path)
+        store.load_table(model, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_oldest_tables_go(tmp_path, model, monkeypatch):
-    monkeypatch.setattr(store, '_MOST', 3)
+def test_the_oldest_tables_are_deleted(tmp_path, model, monkeypatch):
+    monkeypatch.setattr(store, '_MAX_TABLES', 3)
     names = [f'table-{n}.npy' for n in range(4)]
     for age, name in enumerate(names):
         (tmp_path / name).write_text('')
         os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
     (tmp_path / 'other.npy').write_text('')
-    store.table_of(model, tmp_path)
+    store.load_table(model, tmp_path)
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {*names[:2], f'table-{store.table_key(model)}.npy', 'other.npy'}
 
@@ -151,7 +150,7 @@ def test_the_oldest_tables_go(tmp_path, model, monkeypatch):
 @pytest.mark.parametrize(('variable', 'expected'), [
     ('/some/cache', '/some/cache/rhs_isac_ros'), ('', '/me/.cache/rhs_isac_ros'),
     ('relative', '/me/.cache/rhs_isac_ros')])
-def test_default_folder_follows_the_convention(monkeypatch, variable, expected):
+def test_default_folder_follows_the_xdg_convention(monkeypatch, variable, expected):
     monkeypatch.setenv('HOME', '/me')
     monkeypatch.setenv('XDG_CACHE_HOME', variable)
     assert store.default_folder() == Path(expected)

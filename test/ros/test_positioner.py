@@ -119,7 +119,7 @@ def test_without_a_fix_it_says_so(bench, node, send, codebooks):
     assert [message.cycle_id for message in told] == [1, 2]
     assert [message.cycle_id for message in estimates] == [3]
     assert 'energy' in told[0].reason
-    assert 'misfit' in told[1].reason
+    assert 'residual' in told[1].reason
 
 
 class TestNeural:

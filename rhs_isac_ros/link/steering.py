@@ -1,0 +1,117 @@
+"""Steering: the beam of the highest capacity at a position, and the choice of its band."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from rhs_isac_ros.link.ascent import ascend
+from rhs_isac_ros.link.band_link import BandLink
+from rhs_isac_ros.link.capacity import Beam, capacity, expected_capacity
+from rhs_isac_ros.link.search import candidate_configurations
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.surface import matched_configuration
+
+# Number of candidates to compare over all sub-bands and modes, and of ascents.
+_N_CANDIDATES = 8
+_N_ASCENTS = 4
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Choice:
+    """A beam, and its capacity averaged over the posterior of the position [bit/s]."""
+
+    beam: Beam
+    expected_bps: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Capacities of the beam in use and of the beam chosen with the true position [bit/s]."""
+
+    actual_bps: float
+    perfect_bps: float
+
+    @property
+    def loss_bps(self) -> float:
+        """Capacity lost to the positioning error [bit/s]."""
+        return self.perfect_bps - self.actual_bps
+
+    @property
+    def loss_percent(self) -> float:
+        """The loss in per cent of `perfect_bps`; NaN if that is 0."""
+        return 100 * self.loss_bps / self.perfect_bps if self.perfect_bps else math.nan
+
+
+def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
+    """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
+
+    A search from many starts proposes configurations. The best few among these and the matched
+    filter are then improved together with the digital part, so that the beam is never worse than
+    the matched filter. It has the power P_max over all sub-bands. The same position always
+    gives the same beam. Bands are counted from 0.
+
+    Raises
+    ------
+    ValueError
+        If the position is not a finite [3] array, or the band is out of range.
+    """
+    if not 0 <= band < scenario.n_bands:
+        raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
+    link = BandLink.to(scenario, position, band)
+    starts = [matched_configuration(link.los, link.onboard),
+              *candidate_configurations(link, _N_CANDIDATES)]
+    starts.sort(key=link.best_rate, reverse=True)
+    ends = [ascend(link, start) for start in starts[:_N_ASCENTS]]
+    return Beam(*max(ends, key=lambda end: link.best_rate(end[0])), band)
+
+
+def choose_beam(
+        scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
+        bands: Sequence[int] | None = None) -> Choice:
+    """Steer each band to the mean of a position and choose the highest expected capacity.
+
+    The capacity at the mean alone would mislead: a band with a stronger but narrower beam may
+    lose more to the positioning error than it gains without one. Of equal bands, the first is
+    chosen.
+
+    Parameters
+    ----------
+    mean
+        Float64 [3] [m].
+    covariance
+        Float64 [3, 3] [m^2]; None if the position is known exactly.
+    bands
+        Bands to choose from, counted from 0; None for all.
+
+    Raises
+    ------
+    ValueError
+        If mean or covariance have another shape or are not finite, or a band is out of range.
+    """
+    covariance = np.zeros((3, 3)) if covariance is None else covariance
+    choices = []
+    for band in range(scenario.n_bands) if bands is None else bands:
+        beam = steer(scenario, mean, band)
+        choices.append(Choice(beam, expected_capacity(scenario, beam, mean, covariance)))
+    return max(choices, key=lambda choice: choice.expected_bps)
+
+
+def outcome(
+        scenario: Scenario, beam: Beam, position: np.ndarray,
+        bands: Sequence[int] | None = None) -> Outcome:
+    """Compare a beam with the one chosen with the true position, float64 [3] [m].
+
+    The latter is chosen from `bands`, as in `choose_beam`. The search for a beam ends slightly
+    below the maximum, so that the loss with an accurate estimate may be negative, by a few
+    hundredths of a per cent at most.
+
+    Raises
+    ------
+    ValueError
+        If the position is not a finite [3] array, or the beam does not fit the scenario.
+    """
+    perfect = choose_beam(scenario, position, bands=bands)
+    actual = capacity(scenario, beam, np.asarray(position, dtype=float)[None])[0]
+    return Outcome(float(actual), perfect.expected_bps)

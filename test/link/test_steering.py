@@ -1,0 +1,262 @@
+"""Steering: constraints and quality of the beam, the choice of the band, and the loss."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.link import (
+    Beam,
+    Outcome,
+    capacity,
+    choose_beam,
+    expected_capacity,
+    outcome,
+    steer,
+)
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
+
+POSITION = np.array([9.0, 1.5, -0.4])
+
+
+@pytest.fixture(scope='module')
+def positions(table1):
+    """Random positions and two corners of Table I's region."""
+    scenario = table1.scenario
+    return [*scenario.sample_positions(4, np.random.default_rng(0)), *scenario.roi_bounds_m]
+
+
+def rate(scenario, beam, position):
+    return capacity(scenario, beam, np.asarray(position)[None])[0]
+
+
+def assert_valid(scenario, beam, band=0):
+    assert beam.band == band
+    assert beam.analog.shape == (scenario.n_elements,)
+    assert beam.digital.shape == (scenario.n_subbands, scenario.n_feeds)
+    assert beam.analog.min() >= 0
+    assert beam.analog.max() <= 1
+    assert np.sum(np.abs(beam.digital)**2) == pytest.approx(scenario.max_power_w, rel=1e-9)
+
+
+@pytest.mark.parametrize('band', [0, 1])
+def test_beams_satisfy_the_constraints(table1, positions, band):
+    for position in positions:
+        assert_valid(table1.scenario, steer(table1.scenario, position, band), band)
+
+
+def test_the_same_position_gives_the_same_beam(table1, positions):
+    a, b = (steer(table1.scenario, positions[0]) for _ in range(2))
+    np.testing.assert_array_equal(a.analog, b.analog)
+    np.testing.assert_array_equal(a.digital, b.digital)
+
+
+@pytest.mark.parametrize('band', [0, 1])
+def test_beams_are_never_worse_than_the_matched_filter(table1, positions, reference_link, band):
+    scenario, link = table1.scenario, reference_link(table1, band)
+    gained = []
+    for position in positions:
+        los = los_gain(scenario, np.array([position]), band)[0]
+        matched = matched_configuration(los, onboard_matrix(scenario)[band])
+        start = rate(scenario, link.best_beam(matched, position), position)
+        gained.append(rate(scenario, steer(scenario, position, band), position) / start - 1)
+    assert min(gained) >= -1e-12
+    assert max(gained) > 0.001
+
+
+def test_a_beam_of_a_small_surface_is_close_to_the_optimum(small, reference_link):
+    """The optimum is a corner of the box; water-filling divides the power evenly here."""
+    scenario, link = small.scenario, reference_link(small)
+    corners = (np.arange(1, 2**16)[:, None] >> np.arange(16) & 1).astype(float)
+    for position in scenario.sample_positions(3, np.random.default_rng(4)):
+        rates = 0
+        for onboard, los in zip(link.onboard, link.los(position), strict=True):
+            configured = onboard * corners[:, None]
+            direct = configured @ los
+            channels = direct[:, :, None] * direct[:, None].conj()
+            channels += configured @ link.spatial @ np.swapaxes(configured.conj(), 1, 2)
+            shares = scenario.max_power_w / scenario.n_subbands / link.noise
+            rates = rates + np.log2(1 + np.linalg.eigvalsh(channels)[:, -1] * shares)
+        best = rate(scenario, link.best_beam(corners[rates.argmax()], position), position)
+        found = rate(scenario, steer(scenario, position), position)
+        assert 0.999 * best < found <= best * (1 + 1e-9)
+
+
+def test_beams_are_better_than_a_random_search(table1, reference_link):
+    scenario, link, rng = table1.scenario, reference_link(table1), np.random.default_rng(2)
+    position = np.array([9.0, -2.0, 0.3])
+    found = rate(scenario, steer(scenario, position), position)
+    for n in range(60):
+        analog = rng.uniform(size=100)
+        analog = np.round(analog) if n % 2 else analog
+        assert rate(scenario, link.best_beam(analog, position), position) < found
+
+
+def test_random_changes_of_the_digital_part_do_not_gain(small, reference_link):
+    scenario, rng = small.scenario, np.random.default_rng(3)
+    position = np.array([7.0, 3.0, -0.5])
+    beam = steer(scenario, position)
+    found = rate(scenario, beam, position)
+    best = reference_link(small).best_beam(beam.analog, position)
+    assert found == pytest.approx(rate(scenario, best, position), rel=1e-12)
+    for _ in range(300):
+        digital = beam.digital + 10**rng.uniform(-4, -1) * (rng.normal(size=(3, 2, 2)) @ [1, 1j])
+        digital *= np.sqrt(scenario.max_power_w / np.sum(np.abs(digital)**2))
+        assert rate(scenario, Beam(beam.analog, digital), position) <= found * (1 + 1e-12)
+
+
+def test_low_power_goes_to_the_best_sub_bands():
+    """The sub-bands differ, and the power is too low for an even division."""
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9,), n_subbands=4, subband_width_hz=4e8, n_feeds=2,
+        elements_per_side=4, max_power_w=5e-9)
+    position = np.array([7.0, 3.0, -0.5])
+    beam = steer(scenario, position)
+    shares = np.sum(np.abs(beam.digital)**2, axis=1)
+    assert shares.sum() == pytest.approx(scenario.max_power_w)
+    assert shares.max() > 2 * shares.min()
+    scale = np.sqrt(scenario.max_power_w / 4 / np.maximum(shares, 1e-30))
+    even = Beam(beam.analog, beam.digital * scale[:, None])
+    assert rate(scenario, beam, position) > 1.01 * rate(scenario, even, position)
+
+
+def test_the_configuration_is_a_local_maximum(small):
+    scenario, position = small.scenario, np.array([7.0, 3.0, -0.5])
+    beam = steer(scenario, position)
+    found = rate(scenario, beam, position)
+    for m in range(16):
+        analog = beam.analog.copy()
+        analog[m] += 1e-3 if analog[m] < 0.5 else -1e-3
+        assert rate(scenario, Beam(analog, beam.digital), position) <= found
+
+
+def test_steering_to_the_true_position_is_better_than_five_metres_away(table1, positions):
+    scenario = table1.scenario
+    for position in positions:
+        away = position + (np.array([0, 5.0, 0]) if position[1] < 0 else np.array([0, -5.0, 0]))
+        right, wrong = steer(scenario, position), steer(scenario, away)
+        assert rate(scenario, right, position) > rate(scenario, wrong, position)
+        assert rate(scenario, wrong, away) > rate(scenario, right, away)
+
+
+def test_no_beam_for_a_nearby_position_is_better(table1):
+    """Otherwise the beam for an estimate could exceed that for the true position."""
+    scenario, rng = table1.scenario, np.random.default_rng(4)
+    for position in scenario.sample_positions(20, rng):
+        found = rate(scenario, steer(scenario, position), position)
+        for spread_m in (0.02, 0.2, 1.0):
+            near = position + rng.normal(scale=spread_m, size=3)
+            assert rate(scenario, steer(scenario, near), position) < found * (1 + 5e-4)
+
+
+@pytest.mark.parametrize('position', [
+    (1.0, 2.0), 5.0, [[9.0, 0.0, 0.0]], (9.0, np.nan, 0.0), (9.0, 0.0, -np.inf)])
+def test_steering_to_an_invalid_position_is_an_error(small, position):
+    with pytest.raises(ValueError, match='positions'):
+        steer(small.scenario, position)
+
+
+@pytest.mark.parametrize('band', [-1, 1, 7])
+def test_steering_in_a_band_out_of_range_is_an_error(small, band):
+    with pytest.raises(ValueError, match=f'band: {band}, expected 0 to 0'):
+        steer(small.scenario, (9.0, 0.0, 0.0), band)
+
+
+def test_a_single_feed_and_sub_band_get_all_the_power():
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9,), n_subbands=1, n_feeds=1, elements_per_side=3)
+    beam = steer(scenario, (9.0, 0.0, 0.0))
+    assert_valid(scenario, beam)
+    assert np.abs(beam.digital[0, 0]) == pytest.approx(np.sqrt(scenario.max_power_w))
+
+
+def test_the_choice_is_the_best_band_steered_to_the_mean(table1):
+    scenario, covariance = table1.scenario, np.diag([0.8, 0.1, 0.02])
+    choice = choose_beam(scenario, POSITION, covariance)
+    expected = []
+    for band in range(scenario.n_bands):
+        beam = steer(scenario, POSITION, band)
+        expected.append(expected_capacity(scenario, beam, POSITION, covariance))
+    assert choice.expected_bps == max(expected)
+    assert choice.beam.band == np.argmax(expected)
+    best = steer(scenario, POSITION, choice.beam.band)
+    np.testing.assert_array_equal(choice.beam.analog, best.analog)
+    np.testing.assert_array_equal(choice.beam.digital, best.digital)
+
+
+def test_the_expected_capacity_of_a_known_position_is_its_capacity(table1):
+    choice = choose_beam(table1.scenario, POSITION)
+    assert choice.expected_bps == capacity(table1.scenario, choice.beam, POSITION[None])[0]
+
+
+@pytest.mark.parametrize('band', [0, 1])
+def test_the_choice_is_limited_to_the_given_bands(table1, band):
+    assert choose_beam(table1.scenario, POSITION, np.eye(3), [band]).beam.band == band
+
+
+def test_an_uncertain_position_may_change_the_band():
+    """Two bands are nearly equal: the beam that is best at the mean loses more around it."""
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9, 2.6e9), n_subbands=1, n_feeds=2, elements_per_side=6)
+    mean, covariance = np.array([6.9, 3.6, 0.1]), np.diag([0.25, 4.0, 0.25])
+    at_mean = [capacity(scenario, steer(scenario, mean, band), mean[None])[0] for band in (0, 1)]
+    draws = np.random.default_rng(0).multivariate_normal(mean, covariance, 20000)
+    draws[:, 0] = np.maximum(draws[:, 0], scenario.roi_bounds_m[0][0])
+    averaged = [capacity(scenario, steer(scenario, mean, band), draws).mean() for band in (0, 1)]
+    assert np.argmax(at_mean) != np.argmax(averaged)
+    assert choose_beam(scenario, mean).beam.band == np.argmax(at_mean)
+    assert choose_beam(scenario, mean, covariance).beam.band == np.argmax(averaged)
+
+
+def test_the_first_of_equal_bands_is_chosen(table1):
+    scenario = dataclasses.replace(
+        table1.scenario, center_frequencies_hz=(2.5e9, 2.5e9))
+    assert choose_beam(scenario, POSITION, np.eye(3)).beam.band == 0
+
+
+@pytest.mark.parametrize('bands', [[2], [-1], [0, 5]])
+def test_choosing_from_a_band_out_of_range_is_an_error(table1, bands):
+    with pytest.raises(ValueError, match='band: .* expected 0 to 1'):
+        choose_beam(table1.scenario, POSITION, np.eye(3), bands)
+
+
+@pytest.mark.parametrize('band', [0, 1])
+def test_capacities_of_the_outcome_match_the_reference(table1, reference_link, band):
+    scenario, link = table1.scenario, reference_link(table1, band)
+    used = steer(scenario, POSITION + [0.5, 0.6, 0.0], band)
+    found = outcome(scenario, used, POSITION, [band])
+    assert found.actual_bps == pytest.approx(link.capacity(used, POSITION), rel=1e-6)
+    assert found.perfect_bps == pytest.approx(
+        link.capacity(steer(scenario, POSITION, band), POSITION), rel=1e-6)
+    assert found.loss_bps == found.perfect_bps - found.actual_bps > 0
+    assert found.loss_percent == pytest.approx(100 * (1 - found.actual_bps / found.perfect_bps))
+
+
+def test_a_beam_in_another_band_than_the_best_loses_capacity(table1):
+    scenario = table1.scenario
+    best = choose_beam(scenario, POSITION).beam.band
+    other = steer(scenario, POSITION, 1 - best)
+    assert outcome(scenario, other, POSITION).loss_percent > 0.1
+    assert outcome(scenario, other, POSITION, [1 - best]).loss_bps == 0
+
+
+def test_a_surface_that_is_off_loses_all_capacity(table1):
+    scenario = table1.scenario
+    beam = steer(scenario, POSITION)
+    off = Beam(np.zeros_like(beam.analog), beam.digital, beam.band)
+    assert outcome(scenario, off, POSITION).loss_percent == 100
+
+
+def test_the_relative_loss_of_no_capacity_is_nan():
+    assert math.isnan(Outcome(0.0, 0.0).loss_percent)
+    assert math.isnan(Outcome(math.nan, math.nan).loss_percent)
+
+
+@pytest.mark.parametrize('position', [(1.0, 2.0), (9.0, np.nan, 0.0)])
+def test_an_outcome_at_an_invalid_position_is_an_error(table1, position):
+    beam = steer(table1.scenario, POSITION)
+    with pytest.raises(ValueError, match='expected'):
+        outcome(table1.scenario, beam, np.array(position))
