@@ -128,7 +128,7 @@ class CycleLog:
             case m.Capacity():
                 record.capacity = message
             case m.ProtocolState() if message.outcome:
-                self._end(record, message.outcome, now_s)
+                self._end(record, message, now_s)
             case m.ProtocolState():
                 record.user = message.user
                 record.phase_s[message.phase] = now_s
@@ -148,10 +148,10 @@ class CycleLog:
         while len(self._open) > _MAX_OPEN_CYCLES:
             del self._open[next(iter(self._open))]
 
-    def _end(self, record: CycleRecord, outcome: str, now_s: float) -> None:
+    def _end(self, record: CycleRecord, state: m.ProtocolState, now_s: float) -> None:
         if not record.outcome:
             self.ended.append(record)
-        record.outcome, record.ended_s = outcome, now_s
+        record.user, record.outcome, record.ended_s = state.user, state.outcome, now_s
 
     def _close(self, record: CycleRecord) -> None:
         """Stop collecting messages for a record that is complete or was given up."""

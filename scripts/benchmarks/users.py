@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from parts.hops import hops_of, ping_pong
-from system.chaos.watcher import Watcher
+from system.observer import NetworkObserver
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import Processes, private_domain
@@ -71,7 +71,7 @@ def main() -> int:
 
 def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> dict:
     """Run a network until everybody is known, and so many cycles more."""
-    watcher = Watcher(scenario)
+    observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             if composed:
@@ -79,12 +79,13 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
             else:
                 start_network(
                     processes, users, 0, None, default_codebook_file(), scenario, rest_s=0.0)
-            spin(watcher, lambda: {end.user for end in watcher.ends} == {*range(1, users + 1)},
+            ended = observer.log.ended
+            spin(observer, lambda: {cycle.user for cycle in ended} == {*range(1, users + 1)},
                  'a cycle of each user')
-            first = len(watcher.ends)
-            spin(watcher, lambda: len(watcher.ends) >= first + cycles, f'{cycles} cycles')
-    watcher.destroy_node()
-    ends = watcher.ends[first:first + cycles]
+            first = len(ended)
+            spin(observer, lambda: len(ended) >= first + cycles, f'{cycles} cycles')
+    observer.destroy_node()
+    ends = ended[first:first + cycles]
     served = [end for end in ends if end.outcome == 'served']
     ended_s = np.array([end.ended_s for end in served])
     return {
@@ -95,9 +96,9 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
     }
 
 
-def spin(watcher: Watcher, done: Callable[[], bool], what: str) -> None:
+def spin(observer: NetworkObserver, done: Callable[[], bool], what: str) -> None:
     """Hear messages until something is so."""
-    if not watcher.spin_until(done, PATIENCE_S):
+    if not observer.spin_until(done, PATIENCE_S):
         raise RuntimeError(f'{what}: not within {PATIENCE_S:g} s')
 
 
