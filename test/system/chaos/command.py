@@ -21,7 +21,8 @@ from rhs_isac_ros.monitoring.invariants import SETTLE_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import find_each_other_quickly
-from rhs_isac_ros.tools.demo import check_directory, load_files, start_network
+from rhs_isac_ros.tools.arguments import check_directory
+from rhs_isac_ros.tools.demo import load_files, start_network
 from system.chaos import crashes, fuzzing, report, soaking
 from system.observer import NetworkObserver
 

@@ -16,7 +16,8 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.resources import discovery_profile_file
-from rhs_isac_ros.tools.demo import check_directory, load_files, start_network
+from rhs_isac_ros.tools.arguments import check_directory
+from rhs_isac_ros.tools.demo import load_files, start_network
 from system.hosts import plan
 from system.hosts.namespaces import Hosts, NamespacesUnavailable, interruptible
 from system.hosts.trial import NetworkBroken, Trial
