@@ -107,14 +107,9 @@ class InvariantChecker:
         self._undiscovered |= set(kinds)
 
     def add(self, message: m.Message, now_s: float) -> None:
-        """Add a message of one of the types `RECEIVES`, and check the results that are due.
+        """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s].
 
-        Parameters
-        ----------
-        message
-            The message.
-        now_s
-            Time of its arrival [s].
+        Results that are due by then are checked.
         """
         cycle = self._messages_of(message.cycle_id)
         cycle.undiscovered |= self._undiscovered

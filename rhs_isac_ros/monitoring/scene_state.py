@@ -106,19 +106,9 @@ class SceneState:
         return state
 
     def discard_stale(self, before_s: float) -> list[int]:
-        """Discard users and a beam without a message since a time.
+        """Discard users and a beam without a message since `before_s` [s]; return the users.
 
-        A beam to a user that is discarded is discarded as well.
-
-        Parameters
-        ----------
-        before_s
-            The time [s].
-
-        Returns
-        -------
-        list of int
-            Numbers of the discarded users.
+        A beam to a discarded user is discarded as well.
         """
         stale = [user for user, state in self.users.items() if state.updated_s < before_s]
         for user in stale:
