@@ -1,1 +1,1 @@
-"""Observation of a running network from its messages: no ROS, no part in the protocol."""
+"""Monitoring of a running network from its messages, without ROS and without taking part."""

@@ -1,4 +1,4 @@
-"""What became of each cycle, put together from the messages on the bus."""
+"""Records of the cycles of a network, assembled from its messages."""
 
 import dataclasses
 import math
@@ -7,31 +7,27 @@ import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
 
-# Cycles that may still lack a message; of older ones it does not come any more.
-_MOST_OPEN = 16
+# Older cycles that still lack a message are discarded: the message will not arrive any more.
+_MAX_OPEN_CYCLES = 16
 # Messages that the log needs.
 RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity,
             m.ProtocolState)
 
 
 @dataclasses.dataclass
-class CycleRecord:
-    """One cycle, as seen from outside.
+class CycleTimes:
+    """The times of one cycle, as observed from outside.
 
     Attributes
     ----------
-    cycle_id, user
-        Which cycle, and whose.
+    user
+        Number of the user that was granted the cycle; 0 before the grant.
     began_s
-        When the last beacon before the grant was seen [s].
+        Arrival of the last beacon before the grant [s].
     phase_s
-        When each later phase was seen to begin [s].
+        Arrival of the first message of each later phase [s].
     ended_s
-        When the end was seen [s]; NaN before.
-    outcome
-        ``served``, or why the cycle was given up; empty while it runs.
-    truth, signals, estimate, capacity
-        The messages of the cycle, None if not seen.
+        Arrival of the outcome [s]; NaN before.
     """
 
     cycle_id: int
@@ -39,36 +35,56 @@ class CycleRecord:
     began_s: float = math.nan
     phase_s: dict[m.Phase, float] = dataclasses.field(default_factory=dict)
     ended_s: float = math.nan
+
+    def durations_s(self) -> dict[m.Phase, float]:
+        """Return the duration of each phase [s]; phases that were not observed are left out."""
+        marks = [(m.Phase.BEACONING, self.began_s), *sorted(self.phase_s.items())]
+        ends = [start for _, start in marks[1:]] + [self.ended_s]
+        return {phase: end - start for (phase, start), end in zip(marks, ends, strict=True)}
+
+
+@dataclasses.dataclass
+class CompleteCycle(CycleTimes):
+    """A cycle that was served and whose messages were all received."""
+
+    _: dataclasses.KW_ONLY
+    truth: m.GroundTruth
+    signals: m.ReceivedSignals
+    estimate: m.PositionEstimate
+    capacity: m.Capacity
+
+    @property
+    def error_m(self) -> float:
+        """Distance of the estimate from the true position [m]."""
+        return float(np.linalg.norm(self.estimate.position - self.truth.position))
+
+
+@dataclasses.dataclass
+class CycleRecord(CycleTimes):
+    """A cycle that is still running, was given up, or lacks messages.
+
+    Attributes
+    ----------
+    outcome
+        ``served``, or the reason why the cycle was given up; empty while it runs.
+    truth, signals, estimate, capacity
+        The messages of the cycle; None if not received.
+    """
+
     outcome: str = ''
     truth: m.GroundTruth | None = None
     signals: m.ReceivedSignals | None = None
     estimate: m.PositionEstimate | None = None
     capacity: m.Capacity | None = None
 
-    @property
-    def complete(self) -> bool:
-        """Whether the cycle was served and every message of it was seen."""
-        parts = (self.truth, self.signals, self.estimate, self.capacity)
-        return self.outcome == 'served' and all(part is not None for part in parts)
-
-    @property
-    def error_m(self) -> float:
-        """Distance of the estimate from the true position [m]; NaN if not known."""
-        if self.truth is None or self.estimate is None:
-            return math.nan
-        return float(np.linalg.norm(self.estimate.position - self.truth.position))
-
-    def durations_s(self) -> dict[m.Phase, float]:
-        """Return how long each phase took.
-
-        Returns
-        -------
-        dict
-            Durations by phase [s]; phases that were not seen are left out.
-        """
-        marks = [(m.Phase.BEACONING, self.began_s), *sorted(self.phase_s.items())]
-        ends = [start for _, start in marks[1:]] + [self.ended_s]
-        return {phase: end - start for (phase, start), end in zip(marks, ends, strict=True)}
+    def completed(self) -> CompleteCycle | None:
+        """Return the complete cycle; None unless it was served and no message is missing."""
+        if (self.outcome != 'served' or self.truth is None or self.signals is None
+                or self.estimate is None or self.capacity is None):
+            return None
+        return CompleteCycle(
+            self.cycle_id, self.user, self.began_s, self.phase_s, self.ended_s, truth=self.truth,
+            signals=self.signals, estimate=self.estimate, capacity=self.capacity)
 
 
 class CycleLog:
@@ -77,26 +93,23 @@ class CycleLog:
     Attributes
     ----------
     complete
-        Cycles that were served and seen whole, in their order.
-    given_up
-        Cycles that ended without being served.
+        Cycles that were served and received as a whole, in their order.
+    ended
+        All cycles that have ended, in their order.
     """
 
     def __init__(self) -> None:
-        self.complete: list[CycleRecord] = []
-        self.given_up: list[CycleRecord] = []
+        self.complete: list[CompleteCycle] = []
+        self.ended: list[CycleRecord] = []
         self._open: dict[int, CycleRecord] = {}
 
-    def add(self, message: m.Message, now_s: float) -> None:
-        """Take a message.
+    @property
+    def given_up(self) -> list[CycleRecord]:
+        """Cycles that ended without being served."""
+        return [record for record in self.ended if record.outcome != 'served']
 
-        Parameters
-        ----------
-        message
-            One of `RECEIVES`.
-        now_s
-            When it was seen [s].
-        """
+    def add(self, message: m.Message, now_s: float) -> None:
+        """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s]."""
         if message.cycle_id == 0:
             return
         if isinstance(message, m.Beacon):
@@ -115,27 +128,36 @@ class CycleLog:
             case m.Capacity():
                 record.capacity = message
             case m.ProtocolState() if message.outcome:
-                record.outcome, record.ended_s = message.outcome, now_s
+                self._end(record, message, now_s)
             case m.ProtocolState():
                 record.user = message.user
                 record.phase_s[message.phase] = now_s
         self._close(record)
 
+    def clear(self) -> None:
+        """Discard all cycles that have ended."""
+        self.complete.clear()
+        self.ended.clear()
+
     def _begin(self, beacon: m.Beacon, now_s: float) -> None:
-        known = self._open.get(beacon.cycle_id)
-        if known is None or known.outcome or not beacon.attempt:
+        record = self._open.get(beacon.cycle_id)
+        if record is None or record.outcome or not beacon.attempt:
             self._open[beacon.cycle_id] = CycleRecord(beacon.cycle_id, began_s=now_s)
         else:
-            known.began_s = now_s
-        while len(self._open) > _MOST_OPEN:
+            record.began_s = now_s
+        while len(self._open) > _MAX_OPEN_CYCLES:
             del self._open[next(iter(self._open))]
 
+    def _end(self, record: CycleRecord, state: m.ProtocolState, now_s: float) -> None:
+        if not record.outcome:
+            self.ended.append(record)
+        record.user, record.outcome, record.ended_s = state.user, state.outcome, now_s
+
     def _close(self, record: CycleRecord) -> None:
-        """File a record once nothing of it is missing."""
-        if record.complete:
-            self.complete.append(record)
-        elif record.outcome not in ('', 'served'):
-            self.given_up.append(record)
-        else:
+        """Stop collecting messages for a record that is complete or was given up."""
+        cycle = record.completed()
+        if cycle is not None:
+            self.complete.append(cycle)
+        elif record.outcome in ('', 'served'):
             return
         del self._open[record.cycle_id]

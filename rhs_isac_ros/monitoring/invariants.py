@@ -1,7 +1,7 @@
-"""What the network promises of its results, checked from outside by what is on the topics.
+"""Invariants of the published results, checked from outside by the messages on the topics.
 
-No position and no capacity is ever published for a cycle whose signals were incomplete, stale,
-mixed between users, or taken with two codebooks.
+No position and no capacity may be published for a cycle whose signals were incomplete, stale,
+mixed between users, or received with two codebooks.
 """
 
 import collections
@@ -15,146 +15,140 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 
-# Messages that it needs.
+# Messages that the checker needs.
 RECEIVES = (m.Grant, m.RhsConfiguration, m.FeedSignals, m.ReceivedSignals, m.PositionEstimate,
             m.Beam, m.Capacity)
-# Topics have no common order: a result is judged when so much more must have been heard.
+# Messages of different topics arrive in any order: a result is checked after this delay [s].
 SETTLE_S = 1.0
-# Cycles whose messages are kept.
-_MOST_CYCLES = 64
-# What is wrong, and the kind of message whose absence it is, if any.
+# Number of cycles whose messages are kept.
+_MAX_CYCLES = 64
+# Noise is complex Gaussian: |n|^2 exceeds this multiple of its power with probability e^-40.
+_MAX_NOISE_FACTOR = 40.0
+# The type of message whose absence is the fault, if any, and a description.
 _Fault = tuple[type[m.Message] | None, str]
-# Noise is complex Gaussian: |n|^2 is beyond so many times its power once in e^40 values.
-_MOST_NOISE = 40.0
 
 
 @dataclasses.dataclass
-class _Evidence:
-    """What was heard of a cycle; repeats are allowed, contradictions are not."""
+class _CycleMessages:
+    """The messages of a cycle; each may be repeated, but repetitions must agree."""
 
     users: set[int] = dataclasses.field(default_factory=set)
-    # By band: codebook ids, and the configurations that were reported for them.
+    # Configurations for positioning by band.
     applied: dict[int, list[m.RhsConfiguration]] = dataclasses.field(
         default_factory=lambda: collections.defaultdict(list))
     beam_applied: list[m.RhsConfiguration] = dataclasses.field(default_factory=list)
+    # Signals by band and frame.
     feeds: dict[tuple[int, int], list[m.FeedSignals]] = dataclasses.field(
         default_factory=lambda: collections.defaultdict(list))
     signals: list[m.ReceivedSignals] = dataclasses.field(default_factory=list)
     estimates: list[m.PositionEstimate] = dataclasses.field(default_factory=list)
     beams: list[m.Beam] = dataclasses.field(default_factory=list)
-    # Kinds of which messages may have been published unheard.
-    unheard: set[type[m.Message]] = dataclasses.field(default_factory=set)
+    # Types of messages that may have been published before their publisher was discovered.
+    undiscovered: set[type[m.Message]] = dataclasses.field(default_factory=set)
+
+    def add(self, message: m.Message) -> None:
+        match message:
+            case m.Grant():
+                self.users.add(message.user)
+            case m.RhsConfiguration(mode=m.Mode.POSITIONING):
+                self.applied[message.band].append(message)
+            case m.RhsConfiguration():
+                self.beam_applied.append(message)
+            case m.FeedSignals():
+                self.feeds[message.band, message.frame].append(message)
+            case m.ReceivedSignals():
+                self.signals.append(message)
+            case m.PositionEstimate():
+                self.estimates.append(message)
+            case m.Beam():
+                self.beams.append(message)
 
 
 class InvariantChecker:
-    """Collects what is published, and names the results that should not have been.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
+    """Collects the published messages and checks every result against them.
 
     Attributes
     ----------
     checked
-        How many results were judged.
+        Number of results that were checked.
     unverified
-        How many of them lack evidence of a kind that was unheard, and are well otherwise.
-    broken
-        What was wrong with the others, in words.
+        Number of these results whose only fault is the absence of messages that may have been
+        published before their publisher was discovered.
+    violations
+        Descriptions of the results that violate an invariant.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._codebooks: dict[str, Codebook] = {}
-        self._cycles: dict[int, _Evidence] = {}
+        self._cycles: dict[int, _CycleMessages] = {}
         self._results: collections.deque[tuple[float, m.PositionEstimate | m.Capacity]] = (
             collections.deque())
-        # At first everybody is still being found.
-        self._unheard: set[type[m.Message]] = set(RECEIVES)
+        # At first, no publisher has been discovered.
+        self._undiscovered: set[type[m.Message]] = set(RECEIVES)
         self.checked = self.unverified = 0
-        self.broken: list[str] = []
+        self.violations: list[str] = []
 
-    def know(self, codebook: Codebook) -> None:
-        """Take a codebook that cycles may use.
-
-        Parameters
-        ----------
-        codebook
-            The codebook.
-        """
+    def add_codebook(self, codebook: Codebook) -> None:
+        """Add a codebook that cycles may use."""
         self._codebooks[codebook.id] = codebook
 
-    def expect_silence(self, kinds: Iterable[type[m.Message]]) -> None:
-        """Tell that a publisher has died: the next one may be found by others earlier than here.
+    def expect_rediscovery(self, kinds: Iterable[type[m.Message]]) -> None:
+        """Tolerate that messages are missing until the first of their type arrives.
+
+        To be called when a publisher has terminated or is unreachable: other nodes may discover
+        its successor earlier than this one.
 
         Parameters
         ----------
         kinds
-            What it publishes. That such messages are missing is no fault of a cycle until the
-            first of them is heard.
+            Types of the messages that it publishes.
         """
-        self._unheard |= set(kinds)
+        self._undiscovered |= set(kinds)
 
     def add(self, message: m.Message, now_s: float) -> None:
-        """Take a message, and judge the results that have waited long enough.
+        """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s].
 
-        Parameters
-        ----------
-        message
-            One of `RECEIVES`.
-        now_s
-            When it was seen [s].
+        Results that are due by then are checked.
         """
-        self._note(message)
+        cycle = self._messages_of(message.cycle_id)
+        cycle.undiscovered |= self._undiscovered
+        self._undiscovered.discard(type(message))
+        cycle.add(message)
         if isinstance(message, m.PositionEstimate | m.Capacity):
             self._results.append((now_s + SETTLE_S, message))
         while self._results and self._results[0][0] <= now_s:
-            self._judge(self._results.popleft()[1])
+            self._check(self._results.popleft()[1])
 
-    def _note(self, message: m.Message) -> None:
-        cycle = self._cycles.get(message.cycle_id)
+    def _messages_of(self, cycle_id: int) -> _CycleMessages:
+        cycle = self._cycles.get(cycle_id)
         if cycle is None:
-            cycle = self._cycles[message.cycle_id] = _Evidence()
-            if len(self._cycles) > _MOST_CYCLES:
+            cycle = self._cycles[cycle_id] = _CycleMessages()
+            if len(self._cycles) > _MAX_CYCLES:
                 del self._cycles[next(iter(self._cycles))]
-        cycle.unheard |= self._unheard
-        self._unheard.discard(type(message))
-        match message:
-            case m.Grant():
-                cycle.users.add(message.user)
-            case m.RhsConfiguration(mode=m.Mode.POSITIONING):
-                cycle.applied[message.band].append(message)
-            case m.RhsConfiguration():
-                cycle.beam_applied.append(message)
-            case m.FeedSignals():
-                cycle.feeds[message.band, message.frame].append(message)
-            case m.ReceivedSignals():
-                cycle.signals.append(message)
-            case m.PositionEstimate():
-                cycle.estimates.append(message)
-            case m.Beam():
-                cycle.beams.append(message)
+        return cycle
 
-    def _judge(self, result: m.PositionEstimate | m.Capacity) -> None:
+    def _check(self, result: m.PositionEstimate | m.Capacity) -> None:
         self.checked += 1
-        cycle = self._cycles.get(result.cycle_id, _Evidence())
-        judge = self._faults_of_signals if isinstance(
-            result, m.PositionEstimate) else self._faults_of_beam
-        found = list(judge(result, cycle))
+        cycle = self._cycles.get(result.cycle_id, _CycleMessages())
+        faults: list[_Fault] = []
         if cycle.users != {result.user}:
-            absent = None if cycle.users else m.Grant
-            found.insert(0, (absent, f'granted to {sorted(cycle.users) or "nobody"}'))
-        faults = [text for absent, text in found if absent not in cycle.unheard]
-        self.unverified += bool(found) and not faults
-        if faults:
-            self.broken.append(
+            faults.append((None if cycle.users else m.Grant,
+                           f'granted to {sorted(cycle.users) or "nobody"}'))
+        if isinstance(result, m.PositionEstimate):
+            faults += self._signal_faults(result, cycle)
+        else:
+            faults += self._beam_faults(result, cycle)
+        proven = [text for missing, text in faults if missing not in cycle.undiscovered]
+        self.unverified += bool(faults) and not proven
+        if proven:
+            self.violations.append(
                 f'{type(result).__name__} of cycle {result.cycle_id}, user {result.user}, '
-                f'codebook {result.codebook_id}: {"; ".join(faults)}')
+                f'codebook {result.codebook_id}: {"; ".join(proven)}')
 
-    def _faults_of_signals(
-            self, estimate: m.PositionEstimate, cycle: _Evidence) -> Iterator[_Fault]:
-        """What is wrong with the signals that an estimate is made of."""
+    def _signal_faults(
+            self, estimate: m.PositionEstimate, cycle: _CycleMessages) -> Iterator[_Fault]:
+        """Yield the faults of the signals from which a position was estimated."""
         if not cycle.signals:
             yield m.ReceivedSignals, 'no received signals'
             return
@@ -166,27 +160,27 @@ class InvariantChecker:
                 yield None, 'received signals that differ'
         sizes = self._scenario.sizes
         for band in range(sizes['N_B']):
-            ids = {report.codebook_id for report in cycle.applied.get(band, ())}
+            ids = {applied.codebook_id for applied in cycle.applied.get(band, ())}
             if ids != {estimate.codebook_id}:
-                absent = None if ids else m.RhsConfiguration
-                yield absent, f'band {band} taken with {sorted(ids) or "no configuration"}'
+                missing = None if ids else m.RhsConfiguration
+                yield missing, f'band {band} taken with {sorted(ids) or "no configuration"}'
         frames = [(band, frame) for band in range(sizes['N_B']) for frame in range(sizes['F'])]
-        missing = [key for key in frames if not cycle.feeds.get(key)]
-        if missing:
-            yield m.FeedSignals, f'incomplete: no signals of (band, frame) {missing}'
-        others = {feeds.user for heard in cycle.feeds.values() for feeds in heard}
-        if others - {estimate.user}:
-            yield None, f'signals of users {sorted(others)}'
+        absent = [key for key in frames if not cycle.feeds.get(key)]
+        if absent:
+            yield m.FeedSignals, f'incomplete: no signals of (band, frame) {absent}'
+        users = {feeds.user for messages in cycle.feeds.values() for feeds in messages}
+        if users - {estimate.user}:
+            yield None, f'signals of users {sorted(users)}'
         codebook = self._codebooks.get(estimate.codebook_id)
         if codebook is None:
             yield None, 'a codebook that was never offered'
-        elif not missing:
-            yield from self._faults_of_content(cycle, codebook, frames)
+        elif not absent:
+            yield from self._content_faults(cycle, codebook, frames)
 
-    def _faults_of_content(
-            self, cycle: _Evidence, codebook: Codebook, frames: list[tuple[int, int]]
+    def _content_faults(
+            self, cycle: _CycleMessages, codebook: Codebook, frames: list[tuple[int, int]]
     ) -> Iterator[_Fault]:
-        """Whether the received signals are those at the feeds, combined, with noise."""
+        """Compare the received signals with those at the feeds, combined by the codebook."""
         for band, reports in cycle.applied.items():
             if any(not np.array_equal(report.analog, codebook.analog[band]) for report in reports):
                 yield None, f'band {band} taken with a configuration that is not in the codebook'
@@ -195,12 +189,13 @@ class InvariantChecker:
         shape = sizes['N_B'], sizes['F'], *feeds.shape[1:]
         expected = receive_feeds(self._scenario, codebook, feeds.reshape(shape), None)
         noise = np.abs(cycle.signals[0].signals - expected)**2
-        allowed = _MOST_NOISE * self._scenario.noise_power_w + 1e-12 * np.abs(expected).max()**2
+        allowed = (_MAX_NOISE_FACTOR * self._scenario.noise_power_w
+                   + 1e-12 * np.abs(expected).max()**2)
         if noise.max() > allowed:
             yield None, 'received signals that are not those at the feeds'
 
-    def _faults_of_beam(self, report: m.Capacity, cycle: _Evidence) -> Iterator[_Fault]:
-        """What is wrong with the beam that a capacity is reported of."""
+    def _beam_faults(self, report: m.Capacity, cycle: _CycleMessages) -> Iterator[_Fault]:
+        """Yield the faults of the beam for which a capacity was reported."""
         key = report.user, report.codebook_id
         if not any((e.user, e.codebook_id) == key for e in cycle.estimates):
             yield m.PositionEstimate, 'no such estimate'
@@ -211,4 +206,4 @@ class InvariantChecker:
         elif not any(np.array_equal(applied.analog[0], beam.analog) and
                      applied.codebook_id == report.codebook_id
                      for applied in cycle.beam_applied for beam in beams):
-            yield m.RhsConfiguration, 'a beam that the surface does not hold'
+            yield m.RhsConfiguration, 'a beam that the surface does not apply'

@@ -1,4 +1,4 @@
-"""How a role fares: what it has done, what it has dropped, and how long that took."""
+"""Counters and latencies of a role, for its diagnostics."""
 
 import collections
 import dataclasses
@@ -13,8 +13,8 @@ from rhs_isac_ros.protocol import user
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, PeersChanged, Send
 from rhs_isac_ros.protocol.state_machine import Transition
 
-# Durations of which percentiles are told: the newest so many.
-_NEWEST = 512
+# Percentiles are computed over this number of newest durations.
+_MAX_DURATIONS = 512
 _PERCENTS = (50, 95, 99)
 # Of the counters of a role: beacons without an ack, or none at all; steps that were asked for
 # again; and what ends a cycle, as base station or user see it. All else was dropped.
@@ -37,19 +37,19 @@ CYCLE_ENDS = (_ends(bs_table.TABLE) | _ends(user.TABLE)) - {UNANSWERED, NO_BEACO
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """How a role fares.
+    """Diagnostics of a node.
 
     Attributes
     ----------
     fault
-        Whether something is missing, or was dropped or given up since the last report.
+        Whether something is missing, or something was dropped or given up since the last report.
     summary
-        The same in words.
+        One line that describes the fault.
     values
-        Everything by name: ``phase``, ``codebook_id``, ``parameter.<name>`` in use,
-        ``pending.<name>`` that waits, ``failed.<name>`` that came to nothing,
-        ``cycles.<outcome>``, ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``,
-        ``received.<message>``, ``sent.<message>`` and percentiles such as ``handling_ms.p95``.
+        ``phase``, ``codebook_id``, ``parameter.<name>`` in use, ``pending.<name>`` not yet in
+        use, ``failed.<name>`` without effect, ``cycles.<outcome>``, ``dropped.<reason>``,
+        ``retries.<step>``, ``beacons.<reason>``, ``received.<message>``, ``sent.<message>`` and
+        percentiles such as ``handling_ms.p95``.
     """
 
     fault: bool
@@ -58,137 +58,124 @@ class Report:
 
 
 class RoleStatistics:
-    """Keeps the books of a role, from outside: it sees each event and what comes of it."""
+    """Collects the statistics of a role from its events and the resulting actions."""
 
     def __init__(self) -> None:
         self._received: collections.Counter[str] = collections.Counter()
         self._sent: collections.Counter[str] = collections.Counter()
         self._served = 0
         self._codebook_id = ''
-        self._missing: tuple[str, ...] = ()
-        self._lacks: set[str] = set()
-        self._began_s: float | None = None
+        self._missing_roles: tuple[str, ...] = ()
+        self._unavailable: set[str] = set()
+        self._cycle_began_s: float | None = None
         self._durations_s: dict[str, collections.deque[float]] = {}
         self._faults = 0
 
-    def lack(self, what: str, lacks: bool) -> None:
-        """Enter something that the role can do without, for a while.
+    def set_available(self, node: str, available: bool) -> None:
+        """Record whether a node without which the role can work for a while is available."""
+        (self._unavailable.discard if available else self._unavailable.add)(node)
 
-        Parameters
-        ----------
-        what
-            Its name.
-        lacks
-            Whether it is missing now.
-        """
-        (self._lacks.add if lacks else self._lacks.discard)(what)
-
-    def receive(self, kind: type[m.Message]) -> None:
-        """Count a message that has come, whatever becomes of it.
-
-        Parameters
-        ----------
-        kind
-            Its class.
-        """
+    def count_received(self, kind: type[m.Message]) -> None:
+        """Count a received message, also if it is dropped later."""
         self._received[kind.__name__] += 1
 
-    def note(
+    def record(
             self, event: Event, actions: Sequence[Action], now_s: float,
             handling_s: float) -> None:
-        """Enter an event and what a role answers to it.
+        """Record an event and the actions with which the role responded.
 
         Parameters
         ----------
-        event
-            The event.
-        actions
-            The answer.
+        event, actions
+            The event and the response.
         now_s
-            The time of the event, on the clock of the role [s].
+            Time of the event, on the clock of the role [s].
         handling_s
-            How long the role took [s].
+            Time that the role took [s].
         """
         match event:
             case CodebookOffered(codebook):
                 self._codebook_id = codebook.id
             case PeersChanged(missing):
-                self._missing = missing
-        self._add('handling_ms', handling_s)
+                self._missing_roles = missing
+        self._add_duration('handling_ms', handling_s)
         for action in actions:
             if isinstance(action, Send):
                 self._sent[type(action.message).__name__] += 1
-                self._note_message(action.message, now_s)
+                self._record_message(action.message, now_s)
 
-    def _note_message(self, message: m.Message, now_s: float) -> None:
+    def _record_message(self, message: m.Message, now_s: float) -> None:
         match message:
             case m.Beacon():
-                self._began_s = now_s
+                self._cycle_began_s = now_s
             case m.PositionEstimate():
-                self._add('estimate_ms', message.latency_s)
+                self._add_duration('estimate_ms', message.latency_s)
             case m.ProtocolState(outcome='served'):
                 self._served += 1
-                if self._began_s is not None:
-                    self._add('cycle_ms', now_s - self._began_s)
+                if self._cycle_began_s is not None:
+                    self._add_duration('cycle_ms', now_s - self._cycle_began_s)
 
-    def _codebooks(self, in_use: str) -> dict[str, str]:
-        """Tell the codebook in use, or the one to begin with, and the one that waits."""
-        if not self._codebook_id:
-            return {}
-        if in_use in ('', self._codebook_id):
-            return {'codebook_id': self._codebook_id}
-        return {'codebook_id': in_use, 'pending.codebook_id': self._codebook_id}
-
-    def _add(self, name: str, duration_s: float) -> None:
-        self._durations_s.setdefault(name, collections.deque(maxlen=_NEWEST)).append(duration_s)
+    def _add_duration(self, name: str, duration_s: float) -> None:
+        self._durations_s.setdefault(
+            name, collections.deque(maxlen=_MAX_DURATIONS)).append(duration_s)
 
     def report(
-            self, phase: str, counters: Mapping[str, int], lacking: bool = False,
-            standing: Mapping[str, str] = types.MappingProxyType({})) -> Report:
-        """Tell how the role fares; what is new is what came after the last call.
+            self, phase: str, counters: Mapping[str, int], blocked: bool = False,
+            status: Mapping[str, str] = types.MappingProxyType({})) -> Report:
+        """Create a report; new faults are those since the previous call.
 
         Parameters
         ----------
         phase
-            The present state of the role; empty if it has none.
+            State of the role; empty if it has none.
         counters
-            What it has counted, by reason.
-        lacking
-            Whether it misses something in this state.
-        standing
-            What it has in use and what waits, by name.
+            Counters of the role by reason.
+        blocked
+            Whether the role lacks something that it needs in this state.
+        status
+            Settings in use and pending, by name.
 
         Returns
         -------
         Report
             The report.
         """
-        values: dict[str, str] = {}
-        if phase:
-            values['phase'] = phase
-        values |= self._codebooks(standing.get('codebook_id', ''))
-        values |= {name: value for name, value in standing.items() if name != 'codebook_id'}
+        values = {'phase': phase} if phase else {}
+        values |= self._codebook_ids(status.get('codebook_id', ''))
+        values |= {name: value for name, value in status.items() if name != 'codebook_id'}
         if self._served:
             values['cycles.served'] = str(self._served)
-        for reason, n in sorted(counters.items()):
-            values[f'{_section(reason)}.{reason}'] = str(n)
-        for section, books in (('received', self._received), ('sent', self._sent)):
-            values |= {f'{section}.{name}': str(n) for name, n in sorted(books.items())}
-        for name, durations_s in self._durations_s.items():
-            percentiles = 1e3 * np.percentile(durations_s, _PERCENTS)
-            values |= {f'{name}.p{percent}': f'{value:.3f}'
-                       for percent, value in zip(_PERCENTS, percentiles, strict=True)}
-        faults = sum(n for reason, n in counters.items() if reason != UNANSWERED)
-        new, self._faults = faults - self._faults, faults
-        if self._missing:
-            return Report(True, f'waiting for {", ".join(self._missing)}', values)
-        if self._lacks:
-            return Report(True, f'without {", ".join(sorted(self._lacks))}', values)
-        if lacking:
+        for reason, count in sorted(counters.items()):
+            values[f'{_section(reason)}.{reason}'] = str(count)
+        for section, counts in (('received', self._received), ('sent', self._sent)):
+            values |= {f'{section}.{name}': str(count) for name, count in sorted(counts.items())}
+        values |= self._percentiles()
+        total = sum(count for reason, count in counters.items() if reason != UNANSWERED)
+        new_faults, self._faults = total - self._faults, total
+        if self._missing_roles:
+            return Report(True, f'waiting for {", ".join(self._missing_roles)}', values)
+        if self._unavailable:
+            return Report(True, f'without {", ".join(sorted(self._unavailable))}', values)
+        if blocked:
             return Report(True, f'cannot work: {phase}', values)
-        if new:
-            return Report(True, f'{new} faults just now', values)
+        if new_faults:
+            return Report(True, f'{new_faults} faults just now', values)
         return Report(False, 'no fault', values)
+
+    def _codebook_ids(self, in_use: str) -> dict[str, str]:
+        """Return the ids of the codebook in use, or the first one, and of a pending one."""
+        if not self._codebook_id:
+            return {}
+        if in_use in ('', self._codebook_id):
+            return {'codebook_id': self._codebook_id}
+        return {'codebook_id': in_use, 'pending.codebook_id': self._codebook_id}
+
+    def _percentiles(self) -> dict[str, str]:
+        """Return percentiles of the newest durations [ms]."""
+        return {f'{name}.p{percent}': f'{1e3 * value:.3f}'
+                for name, durations_s in self._durations_s.items()
+                for percent, value in zip(
+                    _PERCENTS, np.percentile(durations_s, _PERCENTS), strict=True)}
 
 
 def _section(reason: str) -> str:

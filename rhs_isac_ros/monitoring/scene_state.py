@@ -1,4 +1,4 @@
-"""Who and what is in the scene of a network, as its messages tell it."""
+"""State of the scene of a network: users, beam and surface, as its messages report them."""
 
 import collections
 import dataclasses
@@ -8,87 +8,76 @@ import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
 
-# Messages that the scene is made of.
+# Messages that the scene state needs.
 RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.PositionEstimate, m.Beam)
-# A path holds the newest positions, and of a user that stands still only one.
-_LONGEST_PATH = 200
-_STEP_M = 0.05
+# A path holds the newest positions, and a position only if the user has moved this far.
+_MAX_PATH_LENGTH = 200
+_MIN_STEP_M = 0.05
 
 
-def _path() -> collections.deque[np.ndarray]:
-    return collections.deque(maxlen=_LONGEST_PATH)
+def _empty_path() -> collections.deque[np.ndarray]:
+    return collections.deque(maxlen=_MAX_PATH_LENGTH)
 
 
 @dataclasses.dataclass
 class UserState:
-    """One user.
+    """Position, estimate and paths of one user.
 
     Attributes
     ----------
     user
-        Its number.
-    seen_s
-        When it was heard of last [s].
+        Number of the user.
+    updated_s
+        Arrival of the newest message about the user [s].
     truth
-        Where it really is; None if nobody told.
+        The true position; None before the first.
     estimate
-        The newest estimate; None if there is none yet.
-    true_path, path
-        Its true positions and the estimates, float64 [3] [m] each, the newest last.
+        The newest estimate; None before the first.
+    true_path, estimated_path
+        True positions and estimates, float64 [3] [m] each, the newest last.
     """
 
     user: int
-    seen_s: float
+    updated_s: float
     truth: m.GroundTruth | None = None
     estimate: m.PositionEstimate | None = None
-    true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=_path)
-    path: collections.deque[np.ndarray] = dataclasses.field(default_factory=_path)
-    # The true position for which the signals of a cycle were made.
-    _sounded: m.GroundTruth | None = None
+    true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=_empty_path)
+    estimated_path: collections.deque[np.ndarray] = dataclasses.field(
+        default_factory=_empty_path)
+    # The true position at which the pilots of the newest cycle were sent.
+    _cycle_truth: m.GroundTruth | None = None
 
     @property
     def error_m(self) -> float:
-        """Distance of the estimate from the true position of its cycle [m]; NaN if not known."""
-        told, found = self._sounded, self.estimate
-        if told is None or found is None or told.cycle_id != found.cycle_id:
+        """Distance of the estimate from the true position of its cycle [m]; NaN if unknown."""
+        truth, estimate = self._cycle_truth, self.estimate
+        if truth is None or estimate is None or truth.cycle_id != estimate.cycle_id:
             return math.nan
-        return float(np.linalg.norm(found.position - told.position))
+        return float(np.linalg.norm(estimate.position - truth.position))
 
-    def move(self, truth: m.GroundTruth) -> None:
-        """Take a true position.
-
-        Parameters
-        ----------
-        truth
-            The position.
-        """
+    def add_truth(self, truth: m.GroundTruth) -> None:
+        """Add a true position."""
         self.truth = truth
         if truth.cycle_id:
-            self._sounded = truth
-        if not self.true_path or math.dist(self.true_path[-1], truth.position) > _STEP_M:
+            self._cycle_truth = truth
+        if not self.true_path or math.dist(self.true_path[-1], truth.position) > _MIN_STEP_M:
             self.true_path.append(truth.position)
 
-    def locate(self, estimate: m.PositionEstimate) -> None:
-        """Take an estimate.
-
-        Parameters
-        ----------
-        estimate
-            The estimate.
-        """
+    def add_estimate(self, estimate: m.PositionEstimate) -> None:
+        """Add an estimate."""
         self.estimate = estimate
-        self.path.append(estimate.position)
+        self.estimated_path.append(estimate.position)
 
 
 class SceneState:
-    """The scene: the surface, its beam, and every user of whom something was heard lately.
+    """The surface, its beam, and the users.
 
     Attributes
     ----------
     configuration
-        What the surface applies; None if that is not known.
+        Configuration that the surface applies; None before the first message.
     beam
-        The newest beam of a transmission; None before the first.
+        Newest beam of a transmission; None before the first.
     users
         Users by number.
     """
@@ -100,58 +89,43 @@ class SceneState:
         self._beam_s = math.nan
 
     def add(self, message: m.Message, now_s: float) -> None:
-        """Take a message.
-
-        Parameters
-        ----------
-        message
-            One of `RECEIVES`.
-        now_s
-            When it was heard [s].
-        """
+        """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s]."""
         match message:
             case m.RhsConfiguration():
                 self.configuration = message
             case m.Beam():
                 self.beam, self._beam_s = message, now_s
             case m.GroundTruth():
-                self._of(message.user, now_s).move(message)
+                self._updated_user(message.user, now_s).add_truth(message)
             case m.PositionEstimate():
-                self._of(message.user, now_s).locate(message)
+                self._updated_user(message.user, now_s).add_estimate(message)
 
-    def _of(self, user: int, now_s: float) -> UserState:
-        sighting = self.users.setdefault(user, UserState(user, now_s))
-        sighting.seen_s = now_s
-        return sighting
+    def _updated_user(self, user: int, now_s: float) -> UserState:
+        state = self.users.setdefault(user, UserState(user, now_s))
+        state.updated_s = now_s
+        return state
 
-    def forget(self, before_s: float) -> list[int]:
-        """Forget users that were not heard of lately, a beam for one of them, and an old beam.
+    def discard_stale(self, before_s: float) -> list[int]:
+        """Discard users and a beam without a message since `before_s` [s]; return the users.
 
-        Parameters
-        ----------
-        before_s
-            What was heard of last before this time is forgotten [s].
-
-        Returns
-        -------
-        list of int
-            The users that are forgotten.
+        A beam to a discarded user is discarded as well.
         """
-        gone = [user for user, sighting in self.users.items() if sighting.seen_s < before_s]
-        for user in gone:
+        stale = [user for user, state in self.users.items() if state.updated_s < before_s]
+        for user in stale:
             del self.users[user]
-        if self.beam is not None and (self.beam.user in gone or self._beam_s < before_s):
+        if self.beam is not None and (self.beam.user in stale or self._beam_s < before_s):
             self.beam = None
-        return gone
+        return stale
 
     @property
     def complete(self) -> bool:
-        """Whether surface, beam and some users are there, and every user has an estimate."""
+        """Whether surface, beam and users are known, and every user has an estimate."""
         return (self.configuration is not None and self.beam is not None and bool(self.users)
-                and all(sighting.estimate for sighting in self.users.values()))
+                and all(state.estimate for state in self.users.values()))
 
     @property
     def newest(self) -> UserState | None:
-        """The user of the newest cycle that has an estimate; None if there is none."""
-        located = [sighting for sighting in self.users.values() if sighting.estimate]
-        return max(located, key=lambda sighting: sighting.estimate.cycle_id, default=None)
+        """The user of the newest cycle that led to an estimate; None if there is none."""
+        cycles = [(state.estimate.cycle_id, user) for user, state in self.users.items()
+                  if state.estimate]
+        return self.users[max(cycles)[1]] if cycles else None

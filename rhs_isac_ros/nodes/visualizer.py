@@ -45,7 +45,7 @@ class VisualizerNode(Node):
 
     def _show(self) -> None:
         """Publish all of the scene: who looks on from now on needs all of it."""
-        for user in self._sightings.forget(time.monotonic() - self._forget_s):
+        for user in self._sightings.discard_stale(time.monotonic() - self._forget_s):
             for publisher in self._paths.pop(user, ()):
                 self.destroy_publisher(publisher)
         stamp = self.get_clock().now().to_msg()
@@ -61,7 +61,7 @@ class VisualizerNode(Node):
             self._paths[sighting.user] = tuple(
                 self.create_publisher(Path, name.format(user=sighting.user), qos.EXCHANGE)
                 for name in (topics.PATH, topics.TRUE_PATH))
-        ways = sighting.path, sighting.true_path
+        ways = sighting.estimated_path, sighting.true_path
         for publisher, way in zip(self._paths[sighting.user], ways, strict=True):
             if way and publisher.get_subscription_count():
                 publisher.publish(markers.path(way, stamp))

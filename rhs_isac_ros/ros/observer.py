@@ -1,6 +1,7 @@
-"""A node that watches the cycles of a network from outside."""
+"""A node that observes the cycles of a network from outside."""
 
 import time
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rclpy.node import Node
@@ -13,33 +14,51 @@ from rhs_isac_ros.ros.subscriptions import listen
 
 
 class CycleObserver(Node):
-    """Collects the cycles that it sees on the topics.
+    """Collects the cycles of the network in its namespace.
 
     Parameters
     ----------
     recorder
-        Also takes down what is seen, and everything else; whoever made it closes it.
+        Records all topics of the namespace; the caller closes it. If given, the observer
+        receives exactly the recorded messages of the types `cycle_log.RECEIVES`, and ignores
+        the following parameters.
+    receives
+        Types of the messages to receive.
+    sizes
+        Sizes by symbol that the messages must have, as of `Scenario.sizes`; None: any.
+    on_malformed
+        Called with the error of each malformed message; by default it is logged.
 
     Attributes
     ----------
     log
-        The cycles.
+        The cycles, on the clock `time.monotonic`.
     """
 
-    def __init__(self, recorder: Recorder | None = None, **node_options: Any) -> None:
+    def __init__(
+            self, recorder: Recorder | None = None,
+            receives: Iterable[type[m.Message]] = cycle_log.RECEIVES,
+            sizes: Mapping[str, int] | None = None,
+            on_malformed: Callable[[m.MessageError], None] | None = None,
+            **node_options: Any) -> None:
         super().__init__('cycle_observer', **node_options)
         self.log = cycle_log.CycleLog()
         if recorder is not None:
-            # One subscription for both, so that a replay sees the same cycles in the same order.
+            # One subscription for both, so that a replay yields the same cycles in the same order.
             kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
             recorder.listen(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))
             return
-        listen(self, cycle_log.RECEIVES, None, self._on_message)
+        listen(self, receives, sizes, self._on_message, on_malformed)
+
+    def observe(self, message: m.Message, now_s: float) -> None:
+        """Process a message that arrived at `now_s` [s]; subclasses may extend this."""
+        if isinstance(message, cycle_log.RECEIVES):
+            self.log.add(message, now_s)
 
     def _on_recorded(self, kind: type[m.Message] | None, message: bytes) -> None:
         if kind is not None:
             self._on_message(convert.from_bytes(kind, message))
 
     def _on_message(self, message: m.Message) -> None:
-        self.log.add(message, time.monotonic())
+        self.observe(message, time.monotonic())

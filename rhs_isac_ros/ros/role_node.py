@@ -88,7 +88,7 @@ class RoleNode(SettableNode):
         self._outlets: dict[type[m.Message], Publisher] = {}
         self.advertise(sends)
         self._complaints: set[str] = set()
-        self._health = RoleStatistics()
+        self._statistics = RoleStatistics()
         # One timer for all deadlines. It is set anew only when it rings too early or too late.
         self._timer = steady_timer(self, 3600.0, self._ring)
         self._timer.cancel()
@@ -118,9 +118,9 @@ class RoleNode(SettableNode):
         """
         state = getattr(self._role, 'state', None)
         if state is None:
-            return self._health.report(
-                '', self._role.counters, standing=self._role.status())
-        return self._health.report(
+            return self._statistics.report(
+                '', self._role.counters, status=self._role.status())
+        return self._statistics.report(
             state.value, self._role.counters, state in self._role.LACKING,
             self._role.status())
 
@@ -144,7 +144,7 @@ class RoleNode(SettableNode):
         """
         self._codebook_source = CodebookSource(
             self, self.scenario, on_codebook,
-            lambda there: self._health.lack(topics.OPTIMIZER_NODE, not there))
+            lambda there: self._statistics.set_available(topics.OPTIMIZER_NODE, there))
 
     def advertise(self, sends: Iterable[type[m.Message]]) -> None:
         """Create publishers; the graph then shows that the role is there.
@@ -238,7 +238,7 @@ class RoleNode(SettableNode):
 
     def _receiver(self, kind: type[m.Message]) -> Callable[[bytes], None]:
         def receive(serialized: bytes) -> None:
-            self._health.receive(kind)
+            self._statistics.count_received(kind)
             try:
                 message = convert.from_bytes(kind, serialized)
                 m.check(message, self._sizes)
@@ -252,7 +252,7 @@ class RoleNode(SettableNode):
     def _hand(self, event: Event, now_s: float) -> None:
         begin_s = time.perf_counter()
         actions = self._role.handle(event, now_s)
-        self._health.note(event, actions, now_s, time.perf_counter() - begin_s)
+        self._statistics.record(event, actions, now_s, time.perf_counter() - begin_s)
         self._do(actions)
 
     def _do(self, actions: list[Action]) -> None:

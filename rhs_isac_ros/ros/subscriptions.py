@@ -58,9 +58,9 @@ def listen(
     def complain(error: m.MessageError) -> None:
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
-    def take(kind: type[m.Message], message: object) -> None:
+    def take(kind: type[m.Message], serialized: bytes) -> None:
         try:
-            plain = convert.from_ros(kind, message)
+            plain = convert.from_bytes(kind, serialized)
             if sizes is not None:
                 m.check(plain, sizes)
         except m.MessageError as error:
@@ -69,4 +69,4 @@ def listen(
         then(plain)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
-                  lambda message, kind=kind: take(kind, message), qos.of(kind))
+                  lambda serialized, kind=kind: take(kind, serialized), qos.of(kind), raw=True)

@@ -1,1 +1,1 @@
-"""Tools for the terminal where there is no command ``ros2``; they need rclpy alone."""
+"""Command-line tools for a network: demonstration, live view, recordings, topics, parameters."""

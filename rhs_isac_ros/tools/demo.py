@@ -1,4 +1,4 @@
-"""The executable ``demo``: the whole network as processes, watched for some cycles."""
+"""The executable ``demo``: runs a whole network as processes and reports on its cycles."""
 
 import argparse
 import dataclasses
@@ -8,11 +8,14 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.experiments.arguments import check_directory, nonnegative_int, positive_int
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.ros.observer import CycleObserver
@@ -22,23 +25,23 @@ from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import find_each_other_quickly
 from rhs_isac_ros.tools.demo_report import draw, summary, table
 
-# Without a new cycle for this long, something is broken.
-_PATIENCE_S = 60.0
+# Maximum time between two complete cycles [s].
+_CYCLE_TIMEOUT_S = 60.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demo.
+    """Run the demonstration.
 
     Parameters
     ----------
     arguments
-        Command line; by default the process's.
+        Command line; by default that of the process.
 
     Returns
     -------
     int
         Exit code: 0 if every cycle was served, also after Ctrl-C; 1 if one was not; 2 if an
-        argument or a file is wrong.
+        argument or a file is invalid.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -46,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
-        print(f'error: {error}\nA codebook for a scenario is made by: python -m '
+        print(f'error: {error}\nTo create a codebook for a scenario: python -m '
               'rhs_isac_ros.codebook --scenario FILE --output FILE', file=sys.stderr)
         return 2
     try:
@@ -64,12 +67,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with processes:
                 start_network(processes, options.users, options.seed, options.config,
                               codebook_file, scenario)
-                problem = watch(observer, processes, options.cycles, _progress)
+                problem = watch(observer, processes, options.cycles, _show_progress)
         except (KeyboardInterrupt, ExternalShutdownException):
             problem = ''
         finally:
-            observer.destroy_node()
-            rclpy.try_shutdown()
+            observer.destroy_node()  # type: ignore[no-untyped-call]
+            try_shutdown()
             if recorder is not None:
                 recorder.close()
     try:
@@ -79,26 +82,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
-    """Read a scenario, and see whether a codebook fits it.
+    """Load a scenario, and check that a codebook matches it.
 
     Parameters
     ----------
     config
-        File of the scenario, or None for Table I.
+        Scenario file; None for the paper's Table I.
     codebook
-        File of the codebook, or None for the package's.
+        Codebook file; None for that of the package.
 
     Returns
     -------
     tuple of Scenario and pathlib.Path
-        The scenario, and where the codebook lies.
+        The scenario, and the absolute path of the codebook file.
 
     Raises
     ------
     ScenarioError
-        If the scenario file is wrong.
+        If the scenario file is invalid.
     CodebookError
-        If the codebook file is wrong, or does not fit.
+        If the codebook file is invalid, or does not match the scenario.
     """
     scenario = Scenario.from_yaml(config) if config else Scenario()
     codebook_file = Path(codebook or default_codebook_file()).resolve()
@@ -106,56 +109,36 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
     return scenario, codebook_file
 
 
-def check_directory(parser: argparse.ArgumentParser, argument: str, file: Path | None) -> None:
-    """End with a usage error if a file could not be written at the end of a run.
-
-    Parameters
-    ----------
-    parser
-        The parser of the command line.
-    argument
-        Name of the argument.
-    file
-        Its value; None if it was not given.
-    """
-    if file and not file.resolve().parent.is_dir():
-        parser.error(f'argument {argument}: {file}, expected a file in a directory that exists')
-
-
 def start_network(
         processes: Processes, users: int, seed: int, scenario_file: Path | None,
         codebook_file: Path, scenario: Scenario, rest_s: float = 0.1, first_cycle: int = 1,
         impairments: Impairments | None = None) -> None:
-    """Start every node as a process of its own.
+    """Start every node of a network as a process.
 
     Parameters
     ----------
-    processes
-        Starts and ends them.
     users
-        How many users, numbered from 1, which walk at random at the highest speed.
+        Number of users; they walk at random at the scenario's maximum speed.
     seed
         Seed of all random numbers.
     scenario_file
-        File of the scenario, or None for Table I.
-    codebook_file
-        File of the codebook.
-    scenario
-        The scenario itself.
+        File of `scenario`; None for the paper's Table I.
     rest_s
         Pause between cycles [s].
     first_cycle
-        Number of the first cycle. With numbers from 1, a seed gives the same cycles again; 0, for
-        a base station that is started anew: numbers from the clock.
+        Number of the first cycle. With 1, cycles are reproducible for a seed; with 0, numbers
+        are derived from the clock, so that the base station can be restarted.
     impairments
-        What the air does to signals and packets; by default nothing.
+        Impairments of signals and packets; by default none.
     """
-    common = {'scenario_file': Path(scenario_file).resolve()} if scenario_file else {}
+    common: dict[str, Any] = {}
+    if scenario_file:
+        common['scenario_file'] = Path(scenario_file).resolve()
     for executable in ('rhs_controller', 'positioner', 'transmission'):
         processes.start(executable, **common)
     processes.start('optimizer', codebook_file=codebook_file, **common)
-    air = dataclasses.asdict(impairments or Impairments())
-    processes.start('channel', seed=seed, **air, **common)
+    impaired = dataclasses.asdict(impairments or Impairments())
+    processes.start('channel', seed=seed, **impaired, **common)
     for user in range(1, users + 1):
         processes.start('user', f'user_{user}', user_id=user, seed=seed, mobility='random_walk',
                         speed_mps=scenario.max_user_speed_mps, **common)
@@ -164,24 +147,20 @@ def start_network(
 
 def watch(
         observer: CycleObserver, processes: Processes, cycles: int,
-        progress: Callable[[int, int], None]) -> str:
-    """Spin an observer until it has seen enough cycles.
+        on_progress: Callable[[int, int], None]) -> str:
+    """Spin an observer until it has received enough complete cycles.
 
     Parameters
     ----------
-    observer
-        The observer.
-    processes
-        The network.
     cycles
-        How many complete cycles to wait for.
-    progress
-        Called with the number of complete cycles and the goal, whenever the first changes.
+        Number of complete cycles to wait for.
+    on_progress
+        Called with the number of complete cycles and `cycles` when the former changes.
 
     Returns
     -------
     str
-        What went wrong, or nothing.
+        Description of the error that ended the wait; empty if there was none.
     """
     seen, changed_s = -1, time.monotonic()
     while seen < cycles:
@@ -189,50 +168,41 @@ def watch(
         complete = len(observer.log.complete)
         if complete != seen:
             seen, changed_s = complete, time.monotonic()
-            progress(complete, cycles)
+            on_progress(complete, cycles)
         for name, code in processes.ended().items():
             return f'{name} ended with exit code {code}:\n{processes.log(name)}'
-        if time.monotonic() - changed_s > _PATIENCE_S:
-            return f'no cycle for {_PATIENCE_S:.0f} s; the base station says:\n' + (
-                processes.log('bs'))
+        if time.monotonic() - changed_s > _CYCLE_TIMEOUT_S:
+            return (f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station:\n'
+                    f'{processes.log("bs")}')
     return ''
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='demo', description='Start the network, every node as a process, and report on '
-        'its cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--users', type=_positive, default=2, help='number of users')
-    parser.add_argument('--cycles', type=_positive, default=20, help='cycles to wait for')
-    parser.add_argument('--seed', type=_not_negative, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', type=Path, help="scenario file; the paper's Table I if none")
-    parser.add_argument('--codebook', type=Path, help="codebook file; the package's if none")
+        prog='demo', description='Start a network, every node as a process, and report on its '
+        'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument('--users', type=positive_int, default=2, help='number of users')
+    parser.add_argument('--cycles', type=positive_int, default=20, help='cycles to wait for')
+    parser.add_argument('--seed', type=nonnegative_int, default=0,
+                        help='seed of all random numbers')
+    parser.add_argument('--config', type=Path,
+                        help="scenario file; by default the paper's Table I")
+    parser.add_argument('--codebook', type=Path,
+                        help='codebook file; by default that of the package')
     parser.add_argument('--record', type=Path, metavar='FILE', help='recording to write (MCAP)')
     parser.add_argument('--picture', type=Path, default=Path('demo.png'), help='file to draw')
     return parser
 
 
-def _positive(text: str) -> int:
-    if int(text) < 1:
-        raise argparse.ArgumentTypeError(f'{text}, expected at least 1')
-    return int(text)
-
-
-def _not_negative(text: str) -> int:
-    if int(text) < 0:
-        raise argparse.ArgumentTypeError(f'{text}, expected at least 0')
-    return int(text)
-
-
-def _progress(seen: int, goal: int) -> None:
-    if seen == 0:
+def _show_progress(complete: int, goal: int) -> None:
+    if complete == 0:
         print(f'network started with ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}, '
               'waiting for the first cycle', file=sys.stderr)
     elif sys.stderr.isatty():
-        print(f'\rcycle {seen} of {goal}', end='\n' if seen >= goal else '', file=sys.stderr,
-              flush=True)
-    elif seen % 10 == 0 or seen >= goal:
-        print(f'cycle {seen} of {goal}', file=sys.stderr)
+        print(f'\rcycle {complete} of {goal}', end='\n' if complete >= goal else '',
+              file=sys.stderr, flush=True)
+    elif complete % 10 == 0 or complete >= goal:
+        print(f'cycle {complete} of {goal}', file=sys.stderr)
 
 
 def _report(

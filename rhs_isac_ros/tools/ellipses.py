@@ -1,15 +1,15 @@
-"""Ellipses of covariances, as pictures draw them."""
+"""Ellipses that represent covariances in pictures."""
 
 import math
 
 import numpy as np
 
-# Quantile of the squared distance that holds 95 % of a Gaussian in two dimensions.
+# Quantile of the chi-square distribution with two degrees of freedom at 95 %.
 _CHI_SQUARE_95 = -2 * math.log(0.05)
 
 
 def ellipse_95(covariance_m2: np.ndarray) -> tuple[float, float, float]:
-    """Return the ellipse that holds 95 % of a Gaussian in a plane.
+    """Return the ellipse that contains 95 % of a Gaussian distribution in a plane.
 
     Parameters
     ----------

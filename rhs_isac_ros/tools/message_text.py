@@ -1,4 +1,4 @@
-"""ROS messages as text, laid out as by ``ros2 topic echo``."""
+"""ROS messages as text, in the layout of ``ros2 topic echo``."""
 
 import array
 import dataclasses
@@ -12,58 +12,33 @@ import yaml
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What of a message is written.
+    """Options of the text.
 
     Attributes
     ----------
-    longest
-        Entries of an array, or characters of a string, after which dots follow; None: all.
+    max_length
+        Maximum number of entries of an array or characters of a string; the rest is replaced by
+        dots. None: unlimited.
     arrays, strings
-        Whether they are written; only type and length otherwise.
+        Whether their values are written; otherwise only type and length.
     flow
-        Whether collections stand on one line.
+        Whether collections are written on one line.
     """
 
-    longest: int | None = None
+    max_length: int | None = None
     arrays: bool = True
     strings: bool = True
     flow: bool = False
 
 
 def as_yaml(message: Any, layout: Layout) -> str:
-    """Write a message as YAML.
-
-    Parameters
-    ----------
-    message
-        A ROS message.
-    layout
-        What to write.
-
-    Returns
-    -------
-    str
-        The text, with an end of line.
-    """
+    """Return a ROS message as YAML, ending with a newline."""
     return yaml.dump(_mapping(message, layout), sort_keys=False, allow_unicode=True,
                      width=sys.maxsize, default_flow_style=layout.flow)
 
 
 def as_csv(message: Any, layout: Layout) -> str:
-    """Write all fields of a message, and of those within it, with commas between.
-
-    Parameters
-    ----------
-    message
-        A ROS message.
-    layout
-        What to write.
-
-    Returns
-    -------
-    str
-        One line, without its end.
-    """
+    """Return all fields of a ROS message and of nested messages, separated by commas."""
     return ','.join(str(leaf) for leaf in _leaves(_mapping(message, layout)))
 
 
@@ -73,17 +48,18 @@ def _mapping(message: Any, layout: Layout) -> dict[str, Any]:
 
 
 def _plain(value: Any, kind: str, layout: Layout) -> Any:
-    """Return a value made of what YAML knows."""
-    longest = layout.longest
+    """Convert a value to types that YAML supports."""
+    max_length = layout.max_length
     match value:
         case bytes():
-            return _cut(''.join(map(chr, value)), longest)
+            return _truncate(''.join(map(chr, value)), max_length)
         case str():
-            return _cut(value, longest) if layout.strings else f'<string length: <{len(value)}>>'
+            return (_truncate(value, max_length) if layout.strings
+                    else f'<string length: <{len(value)}>>')
         case list() | tuple() | array.array() | np.ndarray():
             if kind and not layout.arrays:
-                return _outline(kind, len(value))
-            entries = [_plain(entry, '', layout) for entry in value[:longest]]
+                return _array_summary(kind, len(value))
+            entries = [_plain(entry, '', layout) for entry in value[:max_length]]
             return entries + ['...'] * (len(value) > len(entries))
         case np.generic():
             return value.item()
@@ -92,14 +68,18 @@ def _plain(value: Any, kind: str, layout: Layout) -> Any:
     return _mapping(value, layout)
 
 
-def _cut(text: str, longest: int | None) -> str:
-    return text if longest is None or len(text) <= longest else f'{text[:longest]}...'
+def _truncate(text: str, max_length: int | None) -> str:
+    if max_length is None or len(text) <= max_length:
+        return text
+    return f'{text[:max_length]}...'
 
 
-def _outline(kind: str, length: int) -> str:
-    """Return type and length of an array, from the type as a message tells it."""
-    sequence = re.fullmatch(r'sequence<(.+?)(?:, (\d+))?>', kind)
-    entry, bound = sequence.groups() if sequence else re.fullmatch(r'(.+)\[(\d+)\]', kind).groups()
+def _array_summary(kind: str, length: int) -> str:
+    """Return type and length of an array, from the type as the message class names it."""
+    if sequence := re.fullmatch(r'sequence<(.+?)(?:, (\d+))?>', kind):
+        entry, bound = sequence.groups()
+    else:
+        entry, _, bound = kind.removesuffix(']').rpartition('[')
     entry = entry.replace('/', '/msg/')
     bound = f'[{bound}]' if bound else ''
     return (f'<sequence type: {entry}{bound}, length: {length}>' if sequence
@@ -109,6 +89,6 @@ def _outline(kind: str, length: int) -> str:
 def _leaves(value: Any) -> list[Any]:
     if isinstance(value, dict | list):
         entries = value.values() if isinstance(value, dict) else value
-        # An empty array still has its place.
+        # An empty array takes one column.
         return [leaf for entry in entries for leaf in _leaves(entry)] or ['']
     return [value]

@@ -1,4 +1,4 @@
-"""``scripts/param``: what of ``ros2 param`` the wheels lack, with the same output.
+"""``scripts/param``: ``ros2 param``, which the wheels lack, with the same output.
 
 ``python -m rhs_isac_ros.tools.param --help`` lists the commands.
 """
@@ -15,12 +15,12 @@ from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from rhs_isac_ros.tools.session import Session, ToolError, run_tool, say
+from rhs_isac_ros.tools.session import Session, ToolError, print_now, run_tool
 
-# How long a node's services, and their answers, may take [s].
-_PATIENCE_S = 5.0
-# What stands before a value, and what ``--param-type`` says, by the type of a parameter.
-_WORDS = {
+# Maximum time to discover a node's services, and for a response [s].
+_SERVICE_TIMEOUT_S = 5.0
+# Label of a value, and name of the type for ``--param-type``.
+_LABELS = {
     ParameterType.PARAMETER_NOT_SET: ('Parameter not set.', 'not set'),
     ParameterType.PARAMETER_BOOL: ('Boolean value is:', 'boolean'),
     ParameterType.PARAMETER_INTEGER: ('Integer value is:', 'integer'),
@@ -35,90 +35,57 @@ _WORDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command on parameters.
-
-    Parameters
-    ----------
-    arguments
-        Command line; by default the process's.
-
-    Returns
-    -------
-    int
-        Exit code, as of `run_tool`.
-    """
+    """Run a command on parameters, and return the exit code as of `run_tool`."""
     return run_tool(_parser(), arguments)
 
 
 def get(session: Session, options: argparse.Namespace) -> None:
-    """Print a parameter's value.
-
-    Parameters
-    ----------
-    session
-        The session.
-    options
-        ``node_name``, ``parameter_name``, ``hide_type``, ``timeout``.
+    """Print the value of a parameter.
 
     Raises
     ------
     ToolError
-        If there is no such node, or it has no such parameter.
+        If the node or its parameter does not exist.
     """
     node = _find(session, options)
-    values = _values(session, node, [options.parameter_name])
+    values = _get_values(session, node, [options.parameter_name])
     if not values:
         raise ToolError('Parameter not set')
-    label, value = _WORDS[values[0].type][0], parameter_value_to_python(values[0])
+    label, value = _LABELS[values[0].type][0], parameter_value_to_python(values[0])
     if options.hide_type:
-        say(value)
+        print_now(value)
     elif value is None:
-        say(label)
+        print_now(label)
     else:
-        say(label, value)
+        print_now(label, value)
 
 
-def set_one(session: Session, options: argparse.Namespace) -> None:
+def set_value(session: Session, options: argparse.Namespace) -> None:
     """Set a parameter.
-
-    Parameters
-    ----------
-    session
-        The session.
-    options
-        ``node_name``, ``parameter_name``, ``value`` as YAML, ``timeout``.
 
     Raises
     ------
     ToolError
-        If there is no such node, or it refuses the value.
+        If the node does not exist, or it rejects the value.
     """
     node = _find(session, options)
     parameter = Parameter(
         name=options.parameter_name, value=get_parameter_value(string_value=options.value))
-    answer = _ask(session, node, lambda client: client.set_parameters([parameter]))
-    (result,) = answer.results
+    response = _call(session, node, lambda client: client.set_parameters([parameter]))
+    (result,) = response.results
     reason = f': {result.reason}' if result.reason else ''
     if not result.successful:
         raise ToolError(f'Setting parameter failed{reason}')
-    say(f'Set parameter successful{reason}')
+    print_now(f'Set parameter successful{reason}')
 
 
 def show_list(session: Session, options: argparse.Namespace) -> None:
-    """Print the names of the parameters of a node, or of all.
-
-    Parameters
-    ----------
-    session
-        The session.
-    options
-        ``node_name``, ``filter``, ``param_prefixes``, ``param_type``, ``include_hidden_nodes``,
-        ``timeout``.
+    """Print the names of the parameters of one node or of all nodes.
 
     Raises
     ------
     ToolError
-        If there is no such node, or one does not answer.
+        If the node does not exist, or one does not respond.
     """
     if options.node_name:
         nodes = [_find(session, options)]
@@ -126,51 +93,45 @@ def show_list(session: Session, options: argparse.Namespace) -> None:
         session.discover(options.timeout)
         nodes = sorted(_nodes(session, options.include_hidden_nodes))
     for node in nodes:
-        listed = _ask(session, node, lambda client: client.list_parameters(options.param_prefixes))
-        names = sorted(name for name in listed.result.names
+        response = _call(
+            session, node, lambda client: client.list_parameters(options.param_prefixes))
+        names = sorted(name for name in response.result.names
                        if not options.filter or re.match(options.filter, name))
         if names and not options.node_name:
-            say(f'{node}:')
-        for line in _typed(session, node, names) if options.param_type else names:
-            say(f'  {line}')
+            print_now(f'{node}:')
+        for line in _with_types(session, node, names) if options.param_type else names:
+            print_now(f'  {line}')
 
 
-def _typed(session: Session, node: str, names: list[str]) -> list[str]:
-    described = _ask(session, node, lambda client: client.describe_parameters(names))
-    return [f'{descriptor.name} (type: {_WORDS[descriptor.type][1]})'
-            for descriptor in described.descriptors]
+def _with_types(session: Session, node: str, names: list[str]) -> list[str]:
+    response = _call(session, node, lambda client: client.describe_parameters(names))
+    return [f'{descriptor.name} (type: {_LABELS[descriptor.type][1]})'
+            for descriptor in response.descriptors]
 
 
 def dump(session: Session, options: argparse.Namespace) -> None:
-    """Print a node's parameters as a parameter file.
-
-    Parameters
-    ----------
-    session
-        The session.
-    options
-        ``node_name``, ``timeout``.
+    """Print the parameters of a node as a parameter file.
 
     Raises
     ------
     ToolError
-        If there is no such node, or it does not answer.
+        If the node does not exist or does not respond.
     """
     node = _find(session, options)
-    listed = _ask(session, node, lambda client: client.list_parameters())
-    names = sorted(listed.result.names)
+    response = _call(session, node, lambda client: client.list_parameters())
+    names = sorted(response.result.names)
     tree: dict[str, Any] = {}
-    for name, value in zip(names, _values(session, node, names), strict=True):
-        *branches, leaf = name.split('.')
-        place = tree
-        for branch in branches:
-            place = place.setdefault(branch, {})
-        place[leaf] = parameter_value_to_python(value)
-    say(yaml.dump({node: {'ros__parameters': tree}}, default_flow_style=False))
+    for name, value in zip(names, _get_values(session, node, names), strict=True):
+        *groups, leaf = name.split('.')
+        group = tree
+        for key in groups:
+            group = group.setdefault(key, {})
+        group[leaf] = parameter_value_to_python(value)
+    print_now(yaml.dump({node: {'ros__parameters': tree}}, default_flow_style=False))
 
 
-def _values(session: Session, node: str, names: list[str]) -> Sequence[Any]:
-    return _ask(session, node, lambda client: client.get_parameters(names)).values
+def _get_values(session: Session, node: str, names: list[str]) -> list[Any]:
+    return list(_call(session, node, lambda client: client.get_parameters(names)).values)
 
 
 def _nodes(session: Session, hidden: bool) -> set[str]:
@@ -180,23 +141,23 @@ def _nodes(session: Session, hidden: bool) -> set[str]:
 
 
 def _find(session: Session, options: argparse.Namespace) -> str:
-    """Wait for a node, and return its full name."""
+    """Wait for the node `options.node_name`, and return its full name."""
     name = f'/{options.node_name.removeprefix("/")}'
-    if not session.until(
+    if not session.spin_until(
             lambda: name in _nodes(session, options.include_hidden_nodes), options.timeout):
         raise ToolError('Node not found')
     return name
 
 
-def _ask(session: Session, node: str, request: Callable[[AsyncParameterClient], Future]) -> Any:
-    """Return a node's answer."""
+def _call(session: Session, node: str, request: Callable[[AsyncParameterClient], Future]) -> Any:
+    """Send a request to a node's parameter services, and return the response."""
     client = AsyncParameterClient(session.node, node)
-    if not session.until(client.services_are_ready, _PATIENCE_S):
+    if not session.spin_until(client.services_are_ready, _SERVICE_TIMEOUT_S):
         raise ToolError('Wait for service timed out waiting for parameter services for node '
                         f'{node}')
     future = request(client)
-    if not session.until(future.done, _PATIENCE_S):
-        raise ToolError(f'{node}: no answer within {_PATIENCE_S:g} s')
+    if not session.spin_until(future.done, _SERVICE_TIMEOUT_S):
+        raise ToolError(f'{node}: no response within {_SERVICE_TIMEOUT_S:g} s')
     return future.result()
 
 
@@ -205,22 +166,28 @@ def _parser() -> argparse.ArgumentParser:
         prog='param', description='Read and set the parameters of running nodes.')
     verbs = parser.add_subparsers(required=True, metavar='list | get | set | dump')
     subparsers = {}
-    for word, verb in (('list', show_list), ('get', get), ('set', set_one), ('dump', dump)):
-        add = subparsers[word] = verbs.add_parser(word, help=verb.__doc__.partition('\n')[0])
-        add.set_defaults(verb=verb)
-        add.add_argument('node_name', nargs='?' if verb is show_list else None)
-        if verb in (get, set_one):
-            add.add_argument('parameter_name')
-        add.add_argument('--include-hidden-nodes', action='store_true', help='also hidden ones')
-        add.add_argument('--timeout', type=float, default=3.0, metavar='S',
-                         help='how long to wait for the node (default: 3 s)')
-    subparsers['set'].add_argument('value', help='as in YAML')
-    subparsers['get'].add_argument('--hide-type', action='store_true', help='only the value')
-    add = subparsers['list']
-    add.add_argument('--filter', metavar='REGEX', help='only names that it matches')
-    add.add_argument('--param-prefixes', nargs='+', default=[], metavar='PREFIX',
-                     help='only names with one of these prefixes')
-    add.add_argument('--param-type', action='store_true', help='also the types')
+    for name, verb, text in (
+            ('list', show_list, 'Print the names of the parameters of one node or of all nodes.'),
+            ('get', get, 'Print the value of a parameter.'),
+            ('set', set_value, 'Set a parameter.'),
+            ('dump', dump, 'Print the parameters of a node as a parameter file.')):
+        subparser = subparsers[name] = verbs.add_parser(name, help=text)
+        subparser.set_defaults(verb=verb)
+        subparser.add_argument('node_name', nargs='?' if verb is show_list else None)
+        if verb in (get, set_value):
+            subparser.add_argument('parameter_name')
+        subparser.add_argument('--include-hidden-nodes', action='store_true',
+                               help='include hidden nodes')
+        subparser.add_argument('--timeout', type=float, default=3.0, metavar='S',
+                               help='maximum time to discover the node (default: 3 s)')
+    subparsers['set'].add_argument('value', help='value in YAML')
+    subparsers['get'].add_argument('--hide-type', action='store_true',
+                                   help='print the value without its type')
+    subparser = subparsers['list']
+    subparser.add_argument('--filter', metavar='REGEX', help='only names that match')
+    subparser.add_argument('--param-prefixes', nargs='+', default=[], metavar='PREFIX',
+                           help='only names with one of these prefixes')
+    subparser.add_argument('--param-type', action='store_true', help='print the types')
     return parser
 
 

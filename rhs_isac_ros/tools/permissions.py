@@ -1,7 +1,7 @@
-"""Which node may use which topic and service, as a policy for SROS2.
+"""Permissions of the nodes for topics and services, as a policy for SROS2.
 
-``python -m rhs_isac_ros.tools.permissions`` prints the policy. ``config/sros2`` has it for two
-users.
+``python -m rhs_isac_ros.tools.permissions`` prints the policy; ``config/sros2/policy.xml`` is the
+policy for two users.
 """
 
 import argparse
@@ -24,118 +24,122 @@ from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import topics
 
-# What every node of rclpy publishes, and the services that it offers.
-_ALWAYS_PUBLISHED = ('/parameter_events', '/rosout')
+# Topics that every rclpy node publishes, and services that it offers.
+_RCLPY_TOPICS = ('/parameter_events', '/rosout')
 _PARAMETER_SERVICES = (
     'describe_parameters', 'get_parameter_types', 'get_parameters', 'list_parameters',
     'set_parameters', 'set_parameters_atomically')
-_OFFERED = tuple(f'~/{service}' for service in (*_PARAMETER_SERVICES, 'get_type_description'))
+_OFFERED_SERVICES = tuple(
+    f'~/{service}' for service in (*_PARAMETER_SERVICES, 'get_type_description'))
 _GET_CODEBOOK = f'{topics.OPTIMIZER_NODE}/get_parameters'
 _VERSION = '0.2.0'
 
 
 class Permissions(NamedTuple):
-    """What a node may do; names are relative to its namespace, or to itself with a ``~``.
+    """Topics and services of a node.
+
+    Names are relative to its namespace, or with a ``~`` to the node.
 
     Attributes
     ----------
     publish, subscribe
         Topics.
     reply, request
-        Services that it offers, and that it calls.
+        Services that the node offers, and services that it calls.
     """
 
     publish: tuple[str, ...] = ()
     subscribe: tuple[str, ...] = ()
-    reply: tuple[str, ...] = _OFFERED
+    reply: tuple[str, ...] = _OFFERED_SERVICES
     request: tuple[str, ...] = ()
 
 
 def permissions(users: int) -> dict[str, Permissions]:
-    """Return what the nodes of a network may do: what they do, and nothing else.
+    """Return the permissions that the nodes of a network need, and no others.
 
     Parameters
     ----------
     users
-        How many users, numbered from 1.
+        Number of users; they are numbered from 1.
 
     Returns
     -------
     dict
-        By node; ``operator`` is for who looks on from a terminal and sets parameters.
+        Permissions by node. ``operator`` stands for the command-line tools, which may read all
+        topics and set parameters.
     """
-    told = (topics.DIAGNOSTICS,)
-    codebook = {'takes': (topics.CODEBOOK,), 'request': (_GET_CODEBOOK,)}
+    diagnostics = (topics.DIAGNOSTICS,)
     nodes = {
-        'bs': _access(BaseStation.SENDS, BaseStation.RECEIVES, told, **codebook),
-        'channel': _access(Channel.SENDS, Channel.RECEIVES, told),
-        'optimizer': _access((), (), (*told, topics.CODEBOOK)),
-        'positioner': _access(
-            Positioner.SENDS, Positioner.RECEIVES, (*told, topics.POSITION), **codebook),
-        'rhs_controller': _access(
-            RhsController.SENDS, RhsController.RECEIVES, told, **codebook),
-        'transmission': _access(Transmission.SENDS, Transmission.RECEIVES, told, **codebook),
-        'visualizer': _access((), SCENE_RECEIVES, (topics.MARKERS, *_paths(users))),
-        **{f'user_{number}': _access(User.SENDS, User.RECEIVES, told)
+        'bs': _with_codebook(_of_messages(BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)),
+        'channel': _of_messages(Channel.SENDS, Channel.RECEIVES, diagnostics),
+        'optimizer': _of_messages((), (), (*diagnostics, topics.CODEBOOK)),
+        'positioner': _with_codebook(_of_messages(
+            Positioner.SENDS, Positioner.RECEIVES, (*diagnostics, topics.POSITION))),
+        'rhs_controller': _with_codebook(_of_messages(
+            RhsController.SENDS, RhsController.RECEIVES, diagnostics)),
+        'transmission': _with_codebook(_of_messages(
+            Transmission.SENDS, Transmission.RECEIVES, diagnostics)),
+        'visualizer': _of_messages((), SCENE_RECEIVES, (topics.MARKERS, *_paths(users))),
+        **{f'user_{number}': _of_messages(User.SENDS, User.RECEIVES, diagnostics)
            for number in range(1, users + 1)},
     }
     return {**nodes, 'operator': _operator(nodes, users)}
 
 
-def _access(
+def _of_messages(
         sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
-        gives: tuple[str, ...] = (), takes: tuple[str, ...] = (),
-        request: tuple[str, ...] = ()) -> Permissions:
-    """Permissions to the topics of messages, and to some others by name."""
+        publishes: Iterable[str]) -> Permissions:
+    """Return permissions for messages, and for publishing other topics by name."""
     return Permissions(
-        publish=(*sorted([*(topics.NAMES[kind] for kind in sends), *gives]), *_ALWAYS_PUBLISHED),
-        subscribe=tuple(sorted([*(topics.NAMES[kind] for kind in receives), *takes])),
-        request=request)
+        publish=(*sorted([*(topics.NAMES[kind] for kind in sends), *publishes]), *_RCLPY_TOPICS),
+        subscribe=tuple(sorted(topics.NAMES[kind] for kind in receives)))
+
+
+def _with_codebook(permissions: Permissions) -> Permissions:
+    """Add the permissions to fetch the codebook from the optimizer."""
+    return permissions._replace(
+        subscribe=tuple(sorted([*permissions.subscribe, topics.CODEBOOK])),
+        request=(_GET_CODEBOOK,))
 
 
 def _paths(users: int) -> tuple[str, ...]:
-    """Names of the topics of the users' paths."""
+    """Return the names of the topics of the users' paths."""
     return tuple(name.format(user=number) for number in range(1, users + 1)
                  for name in (topics.PATH, topics.TRUE_PATH))
 
 
 def _operator(nodes: Iterable[str], users: int) -> Permissions:
-    """Hear everything, say nothing, and set the parameters of all.
+    """Return the permissions to subscribe to all topics and to set the parameters of all nodes.
 
-    Nodes of the terminal have names of their own, those of ``ros2`` with numbers.
+    Command-line tools have fixed names, those of ``ros2`` with a number.
     """
-    heard = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
-             topics.POSITION, *_paths(users)}
+    readable = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
+                topics.POSITION, *_paths(users)}
     return Permissions(
-        publish=_ALWAYS_PUBLISHED, subscribe=(*sorted(heard), *_ALWAYS_PUBLISHED),
-        reply=(*(service.replace('~', PUSHER_NODE) for service in _OFFERED),
+        publish=_RCLPY_TOPICS, subscribe=(*sorted(readable), *_RCLPY_TOPICS),
+        reply=(*(service.replace('~', PUSHER_NODE) for service in _OFFERED_SERVICES),
                '/_ros2cli_*/get_type_description'),
         request=tuple(f'{node}/{service}' for node in nodes for service in _PARAMETER_SERVICES))
 
 
 def policy(namespace: str = '/', users: int = 2) -> str:
-    """Return the policy of a network, every node in an enclave of its own.
+    """Return the policy of a network in the XML format of SROS2, with one enclave for each node.
 
     Parameters
     ----------
     namespace
-        Namespace of the network, which is also that of its enclaves.
+        Namespace of the network and of its enclaves.
     users
-        How many users.
-
-    Returns
-    -------
-    str
-        XML as SROS2 takes it; what it does not allow is denied.
+        Number of users.
     """
     root = ElementTree.Element('policy', version=_VERSION)
     enclaves = ElementTree.SubElement(root, 'enclaves')
-    for node, access in permissions(users).items():
+    for node, allowed in permissions(users).items():
         enclave = ElementTree.SubElement(
             enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
         profiles = ElementTree.SubElement(enclave, 'profiles')
         profile = ElementTree.SubElement(profiles, 'profile', ns=namespace, node=node)
-        for right, names in access._asdict().items():
+        for right, names in allowed._asdict().items():
             kind = 'topic' if right in ('publish', 'subscribe') else 'service'
             if names:
                 rules = ElementTree.SubElement(profile, f'{kind}s', {right: 'ALLOW'})
@@ -147,23 +151,13 @@ def policy(namespace: str = '/', users: int = 2) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the policy.
-
-    Parameters
-    ----------
-    arguments
-        Command line; by default the process's.
-
-    Returns
-    -------
-    int
-        Exit code.
-    """
+    """Print the policy, and return the exit code 0."""
     parser = argparse.ArgumentParser(
         prog='python -m rhs_isac_ros.tools.permissions', description='Print the SROS2 policy of a '
         'network.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--namespace', type=_namespace, default='/', help='of the network')
-    parser.add_argument('--users', type=_number, default=2, help='how many, numbered from 1')
+    parser.add_argument('--namespace', type=_namespace, default='/',
+                        help='namespace of the network')
+    parser.add_argument('--users', type=_user_count, default=2, help='number of users')
     options = parser.parse_args(arguments)
     print(policy(options.namespace, options.users), end='')
     return 0
@@ -177,7 +171,7 @@ def _namespace(text: str) -> str:
     return text
 
 
-def _number(text: str) -> int:
+def _user_count(text: str) -> int:
     if not 0 <= int(text) <= 1000:
         raise argparse.ArgumentTypeError(f'{text}, expected 0 to 1000')
     return int(text)

@@ -1,4 +1,4 @@
-"""How often messages come."""
+"""Rate of the messages of a topic."""
 
 import collections
 import itertools
@@ -6,44 +6,32 @@ import statistics
 
 
 class Rate:
-    """Intervals between the latest messages of a topic.
+    """Intervals between the newest messages of a topic.
 
     Parameters
     ----------
     window
-        How many intervals to keep.
+        Number of intervals to keep.
     """
 
     def __init__(self, window: int) -> None:
         self._times_ns: collections.deque[int] = collections.deque(maxlen=window + 1)
-        self._fresh = False
+        self._changed = False
 
     def add(self, time_ns: int) -> None:
-        """LogMessage a message; if the clock was set back, forget those before.
-
-        Parameters
-        ----------
-        time_ns
-            When it came [ns].
-        """
+        """Add a message that arrived at a time [ns]; discard the others if the clock went back."""
         if self._times_ns and time_ns < self._times_ns[-1]:
             self._times_ns.clear()
         self._times_ns.append(time_ns)
-        self._fresh = True
+        self._changed = True
 
     def report(self) -> str:
-        """Write the rate if a message came since the last report.
-
-        Returns
-        -------
-        str
-            Two lines as of ``ros2 topic hz``, or nothing.
-        """
+        """Return two lines as ``ros2 topic hz`` prints them; empty without a new message."""
         intervals_s = [1e-9 * (after - before)
                        for before, after in itertools.pairwise(self._times_ns)]
-        if not self._fresh or not intervals_s:
+        if not self._changed or not intervals_s:
             return ''
-        self._fresh = False
+        self._changed = False
         mean_s = statistics.fmean(intervals_s)
         rate_hz = 1 / mean_s if mean_s else 0.0
         return (f'average rate: {rate_hz:.3f}\n\tmin: {min(intervals_s):.3f}s '

@@ -1,4 +1,4 @@
-"""``scripts/record FILE``: takes down everything that is said in a network."""
+"""``scripts/record FILE``: records all topics of a network."""
 
 import argparse
 import sys
@@ -14,44 +14,39 @@ from rhs_isac_ros.ros.run import run
 
 
 class RecorderNode(Node):
-    """Records the topics of its namespace until it is destroyed.
-
-    Parameters
-    ----------
-    recorder
-        Writes the file.
-    """
+    """Records the topics of its namespace until it is destroyed."""
 
     def __init__(self, recorder: Recorder) -> None:
         super().__init__('recorder')
         self._recorder = recorder
-        self._seen: set[str] = set()
-        recorder.listen(self, self._report)
-        self.get_logger().info('recording; Ctrl-C ends it')
+        self._topics: set[str] = set()
+        recorder.listen(self, self._log_topic)
+        self._log = self.get_logger()  # type: ignore[no-untyped-call]
+        self._log.info('recording; press Ctrl-C to stop')
 
-    def _report(self, name: str, _: bytes) -> None:
-        if name not in self._seen:
-            self._seen.add(name)
-            self.get_logger().info(f'first message of {name}')
+    def _log_topic(self, name: str, message: bytes) -> None:
+        if name not in self._topics:
+            self._topics.add(name)
+            self._log.info(f'first message of {name}')
 
     def destroy_node(self) -> None:
-        """End the node, then complete the file."""
-        super().destroy_node()
+        """Destroy the node and close the file."""
+        super().destroy_node()  # type: ignore[no-untyped-call]
         self._recorder.close()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Record until a signal comes.
+    """Record until a signal arrives.
 
     Parameters
     ----------
     arguments
-        Command line, ROS arguments among it; by default the process's.
+        Command line including ROS arguments; by default that of the process.
 
     Returns
     -------
     int
-        Exit code: 0 after a signal; 2 if an argument or a file is wrong.
+        Exit code: 0 after a signal; 2 if an argument or a file is invalid.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(remove_ros_args(['record', *arguments])[1:])
@@ -71,12 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='record', description='Record a network as MCAP until Ctrl-C. ROS arguments choose '
+        prog='record', description='Record a network as MCAP until Ctrl-C. ROS arguments select '
         'the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('file', type=Path, help='recording to write')
-    # Launch files pass an empty name where none is given.
+    # Launch files pass an empty name by default.
     parser.add_argument('--config', metavar='FILE',
-                        help="scenario file of the network; the paper's Table I if none or empty")
+                        help="scenario file of the network; the paper's Table I if empty")
     return parser
 
 

@@ -1,6 +1,7 @@
-"""``scripts/replay FILE``: what estimators make of the received signals of a recording.
+"""``scripts/replay FILE``: feeds the received signals of a recording to estimators.
 
-With ``--publish``, live nodes get them again: see `rhs_isac_ros.tools.republish`.
+With ``--publish``, they are published again to running nodes; see
+`rhs_isac_ros.tools.republish`.
 """
 
 import argparse
@@ -14,8 +15,9 @@ from rclpy.utilities import remove_ros_args
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.experiments.arguments import positive_float
 from rhs_isac_ros.model import Scenario, ScenarioError, plugins
-from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CycleLog, CycleRecord
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     Estimator,
@@ -27,68 +29,53 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.recording import RecordingError, outlets, read, read_scenario
-from rhs_isac_ros.tools.republish import RepublishError, republish, root_of
+from rhs_isac_ros.tools.republish import RepublishError, republish, topic_prefix
 
-# What can be published again: the codebook is a parameter first, and diagnostics are of nodes.
+# Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
+# would contradict those of the running nodes.
 _TOPICS = sorted(set(outlets()) - {topics.CODEBOOK, topics.DIAGNOSTICS})
 
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What a recording holds of one network.
-
-    Attributes
-    ----------
-    scenario
-        Its scenario.
-    cycles
-        Its complete cycles.
-    codebooks
-        Its codebooks, by their ids.
-    """
+    """Complete cycles of one network, with its scenario and its codebooks by id."""
 
     scenario: Scenario
-    cycles: list[CycleRecord]
+    cycles: list[CompleteCycle]
     codebooks: dict[str, Codebook]
 
 
 def load(path: str | Path, namespace: str = '/', scenario: Scenario | None = None) -> Recording:
-    """Read the cycles of a recording.
+    """Load the cycles of a recording.
 
     Parameters
     ----------
-    path
-        The file.
     namespace
         Namespace of the network.
     scenario
-        Scenario in place of the recording's.
-
-    Returns
-    -------
-    Recording
-        What it holds.
+        Scenario to use instead of the recorded one.
 
     Raises
     ------
     RecordingError
-        If the file is no recording, has no complete cycle in the namespace, or a message is
-        malformed.
+        If the file is not a recording, has no complete cycle in the namespace, or contains a
+        malformed message.
     ScenarioError, CodebookError
-        If the scenario or a codebook in it is wrong.
+        If the scenario or a codebook in it is invalid.
     """
     scenario = scenario or read_scenario(path) or Scenario()
-    root = root_of(namespace)
-    kinds = {f'{root}{topics.NAMES[kind]}': kind for kind in RECEIVES}
-    log, codebooks = CycleLog(), {}
-    for topic, message, time_s in read(path):
+    prefix = topic_prefix(namespace)
+    kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
+    log = CycleLog()
+    codebooks: dict[str, Codebook] = {}
+    for topic, ros_message, time_s in read(path):
         try:
             if topic in kinds:
-                plain = convert.from_ros(kinds[topic], message)
-                m.check(plain, scenario.sizes)
-                log.add(plain, time_s)
-            elif topic == f'{root}{topics.CODEBOOK}' and isinstance(message, ros.Codebook):
-                codebooks[message.codebook_id] = convert.codebook_from_ros(message)
+                message = convert.from_ros(kinds[topic], ros_message)
+                m.check(message, scenario.sizes)
+                log.add(message, time_s)
+            elif topic == f'{prefix}{topics.CODEBOOK}' and isinstance(ros_message, ros.Codebook):
+                codebooks[ros_message.codebook_id] = convert.codebook_from_ros(ros_message)
         except m.MessageError as error:
             raise RecordingError(f'{path}: {topic}: {error}') from None
     if not log.complete:
@@ -96,20 +83,20 @@ def load(path: str | Path, namespace: str = '/', scenario: Scenario | None = Non
     return Recording(scenario, log.complete, codebooks)
 
 
-def errors_m(cycles: Sequence[CycleRecord], estimators: Mapping[str, Estimator]) -> np.ndarray:
-    """Estimate every cycle's position anew and return the distances from the true ones.
+def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator]) -> np.ndarray:
+    """Estimate the position of every cycle again, and return the errors.
 
     Parameters
     ----------
     cycles
-        Complete cycles.
+        The cycles.
     estimators
-        Estimators by the id of the codebook with which the signals were taken.
+        Estimators by the id of the codebook with which the signals were received.
 
     Returns
     -------
     numpy.ndarray
-        Errors, float64 [len(cycles)] [m]; NaN where the signals tell no position.
+        Distances from the true positions, float64 [len(cycles)] [m]; NaN without a fix.
     """
     errors = []
     for cycle in cycles:
@@ -122,40 +109,29 @@ def errors_m(cycles: Sequence[CycleRecord], estimators: Mapping[str, Estimator])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the errors of the live network and of estimators that see its signals again.
+    """Print the recorded errors and those of estimators with the same signals.
 
     Parameters
     ----------
     arguments
-        Command line, ROS arguments among it; by default the process's.
+        Command line including ROS arguments; by default that of the process.
 
     Returns
     -------
     int
-        Exit code: 0, also after a signal; 1 if live nodes cannot be served; 2 if an argument or a
-        file is wrong.
+        Exit code: 0, also after a signal; 1 if the signals cannot be published to running nodes;
+        2 if an argument or a file is invalid.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
     options = parser.parse_args(remove_ros_args(['replay', *arguments])[1:])
     if options.publish and (options.estimator or options.model):
-        parser.error('argument --publish: live nodes estimate, expected no --estimator, --model')
+        parser.error('argument --publish: running nodes estimate, expected no --estimator or '
+                     '--model')
     try:
         if options.publish:
             return republish(options, ['replay', *arguments])
-        scenario = Scenario.from_yaml(options.config) if options.config else None
-        recording = load(options.file, options.namespace, scenario)
-        codebooks = _codebooks(recording, options.codebook)
-        live = np.array([cycle.error_m for cycle in recording.cycles])
-        names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
-        print(f'{len(live)} cycles\n{"":12s} median error  root mean square  no fix')
-        print(_row(f'live {", ".join(names)}', live))
-        for name in options.estimator or ['bayes']:
-            made = {key: make_estimator(
-                name, recording.scenario, codebook,
-                **file_options(name, default_folder(), options.model or ''))
-                for key, codebook in codebooks.items()}
-            print(_row(name, errors_m(recording.cycles, made)))
+        _compare(options)
     except (RecordingError, ScenarioError, CodebookError, ModelError, plugins.PluginError,
             OSError) as error:
         print(f'error: {error}', file=sys.stderr)
@@ -166,6 +142,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _compare(options: argparse.Namespace) -> None:
+    """Print a table of the recorded errors and of those of estimators."""
+    scenario = Scenario.from_yaml(options.config) if options.config else None
+    recording = load(options.file, options.namespace, scenario)
+    codebooks = _codebooks(recording, options.codebook)
+    live = np.array([cycle.error_m for cycle in recording.cycles])
+    names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
+    print(f'{len(live)} cycles\n{"":12s} median error  root mean square  no fix')
+    print(_row(f'live {", ".join(names)}', live))
+    for name in options.estimator or ['bayes']:
+        estimators = {codebook_id: make_estimator(
+            name, recording.scenario, codebook,
+            **file_options(name, default_folder(), options.model or ''))
+            for codebook_id, codebook in codebooks.items()}
+        print(_row(name, errors_m(recording.cycles, estimators)))
+
+
 def _row(name: str, errors: np.ndarray) -> str:
     fixes = errors[~np.isnan(errors)]
     median, rms = ((np.median(fixes), np.sqrt(np.mean(fixes**2))) if len(fixes)
@@ -174,59 +167,54 @@ def _row(name: str, errors: np.ndarray) -> str:
 
 
 def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
-    """Return the codebook for the signals of every cycle, checked."""
+    """Return the codebooks to assume, by the ids of those with which signals were received."""
     used = sorted({cycle.signals.codebook_id for cycle in recording.cycles})
     if file:
-        given = Codebook.load(file)
-        for key in used:
-            if key != given.id:
-                print(f'signals taken with codebook {key} are read as if with {given.id}',
-                      file=sys.stderr)
-        chosen = dict.fromkeys(used, given)
+        codebook = Codebook.load(file)
+        for codebook_id in used:
+            if codebook_id != codebook.id:
+                print(f'signals received with codebook {codebook_id} are evaluated with '
+                      f'{codebook.id}', file=sys.stderr)
+        assumed = dict.fromkeys(used, codebook)
     else:
-        missing = [key for key in used if key not in recording.codebooks]
+        missing = [codebook_id for codebook_id in used if codebook_id not in recording.codebooks]
         if missing:
             raise RecordingError(f'codebook {missing[0]}: not in the recording, expected its '
                                  'file: --codebook FILE')
-        chosen = {key: recording.codebooks[key] for key in used}
-    for codebook in chosen.values():
+        assumed = {codebook_id: recording.codebooks[codebook_id] for codebook_id in used}
+    for codebook in assumed.values():
         codebook.check(recording.scenario)
-    return chosen
+    return assumed
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='replay', description='Feed the received signals of a recording to estimators, and '
-        'compare their errors with those of the live network.')
+        'compare their errors with those of the recorded network.')
     parser.add_argument('file', type=Path, help='recording')
     parser.add_argument('--estimator', action='append',
                         choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
-                        help='may be given more than once (default: bayes)')
+                        help='may be repeated (default: bayes)')
     parser.add_argument('--codebook', type=Path, metavar='FILE',
-                        help="codebook to assume; the recording's if none")
+                        help='codebook to assume; by default the recorded one')
     parser.add_argument('--config', type=Path, metavar='FILE',
-                        help="scenario file; the recording's if none")
+                        help='scenario file; by default the recorded scenario')
     parser.add_argument('--model', type=Path, metavar='FILE', help='model of the estimator neural')
-    parser.add_argument('--namespace', default='/', help='network of the recording (default: /)')
+    parser.add_argument('--namespace', default='/',
+                        help='namespace of the recorded network (default: /)')
     live = parser.add_argument_group(
-        'live nodes', 'Publish the recorded signals again, with their timing, in the namespace '
-        'of --ros-args -r __ns:=... The codebook goes with them: unless the namespace has an '
-        'optimizer, the replay holds it as one would.')
+        'running nodes', 'Publish the recorded signals again, with their timing, in the namespace '
+        'of --ros-args -r __ns:=... Unless the namespace has an optimizer, the replay provides '
+        'the recorded codebook like one.')
     live.add_argument('--publish', action='store_true', help='publish instead of estimating')
-    live.add_argument('--rate', type=_positive, default=1.0, metavar='R',
-                      help='how many times as fast as recorded (default: 1)')
+    live.add_argument('--rate', type=positive_float, default=1.0, metavar='R',
+                      help='speed relative to the recording (default: 1)')
     live.add_argument('--topic', action='append', choices=_TOPICS, metavar='NAME',
-                      help='relative name; may be given more than once (default: '
+                      help='relative name; may be repeated (default: '
                       f'{topics.NAMES[m.ReceivedSignals]})')
-    live.add_argument('--timeout', type=_positive, default=60.0, metavar='S',
-                      help='how long to wait for listeners (default: 60 s)')
+    live.add_argument('--timeout', type=positive_float, default=60.0, metavar='S',
+                      help='maximum time to wait for subscribers (default: 60 s)')
     return parser
-
-
-def _positive(text: str) -> float:
-    if not 0 < float(text) < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text}, expected a positive number')
-    return float(text)
 
 
 if __name__ == '__main__':

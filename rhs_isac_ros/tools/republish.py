@@ -1,4 +1,4 @@
-"""Publishing a recording again to live nodes, with its timing and its codebooks."""
+"""Publishes a recording again to running nodes, with its timing and its codebooks."""
 
 import argparse
 import sys
@@ -25,39 +25,39 @@ from rhs_isac_ros.ros.timers import steady_timer
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
-# How often to look for listeners; how long an optimizer may take to be discovered [s].
-_LOOK_S = 0.05
-_DISCOVERY_S = 1.0
-_ACKNOWLEDGED = Duration(seconds=5)
+# Period of looking for subscribers; maximum time to discover an optimizer [s].
+_POLL_PERIOD_S = 0.05
+_DISCOVERY_TIMEOUT_S = 1.0
+_ACK_TIMEOUT = Duration(seconds=5)
 
 
 class RepublishError(Exception):
-    """Live nodes cannot be served."""
+    """A recording cannot be published to running nodes."""
 
 
 class RepublisherNode(Node):
-    """Publishes messages, each when it is due, as soon as somebody listens to all topics.
+    """Publishes messages at their recorded times once all topics have subscribers.
 
     Parameters
     ----------
     messages
-        Relative name of the topic, message and time [s], in the order of the times; a codebook
-        is for the optimizer.
+        Relative name of the topic, message and time [s], sorted by time; codebooks are passed to
+        the optimizer instead.
     names
         Relative names of the topics.
     rate
-        How many times as fast as recorded.
+        Speed relative to the recording.
 
     Attributes
     ----------
     optimizer
-        Holds the codebooks; None if another node does.
+        Provides the codebooks; None if another node does.
     count
-        Messages published.
+        Number of messages published.
     waits_for
-        The topic whose listener it waits for; empty once it publishes.
+        First topic without subscribers; empty once messages are published.
     finished
-        Whether all are published.
+        Whether all messages have been published.
     """
 
     def __init__(
@@ -68,39 +68,39 @@ class RepublisherNode(Node):
         self.count, self.finished, self.waits_for = 0, False, next(iter(names))
         self._messages, self._rate = iter(messages), rate
         self._next: tuple[str, Any, float] | None = None
-        # What the steady clock shows when that of the recording shows 0 [s]; None before the
-        # first message.
+        # Time on the steady clock at the recorded time 0 [s]; None before the first message.
         self._origin_s: float | None = None
         kinds = outlets()
-        self._outlets = {name: self.create_publisher(kinds[name][0], name, kinds[name][1])
-                         for name in names}
-        self._timer = steady_timer(self, _LOOK_S, self._look)
+        self._message_publishers = {
+            name: self.create_publisher(kinds[name][0], name, kinds[name][1]) for name in names}
+        self._timer = steady_timer(self, _POLL_PERIOD_S, self._poll_subscribers)
 
-    def _look(self) -> None:
-        self.waits_for = next((name for name in self._outlets if not self._heard(name)), '')
+    def _poll_subscribers(self) -> None:
+        self.waits_for = next(
+            (name for name in self._message_publishers if not self._has_subscribers(name)), '')
         if not self.waits_for:
             self._timer.cancel()
             self._next = next(self._messages, None)
-            self._timer = steady_timer(self, _LOOK_S, self._publish)
-            self._publish()
+            self._timer = steady_timer(self, _POLL_PERIOD_S, self._publish_due)
+            self._publish_due()
 
-    def _heard(self, name: str) -> bool:
-        """Tell whether the listeners of a topic are there."""
-        outlet, expected = self._outlets[name], 1
+    def _has_subscribers(self, name: str) -> bool:
+        """Return whether the subscribers of a topic are present."""
+        publisher, n_expected = self._message_publishers[name], 1
         if name == _SIGNALS:
-            # Onlookers hear them as well: what counts is who makes estimates of them, and that
-            # listens once its tables are built.
-            makers = {_name_of(end) for end in self.get_publishers_info_by_topic(
+            # Observers may subscribe to the signals as well. Needed are the nodes that publish
+            # estimates, and these subscribe to the signals only when their tables are complete.
+            estimators = {_full_name(endpoint) for endpoint in self.get_publishers_info_by_topic(
                 self.resolve_topic_name(_ESTIMATES))} - {self.get_fully_qualified_name()}
-            ears = {_name_of(end) for end in self.get_subscriptions_info_by_topic(
-                outlet.topic_name)}
-            if not makers or not makers <= ears:
+            subscribers = {_full_name(endpoint) for endpoint in
+                           self.get_subscriptions_info_by_topic(publisher.topic_name)}
+            if not estimators or not estimators <= subscribers:
                 return False
-            expected = len(ears)
-        return outlet.get_subscription_count() >= expected
+            n_expected = len(subscribers)
+        return publisher.get_subscription_count() >= n_expected
 
-    def _publish(self) -> None:
-        """Publish what is due, and wait for the next."""
+    def _publish_due(self) -> None:
+        """Publish the messages that are due, and set the timer for the next one."""
         while self._next:
             name, message, time_s = self._next
             now_s = time.monotonic()
@@ -112,31 +112,25 @@ class RepublisherNode(Node):
                 self._timer.reset()
                 return
             if name != topics.CODEBOOK:
-                self._outlets[name].publish(message)
+                self._message_publishers[name].publish(message)
                 self.count += 1
             elif self.optimizer:
                 self.optimizer.set_parameters_atomically(
                     _parameters(convert.codebook_from_ros(message)))
             self._next = next(self._messages, None)
         self._timer.cancel()
-        for outlet in self._outlets.values():
-            outlet.wait_for_all_acked(_ACKNOWLEDGED)
+        for publisher in self._message_publishers.values():
+            publisher.wait_for_all_acked(_ACK_TIMEOUT)
         self.finished = True
 
-    def others(self) -> list[str]:
-        """Return topics that another node publishes as well.
-
-        Returns
-        -------
-        list of str
-            Their relative names.
-        """
-        return [name for name, outlet in self._outlets.items()
-                if self.count_publishers(outlet.topic_name) > 1]
+    def conflicts(self) -> list[str]:
+        """Return the relative names of the topics that another node publishes as well."""
+        return [name for name, publisher in self._message_publishers.items()
+                if self.count_publishers(publisher.topic_name) > 1]
 
 
 def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
-    """Publish a recording to live nodes.
+    """Publish a recording to running nodes.
 
     Parameters
     ----------
@@ -148,76 +142,67 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     Returns
     -------
     int
-        Exit code: 0, also after a signal; 2 if a ROS argument is wrong.
+        Exit code: 0, also after a signal; 2 if a ROS argument is invalid.
 
     Raises
     ------
     RepublishError
-        If nobody listens, or another node publishes the same.
+        If a topic has no subscribers, or another node publishes it as well.
     RecordingError, ScenarioError, CodebookError
-        If a file is wrong.
+        If a file is invalid.
     """
     names = options.topic or [_SIGNALS]
     scenario = (Scenario.from_yaml(options.config) if options.config
                 else read_scenario(options.file) or Scenario())
-    first = _first_codebook(options, names)
-    if first:
-        first.check(scenario)
+    first_codebook = _first_codebook(options, names)
+    if first_codebook:
+        first_codebook.check(scenario)
     nodes: list[RepublisherNode] = []
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
         file = Path(folder) / 'scenario.yaml'
         file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
 
-        def make() -> list[Node]:
-            nodes.append(RepublisherNode(
-                _messages(options, [*names, topics.CODEBOOK]), names, options.rate))
-            if first and not _optimizer_is_there(nodes[0]):
-                nodes[0].optimizer = OptimizerNode(parameter_overrides=[
-                    Parameter('scenario_file', value=str(file)), *_parameters(first)])
-            return [*nodes, *filter(None, [nodes[0].optimizer])]
+        def create() -> list[Node]:
+            node = RepublisherNode(
+                _messages(options, [*names, topics.CODEBOOK]), names, options.rate)
+            nodes.append(node)
+            if first_codebook and not _optimizer_present(node):
+                node.optimizer = OptimizerNode(parameter_overrides=[
+                    Parameter('scenario_file', value=str(file)), *_parameters(first_codebook)])
+            return [node, *filter(None, [node.optimizer])]
         begin_s = time.monotonic()
 
         def done() -> bool:
             node = nodes[0]
-            if others := node.others():
-                raise RepublishError(f'{others[0]}: another node publishes it, expected none')
+            if conflicts := node.conflicts():
+                raise RepublishError(f'{conflicts[0]}: another node publishes it, expected none')
             if node.waits_for and time.monotonic() > begin_s + options.timeout:
-                raise RepublishError(f'{node.waits_for}: nobody listens within '
+                raise RepublishError(f'{node.waits_for}: no subscriber within '
                                      f'{options.timeout:g} s')
             return node.finished
-        code = run(make, arguments, done)
+        code = run(create, arguments, done)
     if nodes:
         print(f'{nodes[0].count} messages published')
     return code
 
 
-def root_of(namespace: str) -> str:
-    """Return what the full names of a namespace's topics begin with.
-
-    Parameters
-    ----------
-    namespace
-        The namespace.
-
-    Returns
-    -------
-    str
-        It with a slash at both ends.
-    """
+def topic_prefix(namespace: str) -> str:
+    """Return the prefix of the full names of the topics in a namespace."""
     return f'/{namespace.strip("/")}/'.replace('//', '/')
 
 
 def _messages(
         options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, Any, float]]:
-    """Read messages of a recording, with the relative names of their topics."""
-    full = {f'{root_of(options.namespace)}{name}': name for name in names}
-    for topic, message, time_s in read(options.file, full):
-        yield full[topic], message, time_s
+    """Yield messages of a recording with the relative names of their topics."""
+    full_names = {f'{topic_prefix(options.namespace)}{name}': name for name in names}
+    for topic, message, time_s in read(options.file, full_names):
+        yield full_names[topic], message, time_s
 
 
 def _first_codebook(options: argparse.Namespace, names: Collection[str]) -> Codebook | None:
-    """Return the codebook to begin with, if there are signals that need it."""
-    used, codebooks = [], {}
+    """Return the codebook of the first signals; None if no signals are to be published."""
+    used: list[str] = []
+    codebooks: dict[str, Any] = {}
     for name, message, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):
         if name == topics.CODEBOOK:
             codebooks.setdefault(message.codebook_id, message)
@@ -229,27 +214,29 @@ def _first_codebook(options: argparse.Namespace, names: Collection[str]) -> Code
         raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
                              f'{options.namespace}')
     if options.codebook:
-        given = Codebook.load(options.codebook)
-        if given.id != used[0]:
-            raise RecordingError(f'{options.codebook}: codebook {given.id}, but the signals were '
-                                 f'taken with {used[0]}: live nodes would drop them')
-        return given
+        codebook = Codebook.load(options.codebook)
+        if codebook.id != used[0]:
+            raise RecordingError(
+                f'{options.codebook}: codebook {codebook.id}, but the signals were received with '
+                f'{used[0]}: running nodes would drop them')
+        return codebook
     if used[0] not in codebooks:
         raise RecordingError(f'codebook {used[0]}: not in the recording, expected its file: '
                              '--codebook FILE')
     return convert.codebook_from_ros(codebooks[used[0]])
 
 
-def _optimizer_is_there(node: Node) -> bool:
-    there = AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(_DISCOVERY_S)
-    if there:
+def _optimizer_present(node: Node) -> bool:
+    present = AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
+        _DISCOVERY_TIMEOUT_S)
+    if present:
         print(f'the {topics.OPTIMIZER_NODE} of the namespace keeps its codebook', file=sys.stderr)
-    return there
+    return present
 
 
 def _parameters(codebook: Codebook) -> list[Parameter]:
     return [Parameter(name, value=value) for name, value in codebook.to_parameters().items()]
 
 
-def _name_of(end: Any) -> str:
-    return f'{end.node_namespace.rstrip("/")}/{end.node_name}'
+def _full_name(endpoint: Any) -> str:
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'

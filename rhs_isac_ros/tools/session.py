@@ -1,4 +1,4 @@
-"""A command's node, hidden from lists of nodes, and the way every command ends."""
+"""The node of a command, which lists of nodes hide, and its exit codes."""
 
 import argparse
 import os
@@ -6,34 +6,30 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
+from typing import Any
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
+from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from rhs_isac_ros.ros.run import find_each_other_quickly
 
-# How often to look at the graph, which wakes nobody up [s].
-_POLL_S = 0.02
-# A graph that stays the same for so long is taken for complete [s].
-_SETTLED_S = 0.4
+# Changes of the graph do not wake the executor up, so it is polled with this period [s].
+_POLL_PERIOD_S = 0.02
+# Discovery is complete when the graph has not changed for this time [s].
+_SETTLE_S = 0.4
 
 
 class ToolError(RuntimeError):
-    """A command cannot do what it is asked for."""
+    """A command cannot be executed."""
 
 
 class Session:
-    """A context with one node, which the command itself spins.
-
-    Attributes
-    ----------
-    node
-        The node.
-    """
+    """A context with one node, which the command itself spins."""
 
     def __init__(self) -> None:
         find_each_other_quickly()
@@ -43,78 +39,63 @@ class Session:
         self._executor.add_node(self.node)
 
     def __enter__(self) -> 'Session':
-        """Return itself."""
+        """Return the session."""
         return self
 
     def __exit__(
             self, kind: type[BaseException] | None, error: BaseException | None,
             traceback: TracebackType | None) -> None:
-        """End the node and the context."""
+        """Destroy the node and shut the context down."""
         self._executor.shutdown()
         self.node.destroy_node()
-        rclpy.try_shutdown()
+        try_shutdown()
 
-    def until(self, condition: Callable[[], bool], patience_s: float | None = None) -> bool:
-        """Spin until a condition holds.
+    def spin_until(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
+        """Spin until a condition holds; return whether it does.
 
         Parameters
         ----------
         condition
-            The condition.
-        patience_s
-            How long to wait for it [s]; None: without end.
-
-        Returns
-        -------
-        bool
-            Whether it holds.
+            Evaluated after every callback and poll.
+        timeout_s
+            Maximum duration [s]; None: unlimited.
         """
-        end_s = None if patience_s is None else time.monotonic() + patience_s
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not condition():
             if end_s is not None and time.monotonic() >= end_s:
                 return False
-            self._executor.spin_once(timeout_sec=_POLL_S)
+            self._executor.spin_once(timeout_sec=_POLL_PERIOD_S)
         return True
 
-    def discover(self, patience_s: float) -> None:
-        """Spin until others are in the graph and no more come, or until patience ends.
+    def discover(self, timeout_s: float) -> None:
+        """Spin until other nodes have been discovered and the graph no longer changes.
 
         Parameters
         ----------
-        patience_s
-            How long at most [s].
+        timeout_s
+            Maximum duration [s].
         """
-        end_s = time.monotonic() + patience_s
-        graph, since_s = self._graph(), time.monotonic()
+        end_s = time.monotonic() + timeout_s
+        graph, changed_s = self._graph(), time.monotonic()
         while (now_s := time.monotonic()) < end_s:
-            self._executor.spin_once(timeout_sec=_POLL_S)
-            before, graph = graph, self._graph()
-            if graph != before:
-                since_s = now_s
-            if len(self.node.get_node_names()) > 1 and now_s - since_s > _SETTLED_S:
+            self._executor.spin_once(timeout_sec=_POLL_PERIOD_S)
+            previous, graph = graph, self._graph()
+            if graph != previous:
+                changed_s = now_s
+            if len(self.node.get_node_names()) > 1 and now_s - changed_s > _SETTLE_S:
                 return
 
-    def _graph(self) -> list:
+    def _graph(self) -> list[Any]:
         return sorted([*self.node.get_topic_names_and_types(),
                        *self.node.get_node_names_and_namespaces()], key=repr)
 
     def full_name(self, topic: str) -> str:
-        """Return a topic's full name.
-
-        Parameters
-        ----------
-        topic
-            The name, perhaps relative.
-
-        Returns
-        -------
-        str
-            The name from the root.
+        """Return the full name of a topic whose name may be relative.
 
         Raises
         ------
         ToolError
-            If it is no name of a topic.
+            If it is not a valid name of a topic.
         """
         try:
             name = expand_topic_name(topic, self.node.get_name(), self.node.get_namespace())
@@ -124,33 +105,33 @@ class Session:
         return name
 
 
-def say(*values: object, end: str = '\n') -> None:
-    """Print at once, also into a pipe.
-
-    Parameters
-    ----------
-    *values
-        What to print.
-    end
-        What to end with.
-    """
+def print_now(*values: object, end: str = '\n') -> None:
+    """Print and flush, so that a pipe receives the text at once."""
     print(*values, end=end, flush=True)
 
 
+def discard_stdout() -> None:
+    """Redirect the standard output to nowhere after its reader has closed it.
+
+    Otherwise the flush at the exit of Python would fail.
+    """
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
-    """Run the command that a parser's default ``verb`` names.
+    """Run the command of a command line.
 
     Parameters
     ----------
     parser
-        Its subparsers set ``verb``, a function of session and options.
+        Its subparsers set ``verb``, a callable that takes session and options.
     arguments
-        Command line; by default the process's.
+        Command line; by default that of the process.
 
     Returns
     -------
     int
-        Exit code: 0, also after a signal or when nobody reads on; 1 if something is wrong.
+        Exit code: 0, also after a signal or when the reader closes the output; 1 after an error.
     """
     options = parser.parse_args(arguments)
     try:
@@ -162,6 +143,5 @@ def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
         print(error, file=sys.stderr)
         return 1
     except BrokenPipeError:
-        # Python flushes once more when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_stdout()
     return 0

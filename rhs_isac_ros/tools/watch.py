@@ -1,11 +1,12 @@
-"""``scripts/watch``: a network at work, in the terminal."""
+"""``scripts/watch``: shows a running network in the terminal."""
 
 import argparse
 import contextlib
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
@@ -15,16 +16,21 @@ from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
 from rhs_isac_ros.ros import diagnostics, qos, topics
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.subscriptions import listen, subscribe
-from rhs_isac_ros.tools.session import say
+from rhs_isac_ros.tools.session import discard_stdout, print_now
 from rhs_isac_ros.tools.watch_view import render
 
-_REFRESH_S = 0.25
-# Every node tells of itself once in this time; with some room.
-_ROUND_S = 1.3
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+_REFRESH_PERIOD_S = 0.25
+# Refresh period when the output is not a terminal [s].
+_PRINT_PERIOD_S = 1.0
+# Every node has reported its diagnostics after this time: they are published once a second.
+_DIAGNOSTICS_TIMEOUT_S = 1.3
 
 
 class WatchNode(Node):
-    """Keeps an overview of its namespace.
+    """Maintains an overview of its namespace.
 
     Attributes
     ----------
@@ -35,29 +41,29 @@ class WatchNode(Node):
     def __init__(self) -> None:
         super().__init__('watch', start_parameter_services=False)
         self.overview = Overview()
-        # What is malformed, the nodes count: a word in the log would go across the view.
+        # Log messages would disturb the view; the nodes themselves count malformed messages.
         listen(self, RECEIVES, None,
                lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
-        subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._hear, qos.EXCHANGE)
+        subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.EXCHANGE)
 
-    def _hear(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for name, report in diagnostics.from_ros(message):
-            self.overview.hear(name, report, time.monotonic())
+            self.overview.add_report(name, report, time.monotonic())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Show a network until a signal comes, or once.
+    """Show a network until a signal arrives, or once.
 
     Parameters
     ----------
     arguments
-        Command line, ROS arguments among it; by default the process's.
+        Command line including ROS arguments; by default that of the process.
 
     Returns
     -------
     int
         Exit code: 0, also after a signal; 1 if rich is missing or, with ``--once``, no cycle was
-        seen.
+        complete in time.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(remove_ros_args(['watch', *arguments])[1:])
@@ -69,54 +75,62 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     arguments = ['watch', *arguments]
     try:
-        return _once(options.timeout, arguments) if options.once else _live(arguments)
+        return _print_once(options.timeout, arguments) if options.once else _show_live(arguments)
     except BrokenPipeError:
-        # Python flushes once more when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_stdout()
         return 0
 
 
-def _live(arguments: Sequence[str]) -> int:
+def _show_live(arguments: Sequence[str]) -> int:
+    nodes: list[WatchNode] = []
+    drawn_s = 0.0
+    with contextlib.ExitStack() as stack:
+        draw, period_s = _renderer(stack)
+
+        def refresh() -> bool:
+            """Draw between two turns of the executor, where an exception ends the program."""
+            nonlocal drawn_s
+            now_s = time.monotonic()
+            if now_s > drawn_s + period_s:
+                drawn_s = now_s
+                draw(render(nodes[0].overview, now_s))
+            return False
+        return run(lambda: _create(nodes), arguments, refresh)
+
+
+def _renderer(
+        stack: contextlib.ExitStack) -> tuple[Callable[['RenderableType'], None], float]:
+    """Return a function that shows a view, and the period of its calls [s].
+
+    On a terminal, each view replaces the previous one until the stack is closed; otherwise the
+    views are printed one after the other.
+    """
     from rich.console import Console
     from rich.live import Live
 
-    nodes, drawn_s, console = [], 0.0, Console()
-    # Without a terminal there is nothing to draw over: each view follows the last one.
-    if not console.is_terminal:
-        def draw(view: object) -> None:
-            with console.capture() as text:
-                console.print(view)
-            say(text.get())
-        frame, period_s = contextlib.nullcontext(), 4 * _REFRESH_S
-    else:
-        frame = live = Live(console=console, screen=True, auto_refresh=False)
+    console = Console()
+    if console.is_terminal:
+        live = stack.enter_context(Live(console=console, screen=True, auto_refresh=False))
+        return lambda view: live.update(view, refresh=True), _REFRESH_PERIOD_S
 
-        def draw(view: object) -> None:
-            live.update(view, refresh=True)
-        period_s = _REFRESH_S
-
-    def refresh() -> bool:
-        """Draw between two turns of the executor, where an error is not lost in a callback."""
-        nonlocal drawn_s
-        now_s = time.monotonic()
-        if now_s > drawn_s + period_s:
-            drawn_s = now_s
-            draw(render(nodes[0].overview, now_s))
-        return False
-    with frame:
-        return run(lambda: _made(nodes), arguments, refresh)
+    def print_view(view: 'RenderableType') -> None:
+        with console.capture() as text:
+            console.print(view)
+        print_now(text.get())
+    return print_view, _PRINT_PERIOD_S
 
 
-def _once(timeout_s: float, arguments: Sequence[str]) -> int:
+def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
     from rich.console import Console
 
-    nodes, began_s = [], time.monotonic()
+    nodes: list[WatchNode] = []
+    began_s = time.monotonic()
 
     def done() -> bool:
         overview, now_s = nodes[0].overview, time.monotonic()
         return now_s > began_s + timeout_s or bool(
-            overview.fixes and now_s > overview.began_s + _ROUND_S)
-    code = run(lambda: _made(nodes), arguments, done)
+            overview.fixes and now_s > overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
+    code = run(lambda: _create(nodes), arguments, done)
     if nodes and nodes[0].overview.fixes:
         Console().print(render(nodes[0].overview, time.monotonic()))
     elif time.monotonic() - began_s > timeout_s:
@@ -126,7 +140,7 @@ def _once(timeout_s: float, arguments: Sequence[str]) -> int:
     return code
 
 
-def _made(nodes: list[WatchNode]) -> list[WatchNode]:
+def _create(nodes: list[WatchNode]) -> list[WatchNode]:
     nodes.append(WatchNode())
     return nodes
 
@@ -134,11 +148,11 @@ def _made(nodes: list[WatchNode]) -> list[WatchNode]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='watch', description='Show phase, users, losses and faults of a network until '
-        'Ctrl-C. ROS arguments choose the namespace: --ros-args -r __ns:=/lab')
+        'Ctrl-C. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('--once', action='store_true',
-                        help='wait for one complete cycle, print the view, end')
+                        help='wait for one complete cycle, print the view, and exit')
     parser.add_argument('--timeout', type=float, default=60.0, metavar='S',
-                        help='how long --once waits (default: 60 s)')
+                        help='maximum wait of --once (default: 60 s)')
     return parser
 
 

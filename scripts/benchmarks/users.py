@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from parts.hops import hops_of, ping_pong
-from system.chaos.watcher import Watcher
+from system.observer import NetworkObserver
 
 from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario
@@ -74,7 +74,7 @@ def main() -> int:
 
 def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> dict:
     """Run a network until each user has been served, then measure a number of cycles."""
-    watcher = Watcher(scenario)
+    observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             if composed:
@@ -82,13 +82,14 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
             else:
                 start_network(
                     processes, users, 0, None, default_codebook_file(), scenario, rest_s=0.0)
-            everyone = {*range(1, users + 1)}
-            wait_until(watcher, lambda: {end.user for end in watcher.ends} == everyone,
-                       'a cycle of each user')
-            first = len(watcher.ends)
-            wait_until(watcher, lambda: len(watcher.ends) >= first + cycles, f'{cycles} cycles')
-    watcher.destroy_node()
-    ends = watcher.ends[first:first + cycles]
+            ended = observer.log.ended
+            wait_until(
+                observer, lambda: {cycle.user for cycle in ended} == {*range(1, users + 1)},
+                'a cycle of each user')
+            first = len(ended)
+            wait_until(observer, lambda: len(ended) >= first + cycles, f'{cycles} cycles')
+    observer.destroy_node()
+    ends = ended[first:first + cycles]
     served = [end for end in ends if end.outcome == 'served']
     ended_s = np.array([end.ended_s for end in served])
     return {
@@ -99,9 +100,9 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
     }
 
 
-def wait_until(watcher: Watcher, done: Callable[[], bool], goal: str) -> None:
+def wait_until(observer: NetworkObserver, done: Callable[[], bool], goal: str) -> None:
     """Process messages until a condition holds, or raise RuntimeError on timeout."""
-    if not watcher.spin_until(done, TIMEOUT_S):
+    if not observer.spin_until(done, TIMEOUT_S):
         raise RuntimeError(f'{goal}: not within {TIMEOUT_S:g} s')
 
 

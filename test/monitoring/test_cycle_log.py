@@ -1,4 +1,4 @@
-"""Cycles as a visualizer sees them."""
+"""Records of cycles, assembled from the messages of networks without ROS."""
 
 import itertools
 import math
@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CycleLog, CycleRecord
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_table import State
 
@@ -26,14 +26,15 @@ def test_a_served_cycle_is_complete(network, scenario, places):
     assert log.given_up == []
     assert [record.cycle_id for record in log.complete] == [1, 2, 3]
     for record in log.complete:
-        assert (record.user, record.outcome) == (1, 'served')
-        assert record.complete
-        for part in (record.truth, record.estimate, record.capacity):
+        assert record.user == 1
+        for part in (record.truth, record.signals, record.estimate, record.capacity):
             assert (part.cycle_id, part.user) == (record.cycle_id, 1)
         assert record.error_m == pytest.approx(math.dist(scenario.roi_center_m, places[0]))
+    assert [(record.cycle_id, record.outcome) for record in log.ended] == [
+        (1, 'served'), (2, 'served'), (3, 'served')]
 
 
-def test_durations_are_those_of_the_phases(network):
+def test_durations_match_the_messages_of_the_phases(network):
     net = network(rest_s=0.5)
     net.run_cycles(2)
     record = log_of(net).complete[1]
@@ -49,7 +50,7 @@ def test_durations_are_those_of_the_phases(network):
     assert sum(durations.values()) == pytest.approx(record.ended_s - record.began_s)
 
 
-def test_a_cycle_begins_with_its_last_beacon(network, places):
+def test_a_cycle_begins_with_the_last_beacon_before_its_grant(network, places):
     net = network(0)
     net.run(limit_s=3.05)
     net.add_user(1, places[0])
@@ -59,7 +60,7 @@ def test_a_cycle_begins_with_its_last_beacon(network, places):
     assert record.durations_s()[m.Phase.BEACONING] < 0.01
 
 
-def test_a_cycle_that_is_given_up_has_its_reason_and_no_result(network):
+def test_a_cycle_that_is_given_up_has_a_reason_and_no_result(network):
     net = network()
     net.run_to(State.SOUNDING)
     net.remove('positioner', noticed=False)
@@ -68,14 +69,14 @@ def test_a_cycle_that_is_given_up_has_its_reason_and_no_result(network):
     (record,) = log.given_up
     assert log.complete == []
     assert (record.user, record.outcome) == (1, 'positioner_silent')
-    assert not record.complete
+    assert log.ended == [record]
+    assert record.completed() is None
     assert record.truth is not None
     assert record.estimate is record.capacity is None
-    assert math.isnan(record.error_m)
     assert record.durations_s()[m.Phase.ESTIMATING] == pytest.approx(1.0)
 
 
-def test_a_running_cycle_is_neither(network):
+def test_a_running_cycle_is_neither_complete_nor_given_up(network):
     net = network()
     net.run_to(State.STEERING)
     log = log_of(net)
@@ -84,33 +85,34 @@ def test_a_running_cycle_is_neither(network):
 
 @pytest.mark.parametrize('kind', [
     m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity])
-def test_a_served_cycle_that_lacks_a_message_waits_for_it(network, kind):
+def test_a_served_cycle_is_complete_once_its_last_message_arrives(network, kind):
     net = network()
     net.run_cycles(1)
     log = log_of(net, without=kind)
     assert log.complete == log.given_up == []
+    (ended,) = log.ended
+    assert ended.completed() is None
     log.add(net.sent(kind)[0], 99.0)
     (record,) = log.complete
-    assert record.complete
     assert record.ended_s == net.log[-1].time_s
 
 
 def test_the_order_of_topics_does_not_matter(network):
     net = network(2)
     net.run_cycles(3)
-    plain = {r.cycle_id: vars(r) for r in log_of(net).complete}
-    assert plain.keys() == {1, 2, 3}
+    expected = {r.cycle_id: vars(r) for r in log_of(net).complete}
+    assert expected.keys() == {1, 2, 3}
     for kinds in itertools.permutations(set(RECEIVES) - {m.Beacon}):
         log = CycleLog()
         for kind in (m.Beacon, *kinds):
             for sent in net.log:
                 if isinstance(sent.message, kind):
                     log.add(sent.message, sent.time_s)
-        assert {r.cycle_id: vars(r) for r in log.complete} == plain
+        assert {r.cycle_id: vars(r) for r in log.complete} == expected
         assert log.given_up == []
 
 
-def test_a_network_that_restarts_may_use_its_numbers_again(network):
+def test_cycle_numbers_may_repeat_after_a_restart(network):
     before = network()
     before.run_cycles(2)
     before.run_to(State.STEERING)
@@ -124,7 +126,7 @@ def test_a_network_that_restarts_may_use_its_numbers_again(network):
 
 
 @pytest.mark.parametrize('state', [State.CONFIGURING, State.ESTIMATING, State.TRANSMITTING])
-def test_a_cycle_that_the_restart_cut_short_is_not_mixed_with_its_successor(network, state):
+def test_an_interrupted_cycle_is_not_mixed_with_the_next_one_of_its_number(network, state):
     before = network()
     before.run_to(state)
     again_s = before.now_s
@@ -138,7 +140,7 @@ def test_a_cycle_that_the_restart_cut_short_is_not_mixed_with_its_successor(netw
     assert record.estimate is net.sent(m.PositionEstimate)[-1]
 
 
-def test_a_successor_that_is_given_up_keeps_nothing_of_the_cycle_cut_short(network):
+def test_a_cycle_that_is_given_up_keeps_nothing_of_an_interrupted_one(network):
     before = network()
     before.run_to(State.TRANSMITTING)
     net = network(begin_s=before.now_s)
@@ -151,17 +153,17 @@ def test_a_successor_that_is_given_up_keeps_nothing_of_the_cycle_cut_short(netwo
     assert m.Phase.TRANSMITTING not in record.durations_s()
 
 
-def test_messages_of_no_cycle_or_an_unknown_one_make_no_record(example):
+def test_messages_outside_a_known_cycle_create_no_record(example):
     log = CycleLog()
     for kind in (m.GroundTruth, m.PositionEstimate, m.Capacity):
         log.add(example(kind, cycle_id=0), 1.0)
         log.add(example(kind, cycle_id=7), 1.0)
     log.add(example(m.ProtocolState, cycle_id=7, outcome='served'), 1.0)
     log.add(example(m.ProtocolState, cycle_id=7, outcome='user_gone'), 1.0)
-    assert log.complete == log.given_up == []
+    assert log.complete == log.ended == []
 
 
-def test_cycles_that_never_end_are_forgotten(example):
+def test_old_cycles_without_an_end_are_discarded(example):
     log = CycleLog()
     for cycle_id in range(1, 101):
         log.add(example(m.Beacon, cycle_id=cycle_id), float(cycle_id))
@@ -171,8 +173,18 @@ def test_cycles_that_never_end_are_forgotten(example):
 
 
 def test_the_error_is_the_distance(example):
-    record = CycleRecord(1)
-    assert math.isnan(record.error_m)
-    record.truth = example(m.GroundTruth, position=np.array([1.0, 2.0, 3.0]))
-    record.estimate = example(m.PositionEstimate, position=np.array([1.0, 5.0, -1.0]))
-    assert record.error_m == pytest.approx(5.0)
+    cycle = CompleteCycle(
+        1, truth=example(m.GroundTruth, position=np.array([1.0, 2.0, 3.0])),
+        signals=example(m.ReceivedSignals), capacity=example(m.Capacity),
+        estimate=example(m.PositionEstimate, position=np.array([1.0, 5.0, -1.0])))
+    assert cycle.error_m == pytest.approx(5.0)
+
+
+def test_clearing_keeps_the_running_cycle(network):
+    net = network()
+    net.run_cycles(2)
+    log = log_of(net)
+    open_before = dict(log._open)
+    log.clear()
+    assert log.complete == log.ended == log.given_up == []
+    assert log._open == open_before

@@ -1,4 +1,4 @@
-"""The watch over the results: it is silent on good networks, and names what is wrong."""
+"""The checker accepts the results of correct networks and describes every violation."""
 
 import dataclasses
 import re
@@ -9,60 +9,60 @@ import pytest
 from rhs_isac_ros.monitoring.invariants import RECEIVES, InvariantChecker
 from rhs_isac_ros.protocol import messages as m
 
-# Of a cycle without results: what came before it is judged.
+# Belongs to no cycle; its late arrival makes all earlier results due.
 END = m.Grant(0, 1)
 
 
 @pytest.fixture
-def heard(network):
-    """What a good network of two users says in four cycles."""
-    net = network(2)
-    net.run_cycles(4)
-    return net
+def net(network):
+    """A network of two users after four cycles."""
+    result = network(2)
+    result.run_cycles(4)
+    return result
 
 
-def judge(net, messages, codebooks=True):
-    promises = InvariantChecker(net.scenario)
+def check(net, messages, codebooks=True):
+    checker = InvariantChecker(net.scenario)
     for codebook in net.codebooks.values() if codebooks else ():
-        promises.know(codebook)
+        checker.add_codebook(codebook)
     for message in messages:
-        promises.add(message, 0.0)
-    promises.add(END, 1e9)
-    return promises
+        checker.add(message, 0.0)
+    checker.add(END, 1e9)
+    return checker
 
 
 def messages_of(net):
     return [sent.message for sent in net.log if isinstance(sent.message, RECEIVES)]
 
 
-def test_a_good_network_breaks_none(heard):
-    promises = judge(heard, messages_of(heard))
-    assert promises.checked == len(heard.sent(m.PositionEstimate)) + len(heard.sent(m.Capacity))
-    assert promises.checked == 8
-    assert promises.broken == []
+def test_a_correct_network_has_no_violations(net):
+    checker = check(net, messages_of(net))
+    assert checker.checked == len(net.sent(m.PositionEstimate)) + len(net.sent(m.Capacity))
+    assert checker.checked == 8
+    assert checker.violations == []
 
 
-def test_repeats_and_any_order_are_allowed(heard):
-    messages = messages_of(heard) * 2
+def test_messages_may_repeat_and_arrive_in_any_order(net):
+    messages = messages_of(net) * 2
     np.random.default_rng(0).shuffle(messages)
-    promises = judge(heard, messages)
-    assert promises.checked == 16
-    assert promises.broken == []
+    checker = check(net, messages)
+    assert checker.checked == 16
+    assert checker.violations == []
 
 
-def test_a_result_is_judged_when_nothing_more_can_come(heard):
-    promises = InvariantChecker(heard.scenario)
-    for codebook in heard.codebooks.values():
-        promises.know(codebook)
-    first = [message for message in messages_of(heard) if message.cycle_id == 1]
+def test_a_result_is_checked_after_the_settling_time(net):
+    checker = InvariantChecker(net.scenario)
+    for codebook in net.codebooks.values():
+        checker.add_codebook(codebook)
+    first = [message for message in messages_of(net) if message.cycle_id == 1]
     for message in sorted(first, key=lambda message: not isinstance(message, m.PositionEstimate)):
-        promises.add(message, 5.0)
-    assert promises.checked == 0
-    promises.add(m.Grant(2, 1), 5.9)
-    assert promises.checked == 0
-    promises.add(m.Grant(2, 1), 6.1)
-    assert promises.checked == 2
-    assert promises.broken == []
+        checker.add(message, 5.0)
+    assert checker.checked == 0
+    checker.add(m.Grant(2, 1), 5.9)
+    assert checker.checked == 0
+    checker.add(m.Grant(2, 1), 6.1)
+    assert checker.checked == 2
+    assert checker.violations == []
 
 
 def of(kind, **fields):
@@ -72,7 +72,7 @@ def of(kind, **fields):
 
 POSITIONING = {'mode': m.Mode.POSITIONING}
 TRANSMISSION = {'mode': m.Mode.TRANSMISSION}
-# What is taken out of cycle 2, what it is replaced with, and what is said of it.
+# Which messages of cycle 2 are changed, how (None: removed), and the expected violation.
 CASES = {
     'no grant': (of(m.Grant), None, 'granted to nobody'),
     'another user': (of(m.Grant), {'user': 7}, r'granted to \[7\]'),
@@ -87,63 +87,62 @@ CASES = {
     'no estimate': (of(m.PositionEstimate), None, 'no such estimate'),
     'no beam': (of(m.Beam), None, 'no such beam'),
     'no beam on the surface': (of(m.RhsConfiguration, **TRANSMISSION), None,
-                               'does not hold'),
+                               'does not apply'),
     'estimate of another codebook': (of(m.PositionEstimate), {'codebook_id': 'other'},
                                      'never offered'),
-    'frame of a lie': (of(m.FeedSignals, band=0, frame=1), {'signals': 2.0},
+    'mutated frame': (of(m.FeedSignals, band=0, frame=1), {'signals': 2.0},
                        'not those at the feeds'),
-    'configuration of a lie': (of(m.RhsConfiguration, band=0, **POSITIONING), {'analog': 0.5},
+    'mutated configuration': (of(m.RhsConfiguration, band=0, **POSITIONING), {'analog': 0.5},
                                'not in the codebook'),
 }
 
 
 @pytest.mark.parametrize('case', CASES)
-def test_what_is_wrong_is_named_once_for_each_result_of_the_cycle(heard, case):
+def test_a_fault_is_reported_once_for_each_result_of_its_cycle(net, case):
     matches, changes, text = CASES[case]
     messages = []
-    for message in messages_of(heard):
+    for message in messages_of(net):
         if not matches(message):
             messages.append(message)
         elif changes is not None:
             arrays = {name: getattr(message, name) * factor for name, factor in changes.items()
                       if name in ('signals', 'analog')}
             messages.append(dataclasses.replace(message, **changes | arrays))
-    promises = judge(heard, messages)
-    assert any(re.search(text, fault)
-               for fault in promises.broken), promises.broken
-    assert len(promises.broken) <= 2
-    assert all('of cycle 2,' in fault for fault in promises.broken)
+    checker = check(net, messages)
+    assert any(re.search(text, fault) for fault in checker.violations), checker.violations
+    assert len(checker.violations) <= 2
+    assert all('of cycle 2,' in fault for fault in checker.violations)
 
 
-def test_a_codebook_must_have_been_offered(heard):
-    promises = judge(heard, messages_of(heard), codebooks=False)
-    assert len(promises.broken) == 4
-    assert all('never offered' in fault for fault in promises.broken)
+def test_a_codebook_must_have_been_offered(net):
+    checker = check(net, messages_of(net), codebooks=False)
+    assert len(checker.violations) == 4
+    assert all('never offered' in fault for fault in checker.violations)
 
 
-def test_what_a_new_publisher_said_before_it_was_heard_is_not_missed(heard):
-    promises = InvariantChecker(heard.scenario)
-    for codebook in heard.codebooks.values():
-        promises.know(codebook)
-    promises.expect_silence([m.PositionEstimate])
-    for message in messages_of(heard):
-        # The first estimate to be heard is that of cycle 3.
+def test_messages_of_an_undiscovered_publisher_may_be_missing(net):
+    checker = InvariantChecker(net.scenario)
+    for codebook in net.codebooks.values():
+        checker.add_codebook(codebook)
+    checker.expect_rediscovery([m.PositionEstimate])
+    for message in messages_of(net):
+        # The first estimate that arrives is that of cycle 3.
         if not (isinstance(message, m.PositionEstimate) and message.cycle_id < 3):
-            promises.add(message, 0.0)
-    promises.add(END, 1e9)
-    assert promises.broken == []
-    assert (promises.checked, promises.unverified) == (6, 2)
-    # What was heard must fit all the same, and later ones may not be missing.
-    for message in messages_of(heard):
+            checker.add(message, 0.0)
+    checker.add(END, 1e9)
+    assert checker.violations == []
+    assert (checker.checked, checker.unverified) == (6, 2)
+    # After the discovery, a missing estimate is a violation.
+    for message in messages_of(net):
         if not isinstance(message, m.PositionEstimate) and message.cycle_id == 4:
-            promises.add(dataclasses.replace(message, cycle_id=5), 0.0)
-    promises.add(END, 1e9)
-    assert promises.broken == [
-        f'Capacity of cycle 5, user 2, codebook {next(iter(heard.codebooks))}: no such estimate']
+            checker.add(dataclasses.replace(message, cycle_id=5), 0.0)
+    checker.add(END, 1e9)
+    assert checker.violations == [
+        f'Capacity of cycle 5, user 2, codebook {next(iter(net.codebooks))}: no such estimate']
 
 
-def test_it_forgets_old_cycles(heard):
-    promises = InvariantChecker(heard.scenario)
+def test_old_cycles_are_discarded(net):
+    checker = InvariantChecker(net.scenario)
     for cycle_id in range(1000):
-        promises.add(m.Grant(cycle_id, 1), 0.0)
-    assert len(promises._cycles) <= 64
+        checker.add(m.Grant(cycle_id, 1), 0.0)
+    assert len(checker._cycles) <= 64

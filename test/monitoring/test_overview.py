@@ -1,4 +1,4 @@
-"""The model of the live view, fed by networks without ROS."""
+"""The model of the live view, with messages of networks without ROS."""
 
 import numpy as np
 import pytest
@@ -20,29 +20,29 @@ def overview_of(net, until_s=np.inf):
     return overview
 
 
-def test_it_knows_nothing_before_anything_is_heard():
+def test_it_is_empty_before_the_first_message():
     overview = Overview()
     assert (overview.phase, overview.users, overview.fixes, overview.nodes) == ('', {}, [], {})
     assert overview.rate_hz(5.0) == 0
 
 
-def test_users_have_the_figures_of_their_newest_cycle(network, codebooks):
+def test_users_have_the_results_of_their_newest_cycle(network, codebooks):
     net = network(users=2, rest_s=0.5)
     net.run_cycles(4)
     overview = overview_of(net)
     assert set(overview.users) == {1, 2}
-    assert [fix.record.cycle_id for fix in overview.fixes] == [4, 3]
-    assert {fix.record.user for fix in overview.fixes} == {1, 2}
+    assert [fix.cycle.cycle_id for fix in overview.fixes] == [4, 3]
+    assert {fix.cycle.user for fix in overview.fixes} == {1, 2}
     for fix in overview.fixes:
-        record = fix.record
-        assert record.error_m == np.linalg.norm(record.estimate.position - record.truth.position)
-        assert fix.sigma_m == pytest.approx(np.sqrt(np.trace(record.estimate.covariance_m2)))
-    assert (overview.served, overview.given_up, overview.failure) == (4, 0, '')
+        cycle = fix.cycle
+        assert cycle.error_m == np.linalg.norm(cycle.estimate.position - cycle.truth.position)
+        assert fix.sigma_m == pytest.approx(np.sqrt(np.trace(cycle.estimate.covariance_m2)))
+    assert (overview.served, overview.given_up, overview.last_failure) == (4, 0, '')
     assert overview.codebook_id == codebooks[0].id
     assert (overview.phase, overview.cycle_id) == (RESTING, 4)
 
 
-def test_phases_follow_each_other_and_know_their_begin(network):
+def test_phases_follow_each_other_and_have_their_start_times(network):
     net = network(rest_s=0.5)
     net.run_cycles(2)
     seen = {}
@@ -50,26 +50,26 @@ def test_phases_follow_each_other_and_know_their_begin(network):
     for sent in net.log:
         if isinstance(sent.message, RECEIVES):
             overview.add(sent.message, sent.time_s)
-            seen.setdefault((overview.cycle_id, overview.phase), overview.since_s)
+            seen.setdefault((overview.cycle_id, overview.phase), overview.phase_began_s)
     names = ['beaconing', 'positioning', 'estimating', 'transmitting', RESTING]
     assert list(seen) == [(cycle, name) for cycle in (1, 2) for name in names]
-    begins = {(sent.message.cycle_id, sent.message.phase.name.lower()): sent.time_s
+    starts = {(sent.message.cycle_id, sent.message.phase.name.lower()): sent.time_s
               for sent in net.log if isinstance(sent.message, m.ProtocolState)
               and not sent.message.outcome}
-    assert begins.items() <= seen.items()
+    assert starts.items() <= seen.items()
 
 
-def test_a_cycle_that_is_given_up_says_why():
+def test_a_cycle_that_is_given_up_has_a_reason():
     overview = Overview()
     overview.add(m.Beacon(7, 0), 1.0)
     overview.add(ended(7, 3, m.Phase.POSITIONING, ''), 1.1)
     overview.add(ended(7, 3, m.Phase.BEACONING, 'rhs_silent'), 2.1)
     assert (overview.served, overview.given_up) == (0, 1)
-    assert overview.failure == 'cycle 7 of user 3: rhs_silent'
+    assert overview.last_failure == 'cycle 7 of user 3: rhs_silent'
     assert overview.phase == RESTING
 
 
-def test_the_rate_is_that_of_the_newest_ten_seconds():
+def test_the_rate_is_averaged_over_ten_seconds():
     overview = Overview()
     for cycle_id in range(1, 101):
         now_s = 0.5 * cycle_id
@@ -88,18 +88,18 @@ def test_it_does_not_grow_with_the_cycles(network):
     overview = overview_of(net)
     assert overview.served == 30
     assert len(overview.users) == 1
-    assert (overview._log.complete, overview._log.given_up) == ([], [])
+    assert (overview._log.complete, overview._log.ended) == ([], [])
     overview.rate_hz(1e9)
-    assert not overview._ends_s
+    assert not overview._served_s
 
 
-def test_nodes_tell_what_they_dropped_and_fall_silent():
+def test_nodes_have_counts_and_become_silent():
     overview = Overview()
     values = {'phase': 'resting', 'cycles.served': '9', 'cycles.no_fix': '2',
               'dropped.late_ack': '3', 'dropped.duplicate': '0', 'handling_ms.p50': '0.3'}
-    overview.hear('bs', Report(True, '1 dropped', values), 5.0)
-    health = overview.nodes['bs']
-    assert health.counts('dropped') == {'late_ack': 3}
-    assert health.counts('cycles') == {'served': 9, 'no_fix': 2}
-    assert not health.silent(6.1)
-    assert health.silent(9.0)
+    overview.add_report('bs', Report(True, '1 dropped', values), 5.0)
+    status = overview.nodes['bs']
+    assert status.counts('dropped') == {'late_ack': 3}
+    assert status.counts('cycles') == {'served': 9, 'no_fix': 2}
+    assert not status.silent(6.1)
+    assert status.silent(9.0)

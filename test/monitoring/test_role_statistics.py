@@ -1,9 +1,9 @@
-"""What a role tells of how it fares."""
+"""The diagnostics of a role."""
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring import role_statistics as health
+from rhs_isac_ros.monitoring import role_statistics
 from rhs_isac_ros.monitoring.role_statistics import RoleStatistics
 from rhs_isac_ros.protocol import base_station_table as bs_table
 from rhs_isac_ros.protocol import messages as m
@@ -16,14 +16,14 @@ def state(outcome, cycle_id=1):
         cycle_id, 1, m.Phase.BEACONING, outcome, np.zeros(4), 0.5))
 
 
-def test_a_role_that_has_done_nothing_tells_its_phase_only():
+def test_an_idle_role_reports_its_phase_only():
     report = RoleStatistics().report('waiting', {})
     assert (report.fault, report.summary) == (False, 'no fault')
     assert report.values == {'phase': 'waiting'}
     assert RoleStatistics().report('', {}).values == {}
 
 
-def test_counters_are_told_by_what_they_are_about():
+def test_counters_are_sorted_into_sections():
     counters = {'wrong_cycle': 3, 'rhs_silent': 2, 'unanswered': 7, 'not_granted': 1,
                 'retry_band': 4, 'asked_again': 5, 'no_beacon': 6}
     values = RoleStatistics().report('', counters).values
@@ -33,86 +33,86 @@ def test_counters_are_told_by_what_they_are_about():
                       'beacons.no_beacon': '6'}
 
 
-def test_what_is_in_use_and_what_waits_is_told(codebooks):
-    books = RoleStatistics()
-    told = {'parameter.policy': 'first', 'pending.policy': 'random'}
+def test_settings_in_use_and_pending_are_reported(codebooks):
+    statistics = RoleStatistics()
+    settings = {'parameter.policy': 'first', 'pending.policy': 'random'}
 
-    def report(in_use):
-        new = books.report('', {}, standing={'codebook_id': in_use, **told})
-        assert not new.fault
-        return {name: value for name, value in new.values.items() if 'handling' not in name}
+    def values_with(in_use):
+        report = statistics.report('', {}, status={'codebook_id': in_use, **settings})
+        assert not report.fault
+        return {name: value for name, value in report.values.items() if 'handling' not in name}
     first, second, _ = (codebook.id for codebook in codebooks)
-    assert report('') == told
-    books.note(CodebookOffered(codebooks[0]), [], 0.0, 0.0)
-    assert report('') == report(first) == {'codebook_id': first, **told}
-    books.note(CodebookOffered(codebooks[1]), [], 0.0, 0.0)
-    assert report(first) == {'codebook_id': first, 'pending.codebook_id': second, **told}
-    assert report(second) == {'codebook_id': second, **told}
+    assert values_with('') == settings
+    statistics.record(CodebookOffered(codebooks[0]), [], 0.0, 0.0)
+    assert values_with('') == values_with(first) == {'codebook_id': first, **settings}
+    statistics.record(CodebookOffered(codebooks[1]), [], 0.0, 0.0)
+    assert values_with(first) == {'codebook_id': first, 'pending.codebook_id': second, **settings}
+    assert values_with(second) == {'codebook_id': second, **settings}
 
 
-def test_the_ends_of_cycles_are_those_of_the_tables():
+def test_the_ends_of_cycles_match_the_tables():
     abandoned = {step.counts for step in bs_table.TABLE.values() if 'abandon' in step.do}
-    assert abandoned < health.CYCLE_ENDS
-    assert health.CYCLE_ENDS - abandoned == {'not_granted', 'abandoned', 'bs_silent'}
+    assert abandoned < role_statistics.CYCLE_ENDS
+    assert role_statistics.CYCLE_ENDS - abandoned == {'not_granted', 'abandoned', 'bs_silent'}
     counted = {step.counts for table in (bs_table.TABLE, user.TABLE) for step in table.values()}
-    assert health.CYCLE_ENDS < counted
+    assert role_statistics.CYCLE_ENDS < counted
 
 
 def test_messages_and_served_cycles_are_counted(codebooks):
-    books = RoleStatistics()
-    books.note(CodebookOffered(codebooks[1]), [], 0.0, 0.0)
+    statistics = RoleStatistics()
+    statistics.record(CodebookOffered(codebooks[1]), [], 0.0, 0.0)
     for cycle_id, outcome in enumerate(['served', 'rhs_silent', 'served'], 1):
-        books.note(Tick(), [Send(m.Beacon(cycle_id, 0)), LogMessage('x')], 10.0 * cycle_id, 0.0)
-        books.note(Tick(), [state('', cycle_id)], 10.0 * cycle_id, 0.0)
-        books.note(Tick(), [state(outcome, cycle_id)], 10.0 * cycle_id + 0.25, 0.0)
-    values = books.report('', {'rhs_silent': 1}).values
+        begin_s = 10.0 * cycle_id
+        statistics.record(Tick(), [Send(m.Beacon(cycle_id, 0)), LogMessage('x')], begin_s, 0.0)
+        statistics.record(Tick(), [state('', cycle_id)], begin_s, 0.0)
+        statistics.record(Tick(), [state(outcome, cycle_id)], begin_s + 0.25, 0.0)
+    values = statistics.report('', {'rhs_silent': 1}).values
     assert values['codebook_id'] == codebooks[1].id
     assert (values['cycles.served'], values['cycles.rhs_silent']) == ('2', '1')
     assert (values['sent.Beacon'], values['sent.ProtocolState']) == ('3', '6')
     assert {values[f'cycle_ms.p{percent}'] for percent in (50, 95, 99)} == {'250.000'}
 
 
-def test_latencies_are_percentiles_of_the_newest(example):
-    books = RoleStatistics()
+def test_latencies_are_percentiles_of_the_newest_durations(example):
+    statistics = RoleStatistics()
     times_s = np.random.default_rng(0).exponential(size=2000)
     for time_s in times_s:
         estimate = example(m.PositionEstimate, latency_s=2 * time_s)
-        books.note(Tick(), [Send(estimate)], 0.0, time_s)
-    values = books.report('', {}).values
+        statistics.record(Tick(), [Send(estimate)], 0.0, time_s)
+    values = statistics.report('', {}).values
     for percent in (50, 95, 99):
         expected = 1e3 * np.percentile(times_s[-512:], percent)
         assert float(values[f'handling_ms.p{percent}']) == pytest.approx(expected, abs=1e-3)
         assert float(values[f'estimate_ms.p{percent}']) == pytest.approx(2 * expected, abs=1e-3)
 
 
-def test_a_fault_is_told_once_and_a_missing_role_as_long_as_it_is_missing():
-    books = RoleStatistics()
+def test_a_fault_is_reported_once_and_a_missing_role_until_it_is_present():
+    statistics = RoleStatistics()
     counters = {'wrong_user': 2, 'unanswered': 5}
-    first, second = (books.report('', counters) for _ in range(2))
+    first, second = (statistics.report('', counters) for _ in range(2))
     assert (first.fault, second.fault) == (True, False)
     assert first.summary == '2 faults just now'
-    books.note(PeersChanged(('channel', 'bs')), [], 0.0, 0.0)
+    statistics.record(PeersChanged(('channel', 'bs')), [], 0.0, 0.0)
     for _ in range(2):
-        report = books.report('', counters)
+        report = statistics.report('', counters)
         assert (report.fault, report.summary) == (True, 'waiting for channel, bs')
-    books.note(PeersChanged(()), [], 0.0, 0.0)
-    assert not books.report('', counters | {'unanswered': 9}).fault
+    statistics.record(PeersChanged(()), [], 0.0, 0.0)
+    assert not statistics.report('', counters | {'unanswered': 9}).fault
 
 
-def test_a_network_tells_what_it_went_through(network):
-    """The books of a base station, kept from outside, agree with what was on the bus."""
+def test_statistics_of_a_base_station_match_its_messages(network):
     net = network(transport=lambda message, recipient: [] if isinstance(
         message, m.ReceivedSignals) and message.cycle_id == 2 else [(1e-3, message)])
-    books, role = RoleStatistics(), net['bs']
+    statistics, role = RoleStatistics(), net['bs']
     handle = role.handle
 
-    def noted(event, now_s):
+    def recorded(event, now_s):
         actions = handle(event, now_s)
-        books.note(event, actions, now_s, 0.0)
+        statistics.record(event, actions, now_s, 0.0)
         return actions
-    role.handle = noted
+    role.handle = recorded
     net.run_cycles(4)
-    values = books.report(role.state.value, role.counters).values
+    values = statistics.report(role.state.value, role.counters).values
     assert values['phase'] == 'resting'
     assert (values['cycles.served'], values['cycles.positioner_silent']) == ('3', '1')
     assert int(values['sent.Beacon']) == len(net.sent(m.Beacon)) - 1

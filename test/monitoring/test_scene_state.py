@@ -1,4 +1,4 @@
-"""The scene of a network, told by messages alone."""
+"""The state of the scene, assembled from messages alone."""
 
 import math
 
@@ -35,7 +35,7 @@ def test_it_is_complete_once_every_user_has_an_estimate():
     assert scene.newest.user == 2
 
 
-def test_it_takes_what_a_network_sends(network):
+def test_the_messages_of_a_network_complete_it(network):
     net = network()
     net.run_cycles(3)
     scene = SceneState()
@@ -44,7 +44,7 @@ def test_it_takes_what_a_network_sends(network):
             scene.add(sent.message, sent.time_s)
     assert scene.complete
     assert scene.newest.estimate.cycle_id == 3
-    assert len(scene.users[1].path) == 3
+    assert len(scene.users[1].estimated_path) == 3
     assert scene.beam.cycle_id == 3
 
 
@@ -60,32 +60,32 @@ def test_an_error_needs_the_true_position_of_its_cycle():
     assert scene.users[1].truth.position[0] == 7
 
 
-def test_paths_leave_out_who_stands_still_and_do_not_grow_for_ever():
+def test_paths_skip_small_steps_and_are_bounded():
     scene = SceneState()
     for step in (0.0, 0.01, 0.02, 0.5, 0.5):
         scene.add(truth(1, [9 + step, 0, 0]), 0.0)
     assert [place[0] for place in scene.users[1].true_path] == [9.0, 9.5]
     for cycle_id in range(1, 1001):
         scene.add(estimate(1, [cycle_id, 0, 0], cycle_id), 0.0)
-    assert [place[0] for place in scene.users[1].path] == list(range(801, 1001))
+    assert [place[0] for place in scene.users[1].estimated_path] == list(range(801, 1001))
 
 
-def test_who_is_silent_is_forgotten_with_its_beam():
+def test_a_silent_user_is_discarded_with_its_beam():
     scene = SceneState()
     for user, time_s in ((1, 1.0), (2, 2.0)):
         scene.add(truth(user, [9, 0, 0]), time_s)
     scene.add(beam(1), 1.0)
-    assert scene.forget(1.0) == []
+    assert scene.discard_stale(1.0) == []
     scene.add(estimate(2, [9, 0, 0], 1), 3.0)
-    assert scene.forget(2.5) == [1]
+    assert scene.discard_stale(2.5) == [1]
     assert list(scene.users) == [2]
     assert scene.beam is None
     scene.add(beam(2), 3.0)
     scene.add(truth(1, [5, 0, 0]), 3.0)
-    assert scene.forget(2.5) == []
+    assert scene.discard_stale(2.5) == []
     assert scene.beam.user == 2
     scene.add(truth(2, [9, 0, 0]), 5.0)
     scene.add(truth(1, [5, 0, 0]), 5.0)
-    assert scene.forget(4.0) == []
+    assert scene.discard_stale(4.0) == []
     assert scene.beam is None
     assert len(scene.users[1].true_path) == 1

@@ -1,1 +1,1 @@
-"""Rigs that try a whole network: faults, fuzzing and several hosts."""
+"""Rigs that test a whole network: crashes, impairments, fuzzing and several hosts."""

@@ -1,4 +1,4 @@
-"""A network in another process, and the tools run in this one."""
+"""A network in another process, and the tools in this one."""
 
 import contextlib
 import subprocess
@@ -10,7 +10,7 @@ from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.tools.session import Session
 
 CONFIG = Path(__file__).parents[2] / 'config'
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture(scope='module')
@@ -25,46 +25,46 @@ def network(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def shared_session(network):
-    """A session that knows the network: to discover it anew for each command takes its time."""
+    """A session that has discovered the network, so that not every command has to."""
     with Session() as session:
-        def is_there():
+        def present():
             assert not network.ended()
             return session.node.count_publishers('capacity')
-        assert session.until(is_there, PATIENCE_S)
-        session.discover(PATIENCE_S)
+        assert session.spin_until(present, TIMEOUT_S)
+        session.discover(TIMEOUT_S)
         yield session
 
 
 @pytest.fixture
-def say(shared_session, capsys, monkeypatch):
-    """Function that calls a tool's main function and returns what it says, and its exit code."""
+def call(shared_session, capsys, monkeypatch):
+    """Function that calls a tool's main function and returns output, errors and exit code."""
     monkeypatch.setattr(
         'rhs_isac_ros.tools.session.Session', lambda: contextlib.nullcontext(shared_session))
 
-    def call(main, *arguments):
+    def result(main, *arguments):
         code = main(arguments)
         out, err = capsys.readouterr()
         return out, err, code
-    return call
+    return result
 
 
 @pytest.fixture
-def hear(say):
-    """The same where nothing may be wrong: what the tool says."""
-    def call(main, *arguments):
-        out, err, code = say(main, *arguments)
+def output_of(call):
+    """Function that calls a tool's main function, which must succeed, and returns its output."""
+    def output(main, *arguments):
+        out, err, code = call(main, *arguments)
         assert (err, code) == ('', 0)
         return out
-    return call
+    return output
 
 
 @pytest.fixture
-def call_script(shared_session):
-    """Function that runs a script in a shell line of its own and returns what it says."""
-    def call(line):
+def run_script(shared_session):
+    """Function that runs a command line in a shell, which must succeed, and returns its output."""
+    def output(line):
         done = subprocess.run(
             ['bash', '-o', 'pipefail', '-c', line], cwd=CONFIG.parent, capture_output=True,
-            text=True, timeout=PATIENCE_S, check=False)
+            text=True, timeout=TIMEOUT_S, check=False)
         assert (done.returncode, done.stderr) == (0, '')
         return done.stdout
-    return call
+    return output

@@ -1,4 +1,4 @@
-"""Ellipses against the quantile of a table and plain rotation."""
+"""Ellipses against a tabulated quantile and a rotation matrix."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ CHI_SQUARE_95 = 5.991
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_it_is_that_of_the_covariance(seed):
+def test_the_ellipse_matches_the_covariance(seed):
     root = np.random.default_rng(seed).normal(size=(2, 2))
     width, height, angle_deg = ellipse_95(root @ root.T)
     angle = np.radians(angle_deg)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    found = turn @ np.diag([width**2, height**2]) @ turn.T / 4
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    found = rotation @ np.diag([width**2, height**2]) @ rotation.T / 4
     assert found == pytest.approx(CHI_SQUARE_95 * root @ root.T, rel=1e-3)
 
 
-def test_a_certain_position_is_a_point():
+def test_the_ellipse_of_no_variance_is_a_point():
     assert ellipse_95(np.zeros((2, 2)))[:2] == (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The policy allows each node what it does, as the graph of a network shows, and nothing else."""
+"""The policy allows exactly what the nodes of a running network use."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -14,7 +14,7 @@ RIGHTS = ('publish', 'subscribe', 'reply', 'request')
 
 
 def rules(text):
-    """What a policy allows, with full names, by path of the enclave: {right: names}."""
+    """Return the allowed full names by right, for each path of an enclave."""
     found = {}
     for enclave in ElementTree.fromstring(text).iter('enclave'):
         (profile,) = enclave.iter('profile')
@@ -30,22 +30,22 @@ def rules(text):
     return found
 
 
-def test_the_file_is_what_the_command_prints(capsys):
+def test_the_file_matches_the_output_of_the_command(capsys):
     assert permissions.main([]) == 0
     printed = capsys.readouterr().out
     assert printed == (ROOT / 'config' / 'sros2' / 'policy.xml').read_text(encoding='utf-8')
 
 
-def test_a_user_says_nothing_in_the_name_of_another_role():
+def test_a_user_may_not_publish_messages_of_another_role():
     allowed = rules(permissions.policy(users=3))
-    mine = {f'/{name}' for name in ('ack', 'data', 'ground_truth', 'pilot', topics.DIAGNOSTICS)}
-    always = {'/parameter_events', '/rosout'}
+    own = {f'/{name}' for name in ('ack', 'data', 'ground_truth', 'pilot', topics.DIAGNOSTICS)}
+    common = {'/parameter_events', '/rosout'}
     for number in (1, 2, 3):
-        assert allowed[f'/user_{number}']['publish'] == mine | always
+        assert allowed[f'/user_{number}']['publish'] == own | common
         assert not allowed[f'/user_{number}']['request']
 
 
-def test_nobody_but_the_operator_sets_parameters_of_others():
+def test_only_the_operator_may_set_parameters_of_other_nodes():
     for path, rights in rules(permissions.policy()).items():
         if path != '/operator':
             assert rights['request'] <= {'/optimizer/get_parameters'}
@@ -58,23 +58,24 @@ def test_publishers_are_those_of_the_documentation():
     allowed = rules(permissions.policy(users=1))
     assert len(rows) >= len(topics.NAMES)
     for topic, publishers in rows:
-        may = {path[1:].replace('user_1', 'user') for path, rights in allowed.items()
+        allowed_to = {path[1:].replace('user_1', 'user') for path, rights in allowed.items()
                if f'/{topic}' in rights['publish']}
-        # The visualizer has no diagnostics, and the operator says nothing.
-        everybody = {path[1:].replace('user_1', 'user') for path in allowed} - {
+        # The visualizer has no diagnostics, and the operator does not publish.
+        every_node = {path[1:].replace('user_1', 'user') for path in allowed} - {
             'visualizer', 'operator'}
-        assert may == (everybody if publishers == 'every node' else set(publishers.split(', ')))
+        expected = every_node if publishers == 'every node' else set(publishers.split(', '))
+        assert allowed_to == expected
 
 
 @pytest.mark.parametrize('arguments', [['--namespace', 'lab'], ['--users', '-1']])
-def test_wrong_arguments_are_refused(arguments, capsys):
+def test_invalid_arguments_are_rejected(arguments, capsys):
     with pytest.raises(SystemExit):
         permissions.main(arguments)
     assert 'error: argument' in capsys.readouterr().err
 
 
 def test_policy_and_graph_agree(processes, make_watch, small_files):
-    """No right is missing in a running network, and none is left over."""
+    """A running network uses all allowed rights and no others."""
     space, watch = '/closed', make_watch('/closed')
     network = processes.start(
         'network', namespace=space, users=2, rest_s=0.0,
@@ -85,17 +86,17 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
     del allowed[f'{space}/operator']
 
     def used(path):
-        ask, name = watch.node, path.rpartition('/')[2]
-        if (name, space) not in ask.get_node_names_and_namespaces():
+        node, name = watch.node, path.rpartition('/')[2]
+        if (name, space) not in node.get_node_names_and_namespaces():
             return {right: set() for right in RIGHTS}
         found = {
-            'publish': ask.get_publisher_names_and_types_by_node(name, space),
-            'subscribe': ask.get_subscriber_names_and_types_by_node(name, space),
-            'reply': ask.get_service_names_and_types_by_node(name, space),
-            'request': ask.get_client_names_and_types_by_node(name, space)}
+            'publish': node.get_publisher_names_and_types_by_node(name, space),
+            'subscribe': node.get_subscriber_names_and_types_by_node(name, space),
+            'reply': node.get_service_names_and_types_by_node(name, space),
+            'request': node.get_client_names_and_types_by_node(name, space)}
         return {right: {name for name, _ in pairs} for right, pairs in found.items()}
 
-    # The last to listen does so for the first cycle; who does too much has done it by then.
+    # After two cycles, all nodes have created all their publishers and subscriptions.
     watch.until_served(2, processes=[network, visualizer])
     watch.until(lambda: {f'{place}/{name}' for name, place in
                          watch.node.get_node_names_and_namespaces()} >= allowed.keys(),

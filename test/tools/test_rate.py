@@ -1,4 +1,4 @@
-"""The rate of messages."""
+"""Rates against NumPy."""
 
 import re
 
@@ -12,7 +12,7 @@ def numbers(report):
     return [float(number) for number in re.findall(r'[\d.]+(?=s| |\n|$)', report)]
 
 
-def test_report_is_laid_out_as_by_ros2():
+def test_the_layout_is_that_of_ros2():
     rate = Rate(100)
     for time_s in (1.0, 1.25, 1.75):
         rate.add(round(time_s * 1e9))
@@ -20,17 +20,17 @@ def test_report_is_laid_out_as_by_ros2():
         'average rate: 2.667\n\tmin: 0.250s max: 0.500s std dev: 0.12500s window: 2')
 
 
-def test_against_numpy_within_the_window():
+def test_the_rate_within_the_window_matches_numpy():
     times_s = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 50))
     rate = Rate(10)
     for time_s in times_s:
         rate.add(round(time_s * 1e9))
-    steps = np.diff(times_s[-11:])
+    steps_s = np.diff(times_s[-11:])
     assert numbers(rate.report()) == pytest.approx(
-        [1 / steps.mean(), steps.min(), steps.max(), steps.std(), 10], abs=1e-3)
+        [1 / steps_s.mean(), steps_s.min(), steps_s.max(), steps_s.std(), 10], abs=1e-3)
 
 
-def test_nothing_to_report_without_news():
+def test_the_report_is_empty_without_a_new_message():
     rate = Rate(10)
     assert rate.report() == ''
     rate.add(1)
@@ -40,7 +40,7 @@ def test_nothing_to_report_without_news():
     assert rate.report() == ''
 
 
-def test_a_clock_that_is_set_back_starts_anew():
+def test_a_clock_that_goes_back_restarts_the_measurement():
     rate = Rate(10)
     for time_ns in (10**9, 2 * 10**9, 5, 5 + 10**8):
         rate.add(time_ns)

@@ -23,7 +23,7 @@ from rhs_isac_ros.ros.recording import Recorder, read
 from rhs_isac_ros.tools import record
 from rhs_isac_ros.tools.replay import errors_m, load, main
 
-pytest.importorskip('mcap', reason='there is no mcap here')
+pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
 SCRIPTS = CONFIG.parent / 'scripts'
 CYCLES = 4
@@ -31,7 +31,7 @@ CYCLES = 4
 
 @pytest.fixture(scope='module')
 def run(shared_session, tmp_path_factory):
-    """A recording of some cycles, and what an observer saw of them live."""
+    """A recording of some cycles, and the cycles as they were observed live."""
     path = tmp_path_factory.mktemp('recording') / 'run.mcap'
     recorder = Recorder(path, Scenario.from_yaml(CONFIG / 'quick.yaml'))
     context = Context()
@@ -49,13 +49,13 @@ def run(shared_session, tmp_path_factory):
 
 
 def rows(text):
-    """Median, root mean square and missing fixes, by what they are of."""
+    """Return median, root mean square and number of missing fixes by row."""
     number, _, *lines = text.splitlines()
     assert number == f'{CYCLES} cycles'
     return {line[:12].strip(): line[12:].split() for line in lines}
 
 
-def test_the_cycles_are_those_that_were_seen_live(run):
+def test_the_recorded_cycles_match_those_observed_live(run):
     recording = load(run.path)
     assert [cycle.cycle_id for cycle in recording.cycles] == [
         cycle.cycle_id for cycle in run.cycles]
@@ -67,27 +67,27 @@ def test_the_cycles_are_those_that_were_seen_live(run):
         codebook.id for codebook in recording.codebooks.values()]
 
 
-def test_the_same_estimator_makes_the_same_errors(run, call_script):
-    """To the last digit that is printed; another one does not."""
-    found = rows(call_script(f'{SCRIPTS}/replay {run.path} --estimator bayes --estimator ml'))
+def test_the_same_estimator_has_the_same_errors(run, run_script):
+    """All printed digits agree; those of another estimator differ."""
+    found = rows(run_script(f'{SCRIPTS}/replay {run.path} --estimator bayes --estimator ml'))
     live = np.array([cycle.error_m for cycle in run.cycles])
     assert found['bayes'] == found['live bayes'] != found['ml']
     assert found['live bayes'] == [
         f'{np.median(live):.6f}', 'm', f'{np.sqrt(np.mean(live**2)):.6f}', 'm', '0']
 
 
-def test_errors_against_the_estimator_itself(run):
+def test_errors_match_those_of_the_estimator(run):
     recording = load(run.path)
-    made = {key: make_estimator('ml', recording.scenario, codebook)
+    estimators = {key: make_estimator('ml', recording.scenario, codebook)
             for key, codebook in recording.codebooks.items()}
     expected = []
     for cycle in run.cycles:
-        fix = made[cycle.signals.codebook_id].estimate(cycle.signals.signals.reshape(2, -1))
+        fix = estimators[cycle.signals.codebook_id].estimate(cycle.signals.signals.reshape(2, -1))
         expected.append(np.sqrt(np.sum((fix.mean - cycle.truth.position)**2)))
-    np.testing.assert_allclose(errors_m(recording.cycles, made), expected, rtol=1e-9)
+    np.testing.assert_allclose(errors_m(recording.cycles, estimators), expected, rtol=1e-9)
 
 
-def test_an_estimator_of_another_package_is_asked_too(run, install, capsys):
+def test_an_estimator_of_a_plugin_is_available(run, install, capsys):
     install('guesses', 'from rhs_isac_ros.positioning import BayesEstimator as Mine',
             {plugins.ESTIMATORS: {'mine': 'Mine'}})
     assert main([str(run.path), '--estimator', 'mine']) == 0
@@ -95,14 +95,14 @@ def test_an_estimator_of_another_package_is_asked_too(run, install, capsys):
     assert found['mine'] == found['live bayes']
 
 
-def test_another_codebook_is_assumed_with_a_word(run, random_beams, tmp_path, capsys):
+def test_another_codebook_is_assumed_with_a_warning(run, random_beams, tmp_path, capsys):
     other = random_beams(Scenario.from_yaml(CONFIG / 'quick.yaml'), np.random.default_rng(0))
     other.save(tmp_path / 'other.yaml')
     assert main([str(run.path), '--codebook', str(tmp_path / 'other.yaml')]) == 0
     out, err = capsys.readouterr()
     found = rows(out)
     assert found['bayes'] != found['live bayes']
-    assert err.endswith(f'are read as if with {other.id}\n')
+    assert err.endswith(f'are evaluated with {other.id}\n')
 
 
 @pytest.mark.parametrize('arguments, error', [
@@ -113,7 +113,7 @@ def test_another_codebook_is_assumed_with_a_word(run, random_beams, tmp_path, ca
     (['--config', 'nothing.yaml'], 'nothing.yaml: cannot be read'),
     (['--estimator', 'neural'], 'model'),
 ])
-def test_what_does_not_fit_is_named(run, capsys, arguments, error):
+def test_a_mismatch_is_named(run, capsys, arguments, error):
     assert main([str(run.path), *map(str, arguments)]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith('error: ')
@@ -121,7 +121,7 @@ def test_what_does_not_fit_is_named(run, capsys, arguments, error):
 
 
 def estimates_of(path):
-    """Estimates of a recording, by cycle, without the time that they took."""
+    """Return the estimates of a recording by cycle, without their latencies."""
     return {message.cycle_id: content(message)
             for _, message, _ in read(path, ['/position_estimate'])}
 
@@ -134,7 +134,7 @@ def content(message):
 
 @pytest.fixture
 def positioner(shared_session):
-    """A live positioner in a namespace without anything else."""
+    """A running positioner, alone in its namespace."""
     with subprocess.Popen(
             [SCRIPTS / 'run', 'positioner', '--ros-args', '-r', '__ns:=/again', '-p',
              f'scenario_file:={CONFIG}/quick.yaml'], stderr=subprocess.DEVNULL) as process:
@@ -142,30 +142,30 @@ def positioner(shared_session):
         process.send_signal(signal.SIGINT)
 
 
-def test_a_live_positioner_makes_the_recorded_estimates_again(run, shared_session, positioner):
-    """Bit for bit: the codebook comes with the signals."""
-    heard = {}
+def test_a_running_positioner_reproduces_the_recorded_estimates(run, shared_session, positioner):
+    """The estimates agree bit for bit; the codebook is published with the signals."""
+    received = {}
     subscription = shared_session.node.create_subscription(
         convert.ros_type(m.PositionEstimate), '/again/position_estimate',
-        lambda message: heard.update({message.cycle_id: content(message)}), qos.EXCHANGE)
-    assert shared_session.until(lambda: subscription.get_publisher_count() > 0, 60)
+        lambda message: received.update({message.cycle_id: content(message)}), qos.EXCHANGE)
+    assert shared_session.spin_until(lambda: subscription.get_publisher_count() > 0, 60)
     signals = {message.cycle_id for _, message, _ in read(run.path, ['/received_signals'])}
     with subprocess.Popen(
             [SCRIPTS / 'replay', run.path, '--publish', '--rate', '20', '--ros-args', '-r',
              '__ns:=/again'], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True) as process:
-        everything = shared_session.until(lambda: heard.keys() >= signals, 60)
+        complete = shared_session.spin_until(lambda: received.keys() >= signals, 60)
         out, err = process.communicate(timeout=30)
     assert (process.returncode, out) == (0, f'{len(signals)} messages published\n'), err
-    assert everything
+    assert complete
     shared_session.node.destroy_subscription(subscription)
     recorded = estimates_of(run.path)
-    both = recorded.keys() & heard.keys()
+    both = recorded.keys() & received.keys()
     assert both >= {cycle.cycle_id for cycle in run.cycles}
-    assert {cycle: heard[cycle] for cycle in both} == {cycle: recorded[cycle] for cycle in both}
+    assert {cycle: received[cycle] for cycle in both} == {cycle: recorded[cycle] for cycle in both}
 
 
-def test_what_a_network_says_itself_is_not_published_beside_it(run, shared_session):
+def test_topics_of_a_running_network_are_not_published(run, shared_session):
     done = subprocess.run(
         [SCRIPTS / 'replay', run.path, '--publish'], capture_output=True, text=True, timeout=60,
         check=False)
@@ -176,22 +176,22 @@ def test_what_a_network_says_itself_is_not_published_beside_it(run, shared_sessi
 
 @pytest.mark.parametrize('arguments, error', [
     (['--namespace', '/lab'], 'no received_signals in the namespace /lab'),
-    (['--codebook', CONFIG / 'codebook.yaml'], 'live nodes would drop them'),
+    (['--codebook', CONFIG / 'codebook.yaml'], 'running nodes would drop them'),
 ])
-def test_what_live_nodes_cannot_use_is_named(run, capsys, arguments, error):
+def test_unusable_recordings_are_named(run, capsys, arguments, error):
     assert main([str(run.path), '--publish', *map(str, arguments)]) == 2
     assert error in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('arguments', [['--estimator', 'ml'], ['--rate', '0'],
                                        ['--topic', 'codebook']])
-def test_options_that_contradict_publishing_are_named(run, capsys, arguments):
+def test_options_that_exclude_publishing_are_named(run, capsys, arguments):
     with pytest.raises(SystemExit):
         main([str(run.path), '--publish', *arguments])
     assert 'expected' in (text := capsys.readouterr().err) or 'invalid choice' in text
 
 
-def test_record_takes_down_everything_until_it_is_interrupted(shared_session, tmp_path):
+def test_record_writes_all_topics_until_it_is_interrupted(shared_session, tmp_path):
     path = tmp_path / 'all.mcap'
     wanted = {'codebook', 'capacity', 'pilot', 'ground_truth', 'position'}
     with subprocess.Popen(
@@ -200,7 +200,7 @@ def test_record_takes_down_everything_until_it_is_interrupted(shared_session, tm
         missing = set(wanted)
         while missing:
             line = process.stderr.readline()
-            assert line, f'it ended without {missing}'
+            assert line, f'no messages of {missing}'
             missing.discard(line.rpartition('first message of ')[2].strip())
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
@@ -212,7 +212,7 @@ def test_record_takes_down_everything_until_it_is_interrupted(shared_session, tm
         path.with_name('all.mcap.part').stat()
 
 
-def test_record_names_a_wrong_file(tmp_path, capsys):
+def test_record_names_an_invalid_file(tmp_path, capsys):
     assert record.main([str(tmp_path / 'none' / 'run.mcap')]) == 2
     assert 'none/run.mcap: cannot be written' in capsys.readouterr().err
     assert record.main([str(tmp_path / 'run.mcap'), '--config', 'nothing.yaml']) == 2

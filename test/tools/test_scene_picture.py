@@ -1,4 +1,4 @@
-"""The picture of a scene: what is on it, and that a person can read it."""
+"""Contents and readability of the picture of a scene."""
 
 import itertools
 
@@ -15,43 +15,43 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.ellipses import ellipse_95
 from rhs_isac_ros.tools.scene_picture import compose, draw
 
-PLACES = np.array([[9.0, 2.0, 0.5], [12.0, -3.0, -0.4], [7.0, -1.0, 0.0]])
+POSITIONS = np.array([[9.0, 2.0, 0.5], [12.0, -3.0, -0.4], [7.0, -1.0, 0.0]])
 COVARIANCE_M2 = np.array([[0.6, 0.2, 0.05], [0.2, 0.3, 0.0], [0.05, 0.0, 0.1]])
 
 
-def a_scene(scenario, n_users):
+def make_scene(scenario, n_users):
     scene, rng = SceneState(), np.random.default_rng(1)
     for user in range(1, n_users + 1):
-        place = PLACES[user % 3]
+        position = POSITIONS[user % 3]
         for step in range(5):
-            scene.add(m.GroundTruth(user, user, place + 0.2 * step, np.zeros(3)), 0.0)
+            scene.add(m.GroundTruth(user, user, position + 0.2 * step, np.zeros(3)), 0.0)
         for cycle_id in (user, 100 + user):
             scene.add(m.PositionEstimate(
-                cycle_id, user, 'cb', place + 0.1, COVARIANCE_M2, 0.1, 'bayes', 0.01), 0.0)
+                cycle_id, user, 'cb', position + 0.1, COVARIANCE_M2, 0.1, 'bayes', 0.01), 0.0)
     configuration = rng.uniform(size=(scenario.n_frames, scenario.n_elements))
     scene.add(m.RhsConfiguration(1, m.Mode.POSITIONING, 1, 'cb', configuration), 0.0)
-    beam = steer(scenario, PLACES[n_users % 3])
+    beam = steer(scenario, POSITIONS[n_users % 3])
     scene.add(m.Beam(1, n_users, 'cb', 0, beam.analog, beam.digital, 1e6), 0.0)
     return scene
 
 
 def texts(figure, monkeypatch):
-    """What is written, with its box: ticks beyond an axis have a text, but are not drawn."""
+    """Return the texts that are drawn, with their boxes; ticks outside an axis are not drawn."""
     found, draw_text = [], Text.draw
 
-    def note(text, renderer):
+    def record(text, renderer):
         if text.get_visible() and text.get_text().strip():
             found.append((text.get_text(), text.get_window_extent(renderer)))
         draw_text(text, renderer)
     with monkeypatch.context() as patch:
-        patch.setattr(Text, 'draw', note)
+        patch.setattr(Text, 'draw', record)
         FigureCanvasAgg(figure).draw()
     return found
 
 
-def test_no_text_is_cut_off_or_covers_another(monkeypatch):
+def test_no_text_is_cut_off_or_overlaps_another(monkeypatch):
     scenario = Scenario()
-    figure = compose(a_scene(scenario, 12), scenario)
+    figure = compose(make_scene(scenario, 12), scenario)
     found = texts(figure, monkeypatch)
     assert {'x [m]', 'y [m]', 'z [m]', 'user 8', 'and 4 more', 'board'} <= {
         text for text, _ in found}
@@ -62,9 +62,9 @@ def test_no_text_is_cut_off_or_covers_another(monkeypatch):
         assert not box.padded(-1).overlaps(second.padded(-1)), (one, other)
 
 
-def test_both_views_show_region_users_and_ellipses_where_they_are():
+def test_both_views_show_region_users_and_ellipses_at_their_positions():
     scenario = Scenario()
-    figure = compose(a_scene(scenario, 3), scenario)
+    figure = compose(make_scene(scenario, 3), scenario)
     views = {axes.get_ylabel(): axes for axes in figure.axes}
     low, high = scenario.roi_bounds_m
     for label, plane in (('y [m]', [0, 1]), ('z [m]', [0, 2])):
@@ -75,34 +75,34 @@ def test_both_views_show_region_users_and_ellipses_where_they_are():
             tuple((high - low)[plane]))
         ellipses = [patch for patch in axes.patches if isinstance(patch, Ellipse)]
         centres = {tuple(np.round(patch.center, 9)) for patch in ellipses}
-        assert centres == {tuple(np.round(place[plane] + 0.1, 9)) for place in PLACES}
+        assert centres == {tuple(np.round(position[plane] + 0.1, 9)) for position in POSITIONS}
         wanted = ellipse_95(COVARIANCE_M2[np.ix_(plane, plane)])
         for patch in ellipses:
             assert (patch.width, patch.height, patch.angle) == pytest.approx(wanted)
         dots = {tuple(np.round(line.get_xydata()[0], 9)) for line in axes.lines
                 if line.get_marker() == 'o'}
-        assert dots == {tuple(np.round(place[plane] + 0.8, 9)) for place in PLACES}
+        assert dots == {tuple(np.round(position[plane] + 0.8, 9)) for position in POSITIONS}
         assert axes.get_aspect() == 1.0
     board = views['z [cm]'].images[0].get_array()
     assert board.shape == (10, 10)
-    # The newest cycle is that of user 3, whose true position told for it is another one.
+    # No error is shown: the true position of user 3 belongs to another cycle.
     assert figure.get_suptitle() == 'cycle 103, user 3'
 
 
-def test_the_board_is_shown_as_a_user_sees_it(small):
+def test_the_surface_is_shown_from_the_front(small):
     scene = SceneState()
     configuration = np.linspace(0, 1, small.scenario.n_elements)[None]
     scene.add(m.RhsConfiguration(1, m.Mode.TRANSMISSION, 0, 'cb', configuration), 0.0)
     figure = compose(scene, small.scenario)
     (axes,) = [axes for axes in figure.axes if axes.images]
-    # Rows grow with z, columns with y, which points to the right of who looks at the board.
+    # Rows increase with z, and columns with y, which points to the right from the front.
     assert axes.images[0].origin == 'lower'
     assert np.asarray(axes.images[0].get_array())[0] == pytest.approx(configuration[0, :4])
     left, right, bottom, top = axes.images[0].get_extent()
     assert left == bottom == -right == -top < 0
 
 
-def test_a_scene_without_anything_is_drawn_all_the_same(small, tmp_path):
+def test_an_empty_scene_is_drawn(small, tmp_path):
     draw(SceneState(), small.scenario, tmp_path / 'scene.png')
     assert (tmp_path / 'scene.png').read_bytes().startswith(b'\x89PNG')
     assert [path.name for path in tmp_path.iterdir()] == ['scene.png']

@@ -9,7 +9,7 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.scene_state import SceneState
-from rhs_isac_ros.tools.snapshot import finish, main
+from rhs_isac_ros.tools.snapshot import main, write_picture
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / 'scripts' / 'snapshot'
@@ -40,18 +40,16 @@ def test_a_network_of_another_scenario_is_named(shared_session, snapshot, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_without_a_network_it_says_so(capsys):
-    """What comes after the wait; the wait itself is that of every tool."""
+def test_without_a_network_it_is_an_error(capsys):
     options = SimpleNamespace(timeout=0.5, output=Path('never.png'))
-    nobody = SimpleNamespace(sightings=SceneState(), misfit='')
-    assert finish(nobody, Scenario(), options) == 1
+    assert write_picture(SceneState(), '', Scenario(), options) == 1
     out, err = capsys.readouterr()
     assert out == ''
-    assert err.startswith('error: no user was heard of within 0.5 s, in the domain ')
+    assert err.startswith('error: no user found within 0.5 s, in the domain ')
     assert not options.output.exists()
 
 
-def test_a_place_that_is_not_there_is_named_before_it_waits(capsys):
+def test_invalid_files_are_named_before_it_waits(capsys):
     with pytest.raises(SystemExit):
         main(['--output', 'none/scene.png'])
     assert 'argument --output: none/scene.png' in capsys.readouterr().err

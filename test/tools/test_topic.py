@@ -14,69 +14,70 @@ from rhs_isac_ros.tools.topic import main
 SCRIPT = Path(__file__).parents[2] / 'scripts' / 'topic'
 
 
-def test_list_names_every_topic(hear):
-    names = set(hear(main, 'list').split())
+def test_list_prints_every_topic(output_of):
+    names = set(output_of(main, 'list').split())
     assert {f'/{name}' for name in topics.NAMES.values()} <= names
-    typed = hear(main, 'list', '-t').splitlines()
+    typed = output_of(main, 'list', '-t').splitlines()
     assert '/capacity [rhs_isac_msgs/msg/Capacity]' in typed
-    assert int(hear(main, 'list', '-c')) == len(typed)
-    counted = hear(main, 'list', '-v')
+    assert int(output_of(main, 'list', '-c')) == len(typed)
+    counted = output_of(main, 'list', '-v')
     published, subscribed = counted.split('Subscribed topics:')
     assert published.startswith('Published topics:\n * /ack [rhs_isac_msgs/msg/Ack] 2 publishers')
     assert ' * /ack [rhs_isac_msgs/msg/Ack] 1 subscriber\n' in subscribed
     assert '/capacity ' not in subscribed
 
 
-def test_info_counts_the_ends(hear):
-    text = hear(main, 'info', 'received_signals')
+def test_info_counts_publishers_and_subscriptions(output_of):
+    text = output_of(main, 'info', 'received_signals')
     assert text == ('Type: rhs_isac_msgs/msg/ReceivedSignals\nPublisher count: 1\n'
                     'Subscription count: 1\n')
-    verbose = hear(main, 'info', '-v', '/codebook')
+    verbose = output_of(main, 'info', '-v', '/codebook')
     assert 'Node name: optimizer\n' in verbose
     assert verbose.count('Endpoint type: SUBSCRIPTION') == 4
 
 
-def test_echo_prints_documents(hear):
-    text = hear(main, 'echo', '--once', 'capacity')
+def test_echo_prints_documents(output_of):
+    text = output_of(main, 'echo', '--once', 'capacity')
     assert text.endswith('\n---\n')
     (content,) = filter(None, yaml.safe_load_all(text))
     assert list(content)[:4] == ['header', 'cycle_id', 'user', 'codebook_id']
     assert content['actual_bps'] > 0
 
 
-def test_echo_gets_what_is_latched(hear):
-    text = hear(main, 'echo', '--once', 'codebook', '--no-arr')
+def test_echo_receives_latched_messages(output_of):
+    text = output_of(main, 'echo', '--once', 'codebook', '--no-arr')
     assert "data: '<sequence type: double, length: 216>'" in text
 
 
-def test_echo_of_a_field_and_as_csv(hear):
-    point = yaml.safe_load(hear(
+def test_echo_of_a_field_and_as_csv(output_of):
+    point = yaml.safe_load(output_of(
         main, 'echo', '--once', '--field', 'position', 'ground_truth').removesuffix('---\n'))
     assert set(point) == {'x', 'y', 'z'}
-    assert float(hear(main, 'echo', '--once', '--field', 'position.x', 'ground_truth')
+    assert float(output_of(main, 'echo', '--once', '--field', 'position.x', 'ground_truth')
                  .removesuffix('---\n')) > 0
-    line = hear(main, 'echo', '--once', '--csv', 'ground_truth', 'rhs_isac_msgs/msg/GroundTruth')
+    line = output_of(
+        main, 'echo', '--once', '--csv', 'ground_truth', 'rhs_isac_msgs/msg/GroundTruth')
     assert len(line.strip().split(',')) == 11
 
 
-def test_echo_names_what_is_wrong(say):
-    out, err, code = say(main, 'echo', 'nothing', '--spin-time', '0.1')
+def test_echo_and_info_name_the_error(call):
+    out, err, code = call(main, 'echo', 'nothing', '--spin-time', '0.1')
     assert code == 1
     assert out == 'WARNING: topic [nothing] does not appear to be published yet\n'
     assert err == 'Could not determine the type for the passed topic\n'
-    _, err, code = say(main, 'echo', 'ground_truth', '--field', 'position.q')
+    _, err, code = call(main, 'echo', 'ground_truth', '--field', 'position.q')
     assert (code, err) == (
         1, "Invalid field 'position.q': 'Point' object has no attribute 'q'\n")
     for kind in ('std_msgs/String', 'std_msgs/msg/Nothing', 'none_msgs/msg/String'):
-        _, err, code = say(main, 'echo', 'ground_truth', kind)
+        _, err, code = call(main, 'echo', 'ground_truth', kind)
         assert (code, err) == (1, f"The message type '{kind}' is invalid\n")
-    assert say(main, 'echo', 'a//b')[2] == 1
-    _, err, code = say(main, 'info', 'nothing', '--spin-time', '0.1')
+    assert call(main, 'echo', 'a//b')[2] == 1
+    _, err, code = call(main, 'info', 'nothing', '--spin-time', '0.1')
     assert (code, err) == (1, "Unknown topic 'nothing'\n")
 
 
-def test_echo_ends_after_its_time_without_a_message(say):
-    assert say(main, 'echo', 'no_fix', '--timeout', '0.2')[2] == 0
+def test_echo_exits_after_its_timeout(call):
+    assert call(main, 'echo', 'no_fix', '--timeout', '0.2')[2] == 0
 
 
 def test_hz_reports_until_it_is_interrupted(shared_session):
@@ -90,5 +91,5 @@ def test_hz_reports_until_it_is_interrupted(shared_session):
     assert float(found[1]) > 1
 
 
-def test_on_its_own_and_with_a_reader_that_leaves(call_script):
-    assert call_script('scripts/topic echo ground_truth | head -n 2') == 'header:\n  stamp:\n'
+def test_it_exits_when_the_reader_closes_the_pipe(run_script):
+    assert run_script('scripts/topic echo ground_truth | head -n 2') == 'header:\n  stamp:\n'

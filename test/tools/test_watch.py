@@ -18,7 +18,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.watch import main
 from rhs_isac_ros.tools.watch_view import render
 
-console = pytest.importorskip('rich.console', reason='there is no rich here')
+console = pytest.importorskip('rich.console', reason='rich is not installed')
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / 'scripts' / 'watch'
 
@@ -30,19 +30,19 @@ def text_of(overview, now_s, width=80):
     return page.export_text()
 
 
-def test_the_view_of_nothing_says_so():
+def test_the_view_of_an_empty_overview():
     assert 'waiting for a base station' in text_of(Overview(), 1.0)
 
 
-def test_the_view_tells_faults_and_silence_and_leaves_nothing_out_at_80_columns():
+def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
     overview = Overview()
     overview.add(m.Beacon(1795288682616, 0), 1.0)
     overview.add(m.ProtocolState(
         1795288682616, 12, m.Phase.BEACONING, 'rhs_silent', np.zeros(4), 0.0), 2.0)
     overview.add(m.Beacon(1795288682617, 0), 3.0)
-    overview.hear('lab/bs', Report(True, 'waiting for positioner', {
+    overview.add_report('lab/bs', Report(True, 'waiting for positioner', {
         'phase': 'waiting', 'dropped.late_ack': '3', 'cycles.no_fix': '2'}), 1.0)
-    overview.hear('lab/channel', Report(False, 'no fault', {}), 3.0)
+    overview.add_report('lab/channel', Report(False, 'no fault', {}), 3.0)
     text = text_of(overview, 5.0)
     assert 'beaconing for 2.00 s, cycle 1795288682617' in text
     assert 'last given up: cycle 1795288682616 of user 12: rhs_silent' in text
@@ -51,11 +51,11 @@ def test_the_view_tells_faults_and_silence_and_leaves_nothing_out_at_80_columns(
     assert '…' not in text
 
 
-def test_what_others_send_is_neither_markup_nor_control():
+def test_received_strings_are_neither_markup_nor_control_sequences():
     overview = Overview()
     overview.add(m.ProtocolState(
         1, 2, m.Phase.BEACONING, '\x1b[2J[/red]', np.zeros(4), 0.0), 1.0)
-    overview.hear('a[/b]\x1b[31m', Report(True, '[bold]\n[/x]', {
+    overview.add_report('a[/b]\x1b[31m', Report(True, '[bold]\n[/x]', {
         'phase': '[/', 'dropped.[/]\x07': '3', 'dropped.long': '9' * 5000}), 1.0)
     text = text_of(overview, 2.0, width=120)
     assert 'of user 2: ?[2J[/red]' in text
@@ -63,8 +63,8 @@ def test_what_others_send_is_neither_markup_nor_control():
     assert '\x1b' not in text and '\x07' not in text
 
 
-def test_once_prints_a_cycle_and_every_node(network, call_script):
-    text = call_script(f'{SCRIPT} --once')
+def test_once_prints_a_cycle_and_every_node(network, run_script):
+    text = run_script(f'{SCRIPT} --once')
     codebook = Codebook.load(ROOT / 'config' / 'codebook_quick.yaml')
     assert f'codebook {codebook.id}' in text
     row = r'^ +[12] +(-?\d+\.\d\d +){3}\d+\.\d\d +\d+\.\d\d +\d+\.\d\d +\d+\.\d{3} +\d+\.\d *$'
@@ -74,31 +74,31 @@ def test_once_prints_a_cycle_and_every_node(network, call_script):
         assert re.search(f'^ {node} .*(no fault|just now) ', text, re.MULTILINE), text
 
 
-def test_it_draws_over_itself_until_it_is_interrupted(network):
-    ours, theirs = pty.openpty()
-    with subprocess.Popen([SCRIPT], stdin=theirs, stdout=theirs, stderr=theirs) as process:
-        os.close(theirs)
+def test_it_refreshes_the_terminal_until_it_is_interrupted(network):
+    parent, child = pty.openpty()
+    with subprocess.Popen([SCRIPT], stdin=child, stdout=child, stderr=child) as process:
+        os.close(child)
         text = b''
         # Two views of a running network.
         while text.count(b'cycles/s') < 2:
-            text += os.read(ours, 65536)
+            text += os.read(parent, 65536)
         process.send_signal(signal.SIGINT)
         try:
             while True:
-                text += os.read(ours, 65536)
-        except OSError:  # closed by the process that has ended
-            os.close(ours)
+                text += os.read(parent, 65536)
+        except OSError:  # closed when the process ends
+            os.close(parent)
         assert process.wait(30) == 0
     assert b'Traceback' not in text
-    # The terminal is given back.
+    # The terminal is restored.
     assert text.rstrip().endswith(b'\x1b[?1049l')
 
 
-def test_a_reader_that_leaves_ends_it(network, call_script):
-    assert call_script(f'{{ {SCRIPT}; echo $? >&3; }} 3>&1 >&1 | head -n 1; true')
+def test_it_exits_when_the_reader_closes_the_pipe(network, run_script):
+    assert run_script(f'{{ {SCRIPT}; echo $? >&3; }} 3>&1 >&1 | head -n 1; true')
 
 
-def test_without_a_network_once_says_so():
+def test_once_without_a_network_is_an_error():
     done = subprocess.run(
         [SCRIPT, '--once', '--timeout', '0.3', '--ros-args', '-r', '__ns:=/nobody'],
         capture_output=True, text=True, timeout=30, check=False)
@@ -106,7 +106,7 @@ def test_without_a_network_once_says_so():
     assert done.stderr.startswith('error: no complete cycle within 0.3 s, in the domain ')
 
 
-def test_without_the_library_the_error_says_so(monkeypatch, capsys):
+def test_a_missing_library_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'rich', None)
     assert main(['--once']) == 1
     assert capsys.readouterr().err == (

@@ -20,7 +20,7 @@ from rhs_isac_ros.experiments import JobError, markdown_table
 from rhs_isac_ros.link import choose_beam, outcome
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.monitoring.cycle_log import CycleRecord
+from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
@@ -89,9 +89,9 @@ def comparison(samples: dict[str, tuple[np.ndarray, np.ndarray]], truth: np.ndar
         ['quantity', 'network', 'library', '95 % interval of the difference', 'agree'], rows)
 
 
-def run_networks(codebook_file: Path, cycles: int) -> list[CycleRecord]:
+def run_networks(codebook_file: Path, cycles: int) -> list[CompleteCycle]:
     """Return the records of cycles, from as many networks in succession as needed."""
-    records: list[CycleRecord] = []
+    records: list[CompleteCycle] = []
     domain = private_domain()
     rclpy.init(domain_id=int(domain['ROS_DOMAIN_ID']),
                signal_handler_options=SignalHandlerOptions.NO)
@@ -108,7 +108,7 @@ def run_networks(codebook_file: Path, cycles: int) -> list[CycleRecord]:
 
 
 def run_network(codebook_file: Path, cycles: int, seed: int, domain: dict[str, str],
-                bar: tqdm) -> list[CycleRecord]:
+                bar: tqdm) -> list[CompleteCycle]:
     """Return the records of cycles of one network; the seed determines its users' positions."""
     observer = CycleObserver()
     before = bar.n

@@ -1,1 +1,1 @@
-"""Trying the promises of the network: crashes, a bad air, hostile messages."""
+"""Tests of the network's invariants under crashes, an impaired channel and malformed messages."""

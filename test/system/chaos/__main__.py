@@ -1,4 +1,4 @@
-"""``python -m system.chaos``."""
+"""Entry point of ``python -m system.chaos``."""
 
 import sys
 

@@ -8,24 +8,26 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.experiments.arguments import check_directory
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.monitoring.invariants import SETTLE_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import find_each_other_quickly
-from rhs_isac_ros.tools.demo import check_directory, load_files, start_network
+from rhs_isac_ros.tools.demo import load_files, start_network
 from system.chaos import crashes, fuzzing, report, soaking
-from system.chaos.watcher import Watcher
+from system.observer import NetworkObserver
 
-# Pause between cycles; beside lies, so long that true messages leave room in the queues [s].
-_REST_S, _REST_BESIDE_LIES_S = 0.02, 0.2
+# Pause between cycles [s]; a longer one during fuzzing leaves room for messages in the queues.
+_REST_S, _FUZZING_REST_S = 0.02, 0.2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,13 +36,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments
-        Command line; by default the process's.
+        Command line; by default that of the process.
 
     Returns
     -------
     int
-        Exit code: 0 if all promises held, also after Ctrl-C; 1 if one was broken; 2 if an
-        argument or a file is wrong.
+        Exit code: 0 if all trials passed, also after Ctrl-C; 1 if one failed; 2 if an argument
+        or a file is invalid.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -53,23 +55,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.update(private_domain())
     find_each_other_quickly()
     rclpy.init(args=[])
-    watcher = Watcher(scenario)
+    observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         processes = Processes(Path(logs), {'ROS_LOG_DIR': logs})
         try:
             with processes:
                 start_network(
                     processes, 2, options.seed, options.config, codebook_file, scenario,
-                    rest_s=_REST_BESIDE_LIES_S if options.fuzz else _REST_S, first_cycle=0,
-                    impairments=soaking.AIR if options.soak else None)
-                figures = _run(watcher, processes, scenario, options)
+                    rest_s=_FUZZING_REST_S if options.fuzz else _REST_S, first_cycle=0,
+                    impairments=soaking.IMPAIRMENTS if options.soak else None)
+                figures = _run(observer, processes, scenario, options)
         except crashes.ChaosError as error:
             print(f'error: {error}', file=sys.stderr)
             return 1
         except (KeyboardInterrupt, ExternalShutdownException):
             return 0
         finally:
-            watcher.destroy_node()
+            observer.destroy_node()
             rclpy.try_shutdown()
     if options.json:
         write_whole(options.json, json.dumps(figures, indent=2) + '\n')
@@ -77,73 +79,80 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-        watcher: Watcher, processes: Processes, scenario: Scenario, options: argparse.Namespace
-) -> dict:
+        observer: NetworkObserver, processes: Processes, scenario: Scenario,
+        options: argparse.Namespace) -> dict[str, Any]:
     if options.soak:
-        return _soak(watcher, processes, options)
+        return _soak(observer, processes, options)
     if options.fuzz:
-        return _fuzz(watcher, processes, scenario, options)
-    return _crash(watcher, processes, options)
+        return _fuzz(observer, processes, scenario, options)
+    return _crash(observer, processes, options)
 
 
-def _soak(watcher: Watcher, processes: Processes, options: argparse.Namespace) -> dict:
-    soaked = soaking.soak(
-        watcher, processes, options.soak, lambda minutes, cycles: _progress(
+def _soak(
+        observer: NetworkObserver, processes: Processes, options: argparse.Namespace
+) -> dict[str, Any]:
+    result = soaking.soak(
+        observer, processes, options.soak, lambda minutes, cycles: _show_progress(
             f'{minutes:.1f} of {options.soak:g} minutes, {cycles} cycles'))
-    # What came last cannot be judged yet, and what comes now need not be.
-    watcher.spin_until(lambda: False, SETTLE_S)
-    figures = report.soak_figures(soaked, watcher.promises)
-    print(report.soak_text(soaked, figures))
+    # The last results are checked after the settling time.
+    observer.spin_for(SETTLE_S)
+    figures = report.soak_figures(result, observer.invariants)
+    print(report.soak_text(result, figures))
     return figures
 
 
 def _fuzz(
-        watcher: Watcher, processes: Processes, scenario: Scenario, options: argparse.Namespace
-) -> dict:
-    fuzzed = fuzzing.fuzz(
-        watcher, processes, scenario, options.fuzz, np.random.default_rng(options.seed),
-        lambda sent: _progress(f'{sent} of {options.fuzz} lies'))
-    print(report.fuzz_text(fuzzed))
-    return report.fuzz_figures(fuzzed)
+        observer: NetworkObserver, processes: Processes, scenario: Scenario,
+        options: argparse.Namespace) -> dict[str, Any]:
+    result = fuzzing.fuzz(
+        observer, processes, scenario, options.fuzz, np.random.default_rng(options.seed),
+        lambda sent: _show_progress(f'{sent} of {options.fuzz} mutations'))
+    print(report.fuzz_text(result))
+    return report.fuzz_figures(result)
 
 
-def _progress(text: str) -> None:
-    if sys.stderr.isatty():
-        print(f'\r{text}', end='', file=sys.stderr, flush=True)
-
-
-def _crash(watcher: Watcher, processes: Processes, options: argparse.Namespace) -> dict:
+def _crash(
+        observer: NetworkObserver, processes: Processes, options: argparse.Namespace
+) -> dict[str, Any]:
     print(report.CRASH_HEAD)
-    cells = crashes.crash_all(
-        watcher, processes, options.nodes, [m.Phase[name.upper()] for name in options.phases],
-        lambda cell: print(report.crash_line(cell), flush=True))
-    watcher.spin_until(lambda: False, SETTLE_S)
-    figures = report.crash_figures(cells, watcher.promises)
+    trials = crashes.crash_all(
+        observer, processes, options.nodes, [m.Phase[name.upper()] for name in options.phases],
+        lambda trial: print(report.crash_line(trial), flush=True))
+    observer.spin_for(SETTLE_S)
+    figures = report.crash_figures(trials, observer.invariants)
     print(report.crash_summary(figures))
     return figures
+
+
+def _show_progress(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f'\r{text}', end='', file=sys.stderr, flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='chaos', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         description='Start a network of processes, kill and restart each node in each phase, and '
-                    'watch from outside whether the network keeps its promises.')
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument('--soak', type=_positive(float), metavar='MINUTES',
-                      help='kill nobody: run so long through an air that loses 5 %% of signals '
-                      'and packets, doubles 5 %%, and delays and reorders them')
-    what.add_argument('--fuzz', type=_positive(int), metavar='N',
-                      help='kill nobody: publish so many random and mutated messages of every '
-                      'type on every topic')
+                    'check from outside that no invariant of its results is violated.')
+    test = parser.add_mutually_exclusive_group()
+    test.add_argument('--soak', type=_positive(float), metavar='MINUTES',
+                      help='instead of killing nodes, run for this time with an impaired channel '
+                      'that loses 5 %% of signals and packets, duplicates 5 %%, and delays and '
+                      'reorders them')
+    test.add_argument('--fuzz', type=_positive(int), metavar='N',
+                      help='instead of killing nodes, publish this number of random and mutated '
+                      'messages of every type on every topic')
     phases = [phase.name.lower() for phase in crashes.PHASES]
     parser.add_argument('--nodes', nargs='+', default=crashes.NODES, choices=crashes.NODES,
                         metavar='NODE', help='nodes to kill')
     parser.add_argument('--phases', nargs='+', default=phases, choices=phases, metavar='PHASE',
                         help='phases to kill them in')
     parser.add_argument('--seed', type=int, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', type=Path, help="scenario file; the paper's Table I if none")
-    parser.add_argument('--codebook', type=Path, help="codebook file; the package's if none")
-    parser.add_argument('--json', type=Path, metavar='PATH', help='file to write the figures to')
+    parser.add_argument('--config', type=Path,
+                        help="scenario file; by default the paper's Table I")
+    parser.add_argument('--codebook', type=Path,
+                        help='codebook file; by default that of the package')
+    parser.add_argument('--json', type=Path, metavar='PATH', help='file for the figures')
     return parser
 
 

@@ -1,206 +1,185 @@
-"""Kills each node in each phase, starts it again, and sees how long the network takes to serve."""
+"""Crash trials: kill each node in each phase, restart it, and measure the time to recover."""
 
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station import BaseStation
+from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.positioner import Positioner
+from rhs_isac_ros.protocol.rhs_controller import RhsController
+from rhs_isac_ros.protocol.transmission import Transmission
+from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros.processes import Processes
-from system.chaos.watcher import Watcher
+from system.observer import NetworkObserver
 
-# What each node publishes of what the promises are judged by.
+# Messages that each node publishes.
 PUBLISHES = {
-    'bs': (m.Grant, m.ReceivedSignals),
-    'rhs_controller': (m.RhsConfiguration,),
-    'channel': (m.FeedSignals,),
-    'positioner': (m.PositionEstimate,),
-    'transmission': (m.Beam, m.Capacity),
+    'bs': BaseStation.SENDS,
+    'rhs_controller': RhsController.SENDS,
+    'channel': Channel.SENDS,
+    'positioner': Positioner.SENDS,
+    'transmission': Transmission.SENDS,
     'optimizer': (),
-    'user_1': (),
+    'user_1': User.SENDS,
 }
 NODES = tuple(PUBLISHES)
 PHASES = tuple(m.Phase)
-# What counts as recovered [s].
-LIMIT_S = 3.0
-_PATIENCE_S = 30.0
-# Who tells of a node that is missing has so long to do so: users wait 1.5 s for a beacon, and
-# diagnostics come once a second.
-_DOWN_S = 3.0
+# Maximum time to recover [s].
+RECOVERY_LIMIT_S = 3.0
+_TIMEOUT_S = 30.0
+# A killed node is restarted after this time [s]. Until then, the other nodes must report that it
+# is missing: users wait 1.5 s for a beacon, and diagnostics are published once a second.
+_DOWNTIME_S = 3.0
 
 
 class ChaosError(RuntimeError):
-    """The network does not do what every trial begins with."""
+    """The network does not reach the state in which a trial can begin."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Cell:
-    """One trial.
+class CrashTrial:
+    """Result of one trial.
 
     Attributes
     ----------
     node, phase
-        Which node was killed, in which phase.
-    late_s
-        How long after the phase was seen to begin it was dead [s].
-    recovered_s
-        From the start of its process to the end of the first cycle that was served after that,
-        for a user: of one of its own cycles [s]; infinite if there was none.
+        The node that was killed, and the phase.
+    kill_delay_s
+        Time from the observed begin of the phase to the death of the process [s].
+    recovery_s
+        Time from the restart of the process to the end of the first cycle that was served after
+        it, for a user of one of its own cycles [s]; infinite if there was none.
     survivors
-        Whether all other processes lived on.
-    told_log
-        Warnings of the others about it, each with the name of who said it.
-    told_diagnostics
-        Nodes whose diagnostics showed that something was amiss, while it was missing.
-    broken
-        Results that should not have been published.
+        Whether all other processes kept running.
+    logged
+        Warnings that other nodes logged about the missing node, each as ``<node>: <text>``.
+    diagnosed
+        Nodes whose diagnostics reported a fault while the node was missing.
+    violations
+        Results that violate an invariant.
     """
 
     node: str
     phase: str
-    late_s: float
-    recovered_s: float
+    kill_delay_s: float
+    recovery_s: float
     survivors: bool
-    told_log: tuple[str, ...]
-    told_diagnostics: tuple[str, ...]
-    broken: tuple[str, ...]
+    logged: tuple[str, ...]
+    diagnosed: tuple[str, ...]
+    violations: tuple[str, ...]
 
     @property
     def recovered(self) -> bool:
-        """Whether the network served again in time and lost nobody else."""
-        return self.recovered_s <= LIMIT_S and self.survivors
+        """Whether cycles were served in time and all other processes kept running."""
+        return self.recovery_s <= RECOVERY_LIMIT_S and self.survivors
 
     @property
-    def told(self) -> bool:
-        """Whether others told of it, in log and diagnostics, and nobody twice the same."""
-        return bool(self.told_log and self.told_diagnostics
-                    and len(set(self.told_log)) == len(self.told_log))
+    def reported(self) -> bool:
+        """Whether logs and diagnostics reported the missing node, without repeated warnings."""
+        return bool(self.logged and self.diagnosed
+                    and len(set(self.logged)) == len(self.logged))
 
 
 def crash_all(
-        watcher: Watcher, processes: Processes, nodes: Sequence[str],
-        phases: Iterable[m.Phase], done: Callable[[Cell], None]) -> list[Cell]:
-    """Try every node in every phase.
+        observer: NetworkObserver, processes: Processes, nodes: Sequence[str],
+        phases: Iterable[m.Phase], on_trial: Callable[[CrashTrial], None]) -> list[CrashTrial]:
+    """Kill every node in every phase.
 
     Parameters
     ----------
-    watcher
-        Hears the network.
     processes
-        The network, with users 1 and 2.
+        The network, with the users 1 and 2.
     nodes
         Names of the nodes to kill.
-    phases
-        Phases to kill them in.
-    done
+    on_trial
         Called after each trial.
-
-    Returns
-    -------
-    list of Cell
-        The trials.
 
     Raises
     ------
     ChaosError
         If the network does not serve its users before a trial.
     """
-    cells = []
+    trials = []
     for node in nodes:
         for phase in phases:
-            cells.append(crash(watcher, processes, node, phase))
-            done(cells[-1])
-    return cells
+            trials.append(crash(observer, processes, node, phase))
+            on_trial(trials[-1])
+    return trials
 
 
-def crash(watcher: Watcher, processes: Processes, node: str, phase: m.Phase) -> Cell:
-    """Kill a node in a phase, and start it again.
-
-    Parameters
-    ----------
-    watcher
-        Hears the network.
-    processes
-        The network.
-    node
-        Name of the node.
-    phase
-        The phase.
-
-    Returns
-    -------
-    Cell
-        What came of it.
+def crash(
+        observer: NetworkObserver, processes: Processes, node: str, phase: m.Phase) -> CrashTrial:
+    """Kill a node in a phase, and restart it.
 
     Raises
     ------
     ChaosError
         If the network does not serve its users before.
     """
-    _await_service(watcher)
-    broken = len(watcher.promises.broken)
-    logs = _log_lengths(processes)
-    late_s = _kill_in(watcher, processes, node, phase)
-    warned = set()
-    down_s = time.monotonic() + _DOWN_S
-    watcher.told.clear()
-    while time.monotonic() < down_s:
-        watcher.spin_until(lambda: False, 0.1)
-        warned |= set(watcher.warnings())
-    watcher.promises.expect_silence(PUBLISHES[node])
-    told_log = tuple(_warnings_since(processes, logs, node))
-    heard = watcher.codebooks_heard
-    began_s = time.monotonic()
+    _wait_for_service(observer)
+    n_violations = len(observer.invariants.violations)
+    log_lengths = {name: len(processes.log(name)) for name in processes.names}
+    kill_delay_s = _kill_in(observer, processes, node, phase)
+    observer.warnings.clear()
+    observer.spin_for(_DOWNTIME_S)
+    diagnosed = tuple(sorted(observer.warnings))
+    logged = tuple(_warnings_since(processes, log_lengths, node))
+    observer.invariants.expect_rediscovery(PUBLISHES[node])
+    n_codebooks = observer.n_codebooks
+    restart_s = time.monotonic()
     processes.restart(node)
-    wanted = int(node.removeprefix('user_')) if node.startswith('user_') else None
+    user = int(node.removeprefix('user_')) if node.startswith('user_') else None
 
-    def serves() -> bool:
-        again = any(end.outcome == 'served' and end.began_s > began_s and
-                    wanted in (None, end.user) for end in reversed(watcher.ends[-20:]))
-        return again and (node != 'optimizer' or watcher.codebooks_heard > heard)
-    again = watcher.spin_until(serves, _PATIENCE_S)
-    recovered_s = time.monotonic() - began_s if again else float('inf')
-    return Cell(
-        node, phase.name.lower(), late_s, recovered_s, not processes.ended(), told_log,
-        tuple(sorted(warned)), tuple(watcher.promises.broken[broken:]))
-
-
-def _await_service(watcher: Watcher) -> None:
-    """Wait until both users are served in cycles that begin now."""
-    begin = len(watcher.ends)
-
-    def both() -> bool:
-        return {1, 2} <= {end.user for end in watcher.ends[begin:] if end.outcome == 'served'}
-    if not watcher.spin_until(both, _PATIENCE_S):
-        reasons = [end.outcome for end in watcher.ends[begin:]]
-        raise ChaosError(f'the users are not served within {_PATIENCE_S:g} s; cycles end '
-                         f'with {reasons or "nothing"}')
+    def served() -> bool:
+        found = any(record.outcome == 'served' and record.began_s > restart_s
+                    and user in (None, record.user) for record in observer.log.ended[-20:])
+        return found and (node != 'optimizer' or observer.n_codebooks > n_codebooks)
+    recovered = observer.spin_until(served, _TIMEOUT_S)
+    recovery_s = time.monotonic() - restart_s if recovered else float('inf')
+    return CrashTrial(
+        node, phase.name.lower(), kill_delay_s, recovery_s, not processes.ended(), logged,
+        diagnosed, tuple(observer.invariants.violations[n_violations:]))
 
 
-def _kill_in(watcher: Watcher, processes: Processes, node: str, phase: m.Phase) -> float:
+def both_served(observer: NetworkObserver, first: int) -> bool:
+    """Return whether users 1 and 2 were served in the cycles from the index `first` on."""
+    return {1, 2} <= {
+        record.user for record in observer.log.ended[first:] if record.outcome == 'served'}
+
+
+def _wait_for_service(observer: NetworkObserver) -> None:
+    """Wait until both users have been served in cycles that end from now on."""
+    first = len(observer.log.ended)
+    if not observer.spin_until(lambda: both_served(observer, first), _TIMEOUT_S):
+        outcomes = [record.outcome for record in observer.log.ended[first:]]
+        raise ChaosError(f'the users are not served within {_TIMEOUT_S:g} s; outcomes of the '
+                         f'cycles: {outcomes or "none"}')
+
+
+def _kill_in(
+        observer: NetworkObserver, processes: Processes, node: str, phase: m.Phase) -> float:
     """Kill a node as soon as a cycle enters a phase; return how long that took [s]."""
-    late_s: list[float] = []
+    delays_s: list[float] = []
 
-    def strike(entered: m.Phase, cycle_id: int) -> None:
-        if entered is phase and not late_s:
+    def kill(entered: m.Phase) -> None:
+        if entered is phase and not delays_s:
             begin_s = time.monotonic()
             processes.kill(node)
-            late_s.append(time.monotonic() - begin_s)
-    watcher.on_phase = strike
+            delays_s.append(time.monotonic() - begin_s)
+    observer.on_phase = kill
     try:
-        if not watcher.spin_until(lambda: bool(late_s), _PATIENCE_S):
-            raise ChaosError(f'no cycle enters the phase {phase.name} in {_PATIENCE_S:g} s')
+        if not observer.spin_until(lambda: bool(delays_s), _TIMEOUT_S):
+            raise ChaosError(f'no cycle enters the phase {phase.name} within {_TIMEOUT_S:g} s')
     finally:
-        watcher.on_phase = lambda phase, cycle_id: None
-    return late_s[0]
-
-
-def _log_lengths(processes: Processes) -> dict[str, int]:
-    return {name: len(processes.log(name)) for name in processes.names}
+        observer.on_phase = lambda entered: None
+    return delays_s[0]
 
 
 def _warnings_since(
-        processes: Processes, lengths: dict[str, int], without: str) -> list[str]:
-    """Warnings in the logs of all but one process, each with the name of its node."""
+        processes: Processes, log_lengths: dict[str, int], excluded: str) -> list[str]:
+    """Return new warnings in the logs of all nodes but one, each with the name of its node."""
     return [f'{name}: {line.split("]: ", 1)[-1]}'
-            for name, length in lengths.items() if name != without
+            for name, length in log_lengths.items() if name != excluded
             for line in processes.log(name)[length:].splitlines() if '[WARN]' in line]

@@ -1,4 +1,4 @@
-"""Lets a network run through a bad air, and sees what becomes of cycles and memory."""
+"""Soak test: a long run with an impaired channel, with statistics of cycles and memory."""
 
 import collections
 import dataclasses
@@ -8,35 +8,35 @@ from collections.abc import Callable, Mapping
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.ros.processes import Processes
 from system.chaos.crashes import ChaosError
-from system.chaos.watcher import Watcher
+from system.observer import NetworkObserver
 
-AIR = Impairments(
+IMPAIRMENTS = Impairments(
     loss_probability=0.05, double_probability=0.05, delay_s=0.001, jitter_s=0.005)
-# What is asked for: cycles that end in an estimate, and growth of the memory.
-LEAST_SHARE, MOST_GROWTH = 0.99, 0.05
-# Memory is compared with what it was after so long, or a third of the time if that is shorter.
-_SETTLED_S = 60.0
-_PATIENCE_S = 30.0
+# Requirements: share of the cycles that lead to an estimate, and relative growth of the memory.
+MIN_ESTIMATE_SHARE, MAX_MEMORY_GROWTH = 0.99, 0.05
+# The growth counts from this time on, or from a third of the run if that is earlier [s].
+_WARM_UP_S = 60.0
+_TIMEOUT_S = 30.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Soaked:
-    """What became of a long run.
+class SoakResult:
+    """Result of a soak test.
 
     Attributes
     ----------
     minutes
-        How long it was.
+        Duration of the run [min].
     outcomes
-        Cycles by how they ended.
+        Number of cycles by outcome.
     estimates
-        Cycles that led to an estimate.
+        Number of cycles that led to an estimate.
     retries
-        Steps that were asked for again, by step.
-    air
-        What the air did, by kind.
+        Number of repeated requests by step.
+    impaired
+        Number of impaired messages by kind of impairment.
     memory_bytes
-        By node: resident memory when it was settled, and at the end.
+        Resident memory by node, after the warm-up and at the end.
     ended
         Processes that ended.
     """
@@ -45,79 +45,75 @@ class Soaked:
     outcomes: Mapping[str, int]
     estimates: int
     retries: Mapping[str, int]
-    air: Mapping[str, int]
+    impaired: Mapping[str, int]
     memory_bytes: Mapping[str, tuple[int, int]]
     ended: tuple[str, ...]
 
     @property
     def cycles(self) -> int:
-        """Cycles that ended."""
+        """Number of cycles that ended."""
         return sum(self.outcomes.values())
 
     @property
-    def share(self) -> float:
+    def estimate_share(self) -> float:
         """Share of the cycles that led to an estimate."""
         return self.estimates / max(self.cycles, 1)
 
     @property
-    def growth(self) -> dict[str, float]:
-        """Growth of the memory by node, as a share."""
+    def memory_growth(self) -> dict[str, float]:
+        """Relative growth of the memory by node."""
         return {name: last / first - 1 for name, (first, last) in self.memory_bytes.items()}
 
     @property
     def passed(self) -> bool:
-        """Whether enough cycles led to an estimate, and nobody died or grew."""
-        return (not self.ended and self.share >= LEAST_SHARE
-                and max(self.growth.values(), default=0.0) < MOST_GROWTH)
+        """Whether the requirements are met and all processes kept running."""
+        return (not self.ended and self.estimate_share >= MIN_ESTIMATE_SHARE
+                and max(self.memory_growth.values(), default=0.0) < MAX_MEMORY_GROWTH)
 
 
 def soak(
-        watcher: Watcher, processes: Processes, minutes: float,
-        progress: Callable[[float, int], None]) -> Soaked:
-    """Let a network run.
+        observer: NetworkObserver, processes: Processes, minutes: float,
+        on_progress: Callable[[float, int], None]) -> SoakResult:
+    """Observe a network for a time.
 
     Parameters
     ----------
-    watcher
-        Hears the network.
-    processes
-        The network.
     minutes
-        How long.
-    progress
-        Called now and then with the minutes so far and the cycles that have ended.
-
-    Returns
-    -------
-    Soaked
-        What became of it.
+        Duration [min].
+    on_progress
+        Called every few seconds with the elapsed minutes and the number of cycles that ended.
 
     Raises
     ------
     ChaosError
-        If the first cycle does not come.
+        If no first cycle ends.
     """
-    if not watcher.spin_until(lambda: bool(watcher.ends), _PATIENCE_S):
-        raise ChaosError(f'no cycle within {_PATIENCE_S:g} s')
-    begin_s, begin = time.monotonic(), len(watcher.ends)
-    estimates = watcher.estimates
-    span_s = 60.0 * minutes
-    settled_s = min(_SETTLED_S, span_s / 3)
-    first: dict[str, int] = {}
-    while (elapsed_s := time.monotonic() - begin_s) < span_s and not processes.ended():
-        if not first and elapsed_s >= settled_s:
-            first = processes.memory_bytes()
-        watcher.spin_until(lambda: False, min(5.0, settled_s - elapsed_s if elapsed_s < settled_s
-                                              else span_s - elapsed_s))
-        progress((time.monotonic() - begin_s) / 60, len(watcher.ends) - begin)
-    last = processes.memory_bytes()
-    outcomes = collections.Counter(end.outcome for end in watcher.ends[begin:])
-    told = [(key, int(value)) for node in ('bs', 'channel')
-            for key, value in watcher.values(node).items()
-            if key.startswith(('retries.', 'dropped.emulated'))]
-    return Soaked(
-        (time.monotonic() - begin_s) / 60, dict(outcomes), watcher.estimates - estimates,
-        {key.partition('.')[2]: n for key, n in told if key.startswith('retries.')},
-        {key.partition('emulated_')[2]: n for key, n in told if 'emulated_' in key},
-        {name: (first[name], last[name]) for name in first if name in last},
+    log = observer.log
+    if not observer.spin_until(lambda: bool(log.ended), _TIMEOUT_S):
+        raise ChaosError(f'no cycle within {_TIMEOUT_S:g} s')
+    begin_s, first = time.monotonic(), len(log.ended)
+    duration_s = 60.0 * minutes
+    warm_up_s = min(_WARM_UP_S, duration_s / 3)
+    memory_before: dict[str, int] = {}
+    while (elapsed_s := time.monotonic() - begin_s) < duration_s and not processes.ended():
+        if not memory_before and elapsed_s >= warm_up_s:
+            memory_before = processes.memory_bytes()
+        next_s = warm_up_s if elapsed_s < warm_up_s else duration_s
+        observer.spin_for(min(5.0, next_s - elapsed_s))
+        on_progress((time.monotonic() - begin_s) / 60, len(log.ended) - first)
+    memory = processes.memory_bytes()
+    cycles = log.ended[first:]
+    return SoakResult(
+        (time.monotonic() - begin_s) / 60,
+        dict(collections.Counter(cycle.outcome for cycle in cycles)),
+        sum(cycle.estimate is not None for cycle in cycles),
+        _counts(observer, 'bs', 'retries.'), _counts(observer, 'channel', 'dropped.emulated_'),
+        {name: (memory_before[name], memory[name]) for name in memory_before if name in memory},
         tuple(processes.ended()))
+
+
+def _counts(observer: NetworkObserver, node: str, prefix: str) -> dict[str, int]:
+    """Return the counters of a node whose keys begin with a prefix, by the rest of the key."""
+    values = observer.reports[node].values if node in observer.reports else {}
+    return {key.removeprefix(prefix): int(value) for key, value in values.items()
+            if key.startswith(prefix)}

@@ -1,72 +1,86 @@
-"""The tables and figures of the trials."""
+"""Texts and figures of the chaos trials."""
 
 import math
+
+import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.invariants import InvariantChecker
 from system.chaos import report
-from system.chaos.crashes import Cell
-from system.chaos.fuzzing import Fuzzed
-from system.chaos.soaking import Soaked
+from system.chaos.crashes import CrashTrial
+from system.chaos.fuzzing import FuzzResult
+from system.chaos.soaking import SoakResult
 
 
-def cell(recovered_s=1.0, survivors=True, told=('bs: user 1 given up: rhs_silent',), **fields):
-    return Cell('rhs_controller', 'positioning', 1e-3, recovered_s, survivors, told,
-                ('bs',), **{'broken': (), **fields})
+def crash_trial(**fields):
+    given = {'node': 'rhs_controller', 'phase': 'positioning', 'kill_delay_s': 1e-3,
+             'recovery_s': 1.0, 'survivors': True,
+             'logged': ('bs: user 1 given up: rhs_silent',), 'diagnosed': ('bs',),
+             'violations': ()}
+    return CrashTrial(**given | fields)
 
 
-def figures_of(*cells, broken=()):
-    promises = InvariantChecker(Scenario())
-    promises.broken = list(broken)
-    return report.crash_figures(cells, promises)
+def figures_of(*trials, violations=()):
+    checker = InvariantChecker(Scenario())
+    checker.violations = list(violations)
+    return report.crash_figures(trials, checker)
 
 
-def test_all_well():
-    figures = figures_of(cell(), cell(2.5))
+def test_trials_with_recovery_and_reports_pass():
+    figures = figures_of(crash_trial(), crash_trial(recovery_s=2.5))
     assert figures['passed']
-    assert (figures['cells'], figures['cells_recovered'], figures['cells_told']) == (2, 2, 2)
+    assert (figures['trials'], figures['trials_recovered'], figures['trials_reported']) == (
+        2, 2, 2)
     assert (figures['worst_recovery_s'], figures['wrong_publications']) == (2.5, 0)
     assert '2 of 2 recovered' in report.crash_summary(figures)
-    assert report.crash_line(cell()).split() == [
+    assert report.crash_line(crash_trial()).split() == [
         'rhs_controller', 'positioning', '1.00', 's', 'alive', 'bs;', 'bs']
 
 
-def test_late_dead_silent_repeated_and_wrong_are_no_success():
-    for bad in (cell(3.01), cell(math.inf), cell(survivors=False), cell(told=()),
-                cell(told=('bs: gone', 'bs: gone'))):
-        assert not figures_of(cell(), bad)['passed']
-        assert report.crash_line(bad).isprintable()
-    assert not figures_of(cell(), broken=['PositionEstimate of cycle 3'])['passed']
-    assert figures_of(cell(math.inf))['worst_recovery_s'] is None
-    assert 'NOT IN TIME' in report.crash_line(cell(3.01))
-    assert 'NOT TOLD ONCE' in report.crash_line(cell(told=()))
-    assert '  WRONG: x' in report.crash_line(cell(broken=('x',)))
+@pytest.mark.parametrize('fields, mark', [
+    ({'recovery_s': 3.01}, 'NOT IN TIME'), ({'recovery_s': math.inf}, 'NOT IN TIME'),
+    ({'survivors': False}, 'DEAD'), ({'logged': ()}, 'NOT REPORTED ONCE'),
+    ({'diagnosed': ()}, 'NOT REPORTED ONCE'),
+    ({'logged': ('bs: missing', 'bs: missing')}, 'NOT REPORTED ONCE')])
+def test_a_trial_fails_if_late_dead_unreported_or_reported_twice(fields, mark):
+    failed = crash_trial(**fields)
+    assert not figures_of(crash_trial(), failed)['passed']
+    assert mark in report.crash_line(failed)
 
 
-def soaked(**fields):
+def test_violations_fail_and_are_printed():
+    assert not figures_of(crash_trial(), violations=['PositionEstimate of cycle 3'])['passed']
+    assert '  VIOLATION: x' in report.crash_line(crash_trial(violations=('x',)))
+
+
+def test_an_infinite_recovery_is_none_in_json():
+    assert figures_of(crash_trial(recovery_s=math.inf))['worst_recovery_s'] is None
+
+
+def soak_result(**fields):
     given = {'minutes': 10.0, 'outcomes': {'served': 995, 'user_gone': 5}, 'estimates': 996,
-             'retries': {'retry_band': 40}, 'air': {'loss': 80},
+             'retries': {'retry_band': 40}, 'impaired': {'loss': 80},
              'memory_bytes': {'bs': (100, 104)}, 'ended': ()}
-    return Soaked(**given | fields)
+    return SoakResult(**given | fields)
 
 
-def test_a_long_run_passes_within_its_limits():
-    good = soaked()
-    assert (good.cycles, good.share) == (1000, 0.996)
-    assert good.passed
-    assert not soaked(estimates=989).passed
-    assert not soaked(memory_bytes={'bs': (100, 106)}).passed
-    assert not soaked(ended=('bs',)).passed
-    figures = report.soak_figures(good, InvariantChecker(Scenario()))
+def test_a_soak_test_passes_within_its_limits():
+    result = soak_result()
+    assert (result.cycles, result.estimate_share) == (1000, 0.996)
+    assert result.passed
+    assert not soak_result(estimates=989).passed
+    assert not soak_result(memory_bytes={'bs': (100, 106)}).passed
+    assert not soak_result(ended=('bs',)).passed
+    figures = report.soak_figures(result, InvariantChecker(Scenario()))
     assert figures['passed']
-    assert '99.60 %' in report.soak_text(good, figures)
+    assert '99.60 %' in report.soak_text(result, figures)
 
 
-def test_lies_pass_if_all_that_is_malformed_was_counted():
+def test_fuzzing_passes_if_all_malformed_messages_were_counted():
     given = {'sent': {'beacon': 5}, 'malformed': {'bs': 3}, 'counted': {'bs': 3},
-             'dropped': {'malformed': 3}, 'ended': (), 'traces': (), 'serves_again_s': 0.5}
-    assert Fuzzed(**given).passed
-    for bad in ({'counted': {'bs': 2}}, {'ended': ('bs',)}, {'traces': ('bs: Traceback',)}):
-        assert not Fuzzed(**given | bad).passed
-    assert '5 lies on 1 topics' in report.fuzz_text(Fuzzed(**given))
-    assert report.fuzz_figures(Fuzzed(**given))['passed']
+             'dropped': {'malformed': 3}, 'ended': (), 'traces': (), 'recovery_s': 0.5}
+    assert FuzzResult(**given).passed
+    for failed in ({'counted': {'bs': 2}}, {'ended': ('bs',)}, {'traces': ('bs: Traceback',)}):
+        assert not FuzzResult(**given | failed).passed
+    assert '5 mutations on 1 topics' in report.fuzz_text(FuzzResult(**given))
+    assert report.fuzz_figures(FuzzResult(**given))['passed']

@@ -1,1 +1,1 @@
-"""The network on several hosts of one machine: network namespaces whose links are pulled."""
+"""Test of the network on several hosts: network namespaces whose links are taken down."""

@@ -1,4 +1,4 @@
-"""The command of ``scripts/hosts``."""
+"""Entry point of ``python -m system.hosts``."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Network namespaces on this machine: made, entered, cut and always removed."""
+"""Network namespaces on this machine: created, entered, disconnected and always removed."""
 
 import contextlib
 import ctypes
@@ -18,36 +18,37 @@ _FOLDER = Path('/run/netns')
 _CLONE_NEWNET = 0x40000000
 
 
-class NamespacesRefused(RuntimeError):
-    """The caller may make no network namespaces on this machine."""
+class NamespacesUnavailable(RuntimeError):
+    """The process may not create network namespaces on this machine."""
 
 
 class Hosts:
-    """All hosts of a run; a context manager that makes and removes them.
+    """All hosts of a run: a context manager that creates and removes them.
 
-    Whatever runs on a host when it is removed is killed.
+    Processes that still run on a host when it is removed are killed.
 
     Raises
     ------
-    NamespacesRefused
-        On entering, if they cannot be made.
+    NamespacesUnavailable
+        On entering, if the hosts cannot be created.
     """
 
     def __init__(self) -> None:
         self._pid = os.getpid()
 
     def __enter__(self) -> 'Hosts':
-        """Clean up after runs that were killed, then make the hosts."""
+        """Remove the hosts of killed runs, then create those of this run."""
         if shutil.which('ip') is None:
-            raise NamespacesRefused('there is no ip (Debian: apt install iproute2)')
-        for name in plan.stale(_names(), _runs):
+            raise NamespacesUnavailable(
+                'the command ip is missing (Debian: apt install iproute2)')
+        for name in plan.stale(_names(), _is_running):
             _remove(name)
         try:
-            for command in plan.make(self._pid):
+            for command in plan.create(self._pid):
                 _run(command)
         except subprocess.CalledProcessError as error:
             self._remove_all()
-            raise NamespacesRefused(
+            raise NamespacesUnavailable(
                 f'{" ".join(error.cmd)}: {error.stderr.strip()}') from None
         except BaseException:
             self._remove_all()
@@ -66,73 +67,39 @@ class Hosts:
                 _remove(name)
 
     def enter(self, host: str) -> None:
-        """Move this thread, and those that it starts from now on, to a host.
-
-        Parameters
-        ----------
-        host
-            Name of the host.
+        """Move this thread, and the threads that it starts later, to a host.
 
         Raises
         ------
         OSError
-            If that is not allowed.
+            If that is not permitted.
         """
         libc = ctypes.CDLL(None, use_errno=True)
         with open(_FOLDER / plan.namespace(self._pid, host), 'rb') as file:
             if libc.setns(file.fileno(), _CLONE_NEWNET):
                 raise OSError(ctypes.get_errno(), f'setns to the host {host}')
 
-    def inside(self, node: str) -> list[str]:
-        """Return what to put before a command to run it on the host of a node.
+    def command_prefix(self, node: str) -> list[str]:
+        """Return the prefix of a command that runs it on the host of a node."""
+        return plan.command_prefix(self._pid, node)
 
-        Parameters
-        ----------
-        node
-            Name of the node.
+    def disconnect(self, host: str) -> None:
+        """Take the link of a host down."""
+        _run(plan.set_link(self._pid, host, up=False))
 
-        Returns
-        -------
-        list of str
-            The beginning of a command.
-        """
-        return plan.inside(self._pid, node)
-
-    def pull(self, host: str) -> None:
-        """Pull the cable of a host.
-
-        Parameters
-        ----------
-        host
-            Name of the host.
-        """
-        _run(plan.link(self._pid, host, up=False))
-
-    def put_back(self, host: str) -> None:
-        """Put the cable of a host back.
-
-        Parameters
-        ----------
-        host
-            Name of the host.
-        """
-        _run(plan.link(self._pid, host, up=True))
+    def reconnect(self, host: str) -> None:
+        """Restore the link of a host."""
+        _run(plan.set_link(self._pid, host, up=True))
 
     def packets(self) -> dict[str, int]:
-        """Count what has come from each host to the switch.
-
-        Returns
-        -------
-        dict
-            Number of packets by host.
-        """
+        """Return the number of packets that the bridge has received from each host."""
         text = _run(('ip', '-n', plan.namespace(self._pid, plan.SWITCH), '-s', '-j', 'link'))
         received = {port['ifname']: port['stats64']['rx']['packets']
                     for port in json.loads(text)}
         return {host: received[plan.port(host)] for host in plan.HOSTS}
 
 
-def _runs(pid: int) -> bool:
+def _is_running(pid: int) -> bool:
     return Path(f'/proc/{pid}').exists()
 
 
@@ -141,7 +108,7 @@ def _names() -> list[str]:
 
 
 def _remove(name: str) -> None:
-    """Remove a namespace with all that runs in it; one that goes at the same time is fine."""
+    """Kill the processes in a namespace and remove it, unless it is being removed already."""
     with contextlib.suppress(subprocess.CalledProcessError):
         for pid in _run(('ip', 'netns', 'pids', name)).split():
             # This process itself may have moved there.
@@ -154,22 +121,14 @@ def _remove(name: str) -> None:
 def _run(command: plan.Command) -> str:
     return subprocess.run(
         command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True,
-        # Ctrl-C is for this process alone: half a command would be half a cable.
+        # Ctrl-C must not interrupt a command halfway.
         start_new_session=True).stdout
 
 
-def guarded(callback: Callable[[], int]) -> int:
-    """Call a function that SIGTERM and SIGHUP interrupt like Ctrl-C, once, so that it cleans up.
+def interruptible(callback: Callable[[], int]) -> int:
+    """Call a function and return its result; SIGTERM and SIGHUP interrupt it like Ctrl-C.
 
-    Parameters
-    ----------
-    callback
-        The function.
-
-    Returns
-    -------
-    int
-        What it returns.
+    Further signals are ignored after the first one, so that the function can clean up.
     """
     def interrupt(number: int, frame: object) -> None:
         for other in before:

@@ -1,7 +1,7 @@
-"""Which node lives on which host, and the commands that make, cut and remove the hosts.
+"""The hosts with their nodes, and the commands that create, disconnect and remove them.
 
-A host is a network namespace. A virtual cable leads from each to a bridge in one more namespace,
-so that nothing of the machine's own network is touched.
+A host is a network namespace. A pair of virtual Ethernet devices connects each to a bridge in
+another namespace, so that the machine's own network is not touched.
 """
 
 import re
@@ -16,45 +16,35 @@ HOSTS: dict[str, tuple[str, ...]] = {
     'positioner': ('positioner', 'transmission'),
     'users': ('user',),
 }
-# Watches from a host of its own, whose link stays.
+# Host of the observer, which is never disconnected.
 OBSERVER = 'observer'
 SWITCH = 'switch'
-# Who misses whom: the nodes that wait for one of a host whose link is pulled.
-WAITERS: dict[str, tuple[str, ...]] = {
+# Nodes that wait for a node of the disconnected host.
+WAITING: dict[str, tuple[str, ...]] = {
     'base_station': ('user',),
     'surface': ('bs',),
     'channel': ('bs', 'user'),
     'positioner': ('bs',),
     'users': (),
 }
-# What Fast DDS takes if no profile says otherwise [s].
-_USUAL_LEASE_S = 20.0
+# Default of Fast DDS [s].
+_DEFAULT_LEASE_S = 20.0
 
 _PREFIX = 'rhs_isac'
 _NAME = re.compile(rf'{_PREFIX}-(\d+)-\w+')
-# For tests of networks (RFC 2544): in no one's real network.
+# Reserved for tests of network devices (RFC 2544).
 _NETWORK = '198.18.0'
 
 Command = tuple[str, ...]
 
 
 def host_of(node: str) -> str:
-    """Return the host of a node.
-
-    Parameters
-    ----------
-    node
-        Name of the node; users are ``user_1`` and so on.
-
-    Returns
-    -------
-    str
-        Name of the host.
+    """Return the host of a node; the nodes of users are ``user_1`` and so on.
 
     Raises
     ------
     ValueError
-        If it lives on none.
+        If the node is on none of the hosts.
     """
     kind = 'user' if node.startswith('user_') else node
     for host, nodes in HOSTS.items():
@@ -64,59 +54,33 @@ def host_of(node: str) -> str:
 
 
 def namespace(pid: int, host: str) -> str:
-    """Return the network namespace of a host; runs of other processes have others.
-
-    Parameters
-    ----------
-    pid
-        Process that makes it.
-    host
-        Name of the host, of the observer's or of the switch.
-
-    Returns
-    -------
-    str
-        Name of the namespace.
-    """
+    """Return the name of the network namespace of a host, unique for each process."""
     return f'{_PREFIX}-{pid}-{host}'
 
 
-def stale(namespaces: Iterable[str], runs: Callable[[int], bool]) -> list[str]:
-    """Return what runs have left behind that could not clean up.
+def stale(namespaces: Iterable[str], is_running: Callable[[int], bool]) -> list[str]:
+    """Return the namespaces that terminated processes have left behind.
 
     Parameters
     ----------
     namespaces
         Names of all network namespaces of the machine.
-    runs
-        Tells whether there is a process of a number.
-
-    Returns
-    -------
-    list of str
-        Those namespaces of ours whose process is gone.
+    is_running
+        Callable that takes the id of a process and returns whether it is running.
     """
     return [name for name in namespaces
-            if (match := _NAME.fullmatch(name)) and not runs(int(match[1]))]
+            if (match := _NAME.fullmatch(name)) and not is_running(int(match[1]))]
 
 
-def make(pid: int) -> list[Command]:
-    """Return the commands that make all hosts and connect them.
+def create(pid: int) -> list[Command]:
+    """Return the commands that create all hosts and connect them.
 
-    Parameters
-    ----------
-    pid
-        Process that makes them.
-
-    Returns
-    -------
-    list of tuple
-        Commands; all but the first few act inside of namespaces.
+    All commands but those that create namespaces act inside of them.
     """
     switch = namespace(pid, SWITCH)
     commands: list[Command] = [
         *(('ip', 'netns', 'add', namespace(pid, name)) for name in (SWITCH, *addresses())),
-        # Without snooping, the bridge floods multicast: nobody on it asks for memberships.
+        # Without a multicast querier, a snooping bridge does not forward multicast packets.
         ('ip', '-n', switch, 'link', 'add', 'bridge', 'type', 'bridge', 'mcast_snooping', '0'),
         ('ip', '-n', switch, 'link', 'set', 'bridge', 'up'),
     ]
@@ -134,89 +98,39 @@ def make(pid: int) -> list[Command]:
 
 
 def addresses() -> dict[str, str]:
-    """Return the addresses of the hosts, the observer's among them.
-
-    Returns
-    -------
-    dict
-        IPv4 addresses by host, all in one network.
-    """
+    """Return the IPv4 addresses of all hosts and of the observer's, all in one network."""
     return {host: f'{_NETWORK}.{number}'
             for number, host in enumerate((*HOSTS, OBSERVER), start=1)}
 
 
 def port(host: str) -> str:
-    """Return the name of the switch's end of a host's cable.
-
-    Parameters
-    ----------
-    host
-        Name of the host.
-
-    Returns
-    -------
-    str
-        Name of the device.
-    """
-    # Linux takes 15 characters.
+    """Return the name of the bridge's device that leads to a host."""
+    # Linux limits names of devices to 15 characters.
     return f'to_{host}'[:15]
 
 
-def link(pid: int, host: str, up: bool) -> Command:
-    """Return the command that pulls a host's cable out of the switch, or puts it back.
-
-    Parameters
-    ----------
-    pid
-        Process that has made it.
-    host
-        Name of the host.
-    up
-        Whether it is to be connected.
-
-    Returns
-    -------
-    tuple
-        The command.
-    """
+def set_link(pid: int, host: str, up: bool) -> Command:
+    """Return the command that connects a host with the bridge, or disconnects it."""
     return ('ip', '-n', namespace(pid, SWITCH), 'link', 'set', port(host), 'up' if up else 'down')
 
 
-def inside(pid: int, node: str) -> list[str]:
-    """Return what to put before a command to run it on the host of a node.
-
-    Parameters
-    ----------
-    pid
-        Process that has made the hosts.
-    node
-        Name of the node.
-
-    Returns
-    -------
-    list of str
-        The beginning of a command.
-    """
+def command_prefix(pid: int, node: str) -> list[str]:
+    """Return the prefix of a command that runs it on the host of a node."""
     return ['ip', 'netns', 'exec', namespace(pid, host_of(node))]
 
 
 def lease_s(profile: Path | None) -> float:
-    """Return after how long without a word Fast DDS takes a participant for gone.
+    """Return the time after which Fast DDS considers an unreachable participant lost [s].
 
     Parameters
     ----------
     profile
-        XML file of its profiles, or None.
-
-    Returns
-    -------
-    float
-        The time [s].
+        XML file with profiles; None for the defaults of Fast DDS.
     """
     if profile is None:
-        return _USUAL_LEASE_S
+        return _DEFAULT_LEASE_S
     for element in ElementTree.parse(profile).iter():
         if element.tag.rpartition('}')[2] == 'leaseDuration':
             parts = {child.tag.rpartition('}')[2]: float(child.text) for child in element}
             return parts.get('sec', 0.0) + 1e-9 * parts.get('nanosec', 0.0)
-    return _USUAL_LEASE_S
+    return _DEFAULT_LEASE_S

@@ -1,4 +1,4 @@
-"""Real network namespaces, where they are allowed: a link is pulled, and nothing is left."""
+"""``scripts/hosts`` with real network namespaces, where they are available."""
 
 import json
 import os
@@ -12,22 +12,22 @@ import pytest
 from system.hosts.command import SKIPPED, main
 
 ROOT = Path(__file__).parents[3]
-# Where Python finds the package `system`.
+# The parent directory of the package `system`.
 FOLDER = ROOT / 'test'
-# Makes hosts, says so, and waits.
+# Creates hosts, prints a line, and waits for a signal.
 HOLD = '''
 import signal
-from system.hosts.namespaces import Hosts, guarded
+from system.hosts.namespaces import Hosts, interruptible
 
 def hold():
     with Hosts():
-        print('made', flush=True)
+        print('created', flush=True)
         signal.pause()
 
 try:
-    guarded(hold)
+    interruptible(hold)
 except KeyboardInterrupt:
-    print('cleaned')
+    print('removed')
 '''
 
 
@@ -37,7 +37,7 @@ def namespaces_of(pid):
 
 @pytest.fixture
 def hold():
-    """Function that starts a process which holds hosts; skips where that is not allowed."""
+    """Function that starts a process with hosts; skips the test where they are unavailable."""
     started = []
 
     def start():
@@ -45,9 +45,9 @@ def hold():
             [sys.executable, '-c', HOLD], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, cwd=FOLDER)
         started.append(process)
-        if process.stdout.readline() != 'made\n':
+        if process.stdout.readline() != 'created\n':
             _, err = process.communicate(timeout=60)
-            if 'NamespacesRefused' in err:
+            if 'NamespacesUnavailable' in err:
                 pytest.skip(f'no network namespaces here: {err.splitlines()[-1]}')
             raise AssertionError(err)
         return process
@@ -66,16 +66,16 @@ def files(small_files):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_leaves_nothing_behind(hold, number):
+def test_a_signal_removes_all_namespaces(hold, number):
     process = hold()
     assert len(namespaces_of(process.pid)) == 7
     process.send_signal(number)
     out, err = process.communicate(timeout=60)
-    assert (out, err) == ('cleaned\n', '')
+    assert (out, err) == ('removed\n', '')
     assert not namespaces_of(process.pid)
 
 
-def test_a_pulled_link_and_what_a_killed_run_left(hold, files, tmp_path):
+def test_an_outage_passes_and_namespaces_of_a_killed_run_are_removed(hold, files, tmp_path):
     killed = hold()
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
@@ -85,31 +85,31 @@ def test_a_pulled_link_and_what_a_killed_run_left(hold, files, tmp_path):
          '--json', str(tmp_path / 'figures.json'), *files],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=FOLDER)
     out, err = done.communicate(timeout=120)
-    told = json.loads((tmp_path / 'figures.json').read_text(encoding='utf-8'))
-    (pull,) = told['pulls']
+    figures = json.loads((tmp_path / 'figures.json').read_text(encoding='utf-8'))
+    (outage,) = figures['outages']
     assert done.returncode == 0, out + err
-    assert told['passed']
-    assert pull['host'] == 'channel'
-    assert pull['recovered_s'] <= 3.0
-    assert pull['before'] > 0
-    assert told['wrong_publications'] == 0
-    # Every host has spoken through its cable.
-    assert min(told['packets'].values()) > 100
+    assert figures['passed']
+    assert outage['host'] == 'channel'
+    assert outage['recovery_s'] <= 3.0
+    assert outage['before'] > 0
+    assert figures['wrong_publications'] == 0
+    # Every host has used its link.
+    assert min(figures['packets'].values()) > 100
     assert not namespaces_of(killed.pid)
     assert not namespaces_of(done.pid)
 
 
-def test_where_there_is_no_ip_it_says_skipped(files, monkeypatch, capsys):
+def test_it_is_skipped_without_the_command_ip(files, monkeypatch, capsys):
     monkeypatch.setenv('PATH', '/nonexistent')
     for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'RMW_IMPLEMENTATION',
                  'FASTDDS_BUILTIN_TRANSPORTS', 'FASTRTPS_DEFAULT_PROFILES_FILE'):
-        # Put back afterwards, whatever the command sets.
+        # monkeypatch restores what the command sets.
         monkeypatch.setenv(name, os.environ.get(name, ''))
     assert main(files) == SKIPPED
     assert 'skipped' in capsys.readouterr().err
 
 
-def test_wrong_arguments_are_refused(capsys):
+def test_invalid_arguments_are_rejected(capsys):
     for arguments in (['--pull', 'radio'], ['--seconds', '0'], ['--users', '0'],
                       ['--json', '/nonexistent/figures.json']):
         with pytest.raises(SystemExit):

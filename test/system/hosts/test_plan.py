@@ -1,4 +1,4 @@
-"""The plan of the hosts: addresses, names and commands."""
+"""Names, addresses and commands of the hosts."""
 
 import ipaddress
 
@@ -17,8 +17,8 @@ def test_every_node_has_one_host():
         plan.host_of('radio')
 
 
-def test_nothing_happens_outside_of_namespaces_of_the_run():
-    for command in plan.make(4711):
+def test_commands_act_inside_the_namespaces_of_the_run():
+    for command in plan.create(4711):
         assert command[0] == 'ip'
         name = command[3] if command[1:3] == ('netns', 'add') else command[2]
         assert command[1] == '-n' or command[1:3] == ('netns', 'add')
@@ -27,24 +27,24 @@ def test_nothing_happens_outside_of_namespaces_of_the_run():
             assert command[-1].startswith('rhs_isac-4711-')
 
 
-def test_hosts_have_addresses_of_their_own_in_one_network():
-    given = [ipaddress.ip_interface(command[5]) for command in plan.make(1)
+def test_addresses_differ_and_are_in_one_network():
+    given = [ipaddress.ip_interface(command[5]) for command in plan.create(1)
              if command[3:5] == ('address', 'add')]
     assert len(set(given)) == len(plan.HOSTS) + 1
     (network,) = {address.network for address in given}
     assert network.subnet_of(ipaddress.ip_network('198.18.0.0/15'))
 
 
-def test_names_of_devices_are_short_and_differ():
+def test_names_of_devices_differ_and_are_short_enough():
     ports = {plan.port(host) for host in (*plan.HOSTS, plan.OBSERVER)}
     assert len(ports) == len(plan.HOSTS) + 1
     assert max(map(len, ports)) <= 15
 
 
-def test_stale_is_what_a_process_that_is_gone_has_made():
-    mine, other = plan.namespace(1, 'users'), plan.namespace(22, 'users')
-    names = [mine, other, 'lab', 'rhs_isac-lab', 'other-22-users']
-    assert plan.stale(names, lambda pid: pid == 1) == [other]
+def test_namespaces_of_terminated_processes_are_stale():
+    running, terminated = plan.namespace(1, 'users'), plan.namespace(22, 'users')
+    names = [running, terminated, 'lab', 'rhs_isac-lab', 'other-22-users']
+    assert plan.stale(names, lambda pid: pid == 1) == [terminated]
 
 
 def test_the_lease_is_read_from_the_profile(tmp_path):

@@ -1,0 +1,108 @@
+"""The observer of both rigs: cycles, invariants and diagnostics of a running network."""
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring import cycle_log, invariants
+from rhs_isac_ros.monitoring.role_statistics import Report
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, diagnostics, qos, topics
+from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros.subscriptions import subscribe
+
+
+class NetworkObserver(CycleObserver):
+    """Collects the cycles of a network, checks its results and keeps its diagnostics.
+
+    Malformed messages are ignored: counting them is up to the nodes.
+
+    Attributes
+    ----------
+    invariants
+        Checker of the published results.
+    reports
+        Newest report of each node by name.
+    warnings
+        Summaries of the reports with a fault, each once, by name of the node.
+    n_codebooks
+        Number of codebooks received.
+    on_phase
+        Called when a cycle enters a phase.
+    """
+
+    def __init__(self, scenario: Scenario, **node_options: Any) -> None:
+        super().__init__(
+            receives=dict.fromkeys((*cycle_log.RECEIVES, *invariants.RECEIVES)),
+            sizes=scenario.sizes, on_malformed=lambda error: None, **node_options)
+        self.invariants = invariants.InvariantChecker(scenario)
+        self.reports: dict[str, Report] = {}
+        self.warnings: dict[str, list[str]] = {}
+        self.n_codebooks = 0
+        self.on_phase: Callable[[m.Phase], None] = lambda phase: None
+        self._subscribe(ros.Codebook, topics.CODEBOOK, qos.LATCHED, self._on_codebook)
+        self._subscribe(
+            DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE, self._on_diagnostics)
+
+    def observe(self, message: m.Message, now_s: float) -> None:
+        """Process a message that arrived at `now_s` [s]."""
+        super().observe(message, now_s)
+        if isinstance(message, invariants.RECEIVES):
+            self.invariants.add(message, now_s)
+        match message:
+            case m.Beacon():
+                self.on_phase(m.Phase.BEACONING)
+            case m.ProtocolState(outcome=''):
+                self.on_phase(message.phase)
+
+    def spin_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Receive messages until a condition holds; return whether it does.
+
+        Parameters
+        ----------
+        condition
+            Evaluated after every message.
+        timeout_s
+            Maximum duration [s].
+        """
+        end_s = time.monotonic() + timeout_s
+        while not condition():
+            remaining_s = end_s - time.monotonic()
+            if remaining_s <= 0:
+                return False
+            rclpy.spin_once(self, timeout_sec=min(remaining_s, 0.05))
+        return True
+
+    def spin_for(self, duration_s: float) -> None:
+        """Receive messages for a time [s]."""
+        self.spin_until(lambda: False, duration_s)
+
+    def _subscribe(
+            self, kind: type, name: str, profile: QoSProfile,
+            callback: Callable[[Any], None]) -> None:
+        def receive(serialized: bytes) -> None:
+            # rclpy raises a RuntimeError without a public name for bytes that are no message.
+            with contextlib.suppress(CodebookError, RuntimeError, ValueError):
+                callback(deserialize_message(serialized, kind))
+        subscribe(self, kind, name, receive, profile, raw=True)
+
+    def _on_codebook(self, message: ros.Codebook) -> None:
+        self.n_codebooks += 1
+        self.invariants.add_codebook(convert.codebook_from_ros(message))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for name, report in diagnostics.from_ros(message):
+            self.reports[name] = report
+            if report.fault:
+                warnings = self.warnings.setdefault(name, [])
+                if report.summary not in warnings:
+                    warnings.append(report.summary)
