@@ -91,7 +91,7 @@ def test_scenarios_and_codebooks_are_installed(installation):
 @pytest.mark.parametrize(('library', 'arguments'), [
     ('matplotlib', ('codebook', '--method', 'random', '--plot', 'codebook.png')),
     ('pymoo', ('codebook', '--method', 'genetic')),
-    ('scikit-learn', ('positioning', '--codebook', 'source/config/codebook.yaml'))])
+    ('sklearn', ('positioning', '--codebook', 'source/config/codebook.yaml'))])
 def test_a_missing_extra_is_named_in_one_line(installation, library, arguments):
     module, *options = arguments
     done = installation.run('python', '-m', f'rhs_isac_ros.{module}', '--quiet', *options)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.optional import MissingLibraryError
 from rhs_isac_ros.positioning.training import (
     DEFAULT_EPOCHS,
     DEFAULT_HIDDEN,
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     # Errors of scenario and codebook are ValueErrors.
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MissingLibraryError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
     return 0

@@ -16,6 +16,7 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning.estimate import stack_parts
 from rhs_isac_ros.positioning.network import Network
 from rhs_isac_ros.positioning.simulate import simulate_pairs
@@ -149,12 +150,9 @@ def _descend(
 
 def _regressor(n_hidden: int, seed: int) -> tuple[Any, Any]:
     """Return the untrained network, and the context manager that limits its threads."""
-    try:
+    with optional_import('training', extra='neural'):
         from sklearn.neural_network import MLPRegressor
         from threadpoolctl import threadpool_limits
-    except ImportError:
-        raise ValueError('training needs scikit-learn, which is not installed '
-                         '(pip install scikit-learn)') from None
     state = int(streams.generator(seed, streams.TRAINING).integers(2**32))
     regressor = MLPRegressor(
         hidden_layer_sizes=(n_hidden,), activation='relu', solver='adam', alpha=0.0,

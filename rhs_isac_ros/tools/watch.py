@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
+from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
 from rhs_isac_ros.ros import diagnostics, qos, topics
 from rhs_isac_ros.ros.run import run
@@ -68,10 +69,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(remove_ros_args(['watch', *arguments])[1:])
     try:
-        import rich  # noqa: F401
-    except ImportError:
-        print('error: watch needs rich, which is not installed (pip install rich)',
-              file=sys.stderr)
+        with optional_import('watch', extra='watch'):
+            import rich  # noqa: F401
+    except MissingLibraryError as error:
+        print(f'error: {error}', file=sys.stderr)
         return 1
     arguments = ['watch', *arguments]
     try:

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.optional import MissingLibraryError
 from rhs_isac_ros.positioning import (
     ModelError,
     Network,
@@ -164,7 +165,7 @@ def test_training_without_scikit_learn_is_an_error_that_names_it(scenario, codeb
     for name in [name for name in sys.modules if name.partition('.')[0] == 'sklearn']:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'sklearn', None)
-    with pytest.raises(ValueError, match=r'scikit-learn, which is not installed \(pip install'):
+    with pytest.raises(MissingLibraryError, match=r"needs sklearn, .* 'rhs_isac_ros\[neural\]'"):
         train(scenario, codebook, 100)
 
 
