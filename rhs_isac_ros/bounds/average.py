@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.bounds.compressed_rows import CompressedRows
-from rhs_isac_ros.bounds.fisher import factor, information_of, measurement_correlation
+from rhs_isac_ros.bounds.fisher import factor, information_of
 from rhs_isac_ros.bounds.gradient import gradient_analog, gradient_digital
 from rhs_isac_ros.bounds.rows import ExactRows, Rows, RowSource, blocks
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import Beamforming
 
 # Function of (block of items, forms [n, G, G]) that returns the items' values [n] and minus their

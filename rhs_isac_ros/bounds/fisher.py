@@ -1,16 +1,11 @@
 """The Cramer-Rao lower bound of positioning and what it is made of."""
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.model.los import checked_positions, los_derivative
-from rhs_isac_ros.model.multipath import (
-    frequency_correlation,
-    multipath_covariance,
-    time_correlation,
-)
+from rhs_isac_ros.model.measurement import mean_derivative, whitening_matrices
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
 
@@ -175,109 +170,3 @@ def information_of(whitened: np.ndarray) -> np.ndarray:
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(float)
     return 2 * np.matmul(parts, np.swapaxes(parts, 1, 2))
-
-
-def mean_derivative(slopes: np.ndarray, pattern: np.ndarray) -> np.ndarray:
-    """Implements Eq. (13). Derivative of one band's mean signal by the position.
-
-    Parameters
-    ----------
-    slopes
-        Derivative of the line-of-sight gains, complex128 [N, G, N_SB, N_E] [1/m]; G is 3. Other
-        functions of the gains are possible, in any number.
-    pattern
-        T_i, complex128 [N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N, G, N_SB F] [1/m], sub-band-major.
-    """
-    n, n_rows, n_subbands, n_elements = slopes.shape
-    frames = pattern.reshape(n_subbands, -1, n_elements)
-    # One matrix product a sub-band: [G N, N_E] with [N_E, F].
-    stacked = np.moveaxis(slopes, 2, 0).reshape(n_subbands, n_rows * n, n_elements)
-    products = np.matmul(stacked, np.swapaxes(frames, 1, 2))
-    return np.moveaxis(products, 0, 1).reshape(n, n_rows, -1)
-
-
-def covariance(scenario: Scenario, patterns: np.ndarray) -> np.ndarray:
-    """Implements Eq. (14). Covariance of the received signals; independent of the position.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    patterns
-        T_i of every band, complex128 [N_B, N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W].
-    """
-    spatial = multipath_covariance(scenario)
-    scattered = np.matmul(np.matmul(patterns, spatial), np.conj(np.swapaxes(patterns, 1, 2)))
-    noise = scenario.noise_power_w * np.eye(patterns.shape[1])
-    return measurement_correlation(scenario) * scattered + noise
-
-
-def whitening_matrices(scenario: Scenario, patterns: np.ndarray) -> np.ndarray:
-    """Matrices that make the received signals' covariance the identity.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    patterns
-        T_i of every band, complex128 [N_B, N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        L_i^-1 with L_i L_i^H = Lambda_i, lower triangular, complex128 [N_B, N_SB F, N_SB F].
-    """
-    return np.linalg.inv(np.linalg.cholesky(covariance(scenario, patterns)))
-
-
-@functools.lru_cache(maxsize=16)
-def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Implements Eq. (15). Correlation of the multipath over sub-bands and over frames.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        K_f, complex128 [N_B, N_SB, N_SB], and K_t, float64 [N_B, F, F]; read-only.
-    """
-    subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
-    bands = range(scenario.n_bands)
-    over_frequency = np.stack(
-        [frequency_correlation(scenario, i, subbands[:, None], subbands) for i in bands])
-    over_time = np.stack([time_correlation(scenario, i, frames[:, None], frames) for i in bands])
-    over_frequency.flags.writeable = over_time.flags.writeable = False
-    return over_frequency, over_time
-
-
-@functools.lru_cache(maxsize=16)
-def measurement_correlation(scenario: Scenario) -> np.ndarray:
-    """Correlation of the multipath over all measurements of a band: the paper's K_ft.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N_B, N_SB F, N_SB F], read-only.
-    """
-    pairs = zip(*correlation_matrices(scenario), strict=True)
-    correlation = np.stack([np.kron(over_f, over_t) for over_f, over_t in pairs])
-    correlation.flags.writeable = False
-    return correlation

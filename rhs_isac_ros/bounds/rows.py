@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import mean_derivative
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.measurement import mean_derivative
 
 # Function of (start, stop, band): rows of these items, complex128 [n, G, N_SB, N_E].
 RowSource = Callable[[int, int, int], np.ndarray]

@@ -139,6 +139,49 @@ def time_correlation(
 
 
 @functools.lru_cache(maxsize=16)
+def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Implements Eq. (15). Correlation of the multipath over sub-bands and over frames.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        K_f, complex128 [N_B, N_SB, N_SB], and K_t, float64 [N_B, F, F]; read-only.
+    """
+    subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
+    bands = range(scenario.n_bands)
+    over_frequency = np.stack(
+        [frequency_correlation(scenario, i, subbands[:, None], subbands) for i in bands])
+    over_time = np.stack([time_correlation(scenario, i, frames[:, None], frames) for i in bands])
+    over_frequency.flags.writeable = over_time.flags.writeable = False
+    return over_frequency, over_time
+
+
+@functools.lru_cache(maxsize=16)
+def measurement_correlation(scenario: Scenario) -> np.ndarray:
+    """Correlation of the multipath over all measurements of a band: the paper's K_ft.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+
+    Returns
+    -------
+    numpy.ndarray
+        Complex128 [N_B, N_SB F, N_SB F], read-only.
+    """
+    pairs = zip(*correlation_matrices(scenario), strict=True)
+    correlation = np.stack([np.kron(over_f, over_t) for over_f, over_t in pairs])
+    correlation.flags.writeable = False
+    return correlation
+
+
+@functools.lru_cache(maxsize=16)
 def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Square roots of the covariances, from which gains are drawn.
 
@@ -153,14 +196,8 @@ def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray]
         For each band G [N_E, r] with G G^H = V_i, and L [N_SB F, s] with L L^H the correlation of
         the measurements (sub-band-major); r and s are the numerical ranks.
     """
-    subbands, frames = np.divmod(
-        np.arange(scenario.n_subbands * scenario.n_frames), scenario.n_frames)
-    factors = []
-    for band, covariance in enumerate(multipath_covariance(scenario)):
-        correlation = frequency_correlation(scenario, band, subbands[:, None], subbands)
-        correlation = correlation * time_correlation(scenario, band, frames[:, None], frames)
-        factors.append((_square_root(covariance), _square_root(correlation)))
-    return tuple(factors)
+    pairs = zip(multipath_covariance(scenario), measurement_correlation(scenario), strict=True)
+    return tuple((_square_root(spatial), _square_root(over_rows)) for spatial, over_rows in pairs)
 
 
 def draw_multipath(

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import covariance
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, mean_received, streams
+from rhs_isac_ros.model.measurement import covariance
 from rhs_isac_ros.model.multipath import complex_normal
 from rhs_isac_ros.model.surface import radiation_matrix
 

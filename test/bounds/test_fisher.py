@@ -5,14 +5,14 @@ import pytest
 
 from rhs_isac_ros.bounds import crlb, fisher, fisher_information
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, measurement, multipath
 from rhs_isac_ros.model.los import los_derivative
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.surface import radiation_matrix
 
 
 def test_correlation_matrices_are_the_vectors(case):
-    over_frequency, over_time = fisher.correlation_matrices(case.scenario)
+    over_frequency, over_time = multipath.correlation_matrices(case.scenario)
     np.testing.assert_allclose(over_frequency, case.vectors['K_f'], rtol=1e-8)
     np.testing.assert_allclose(over_time, case.vectors['K_t'], rtol=1e-8)
     assert not over_frequency.flags.writeable
@@ -21,7 +21,7 @@ def test_correlation_matrices_are_the_vectors(case):
 
 def test_covariance_is_the_vectors(case):
     patterns = radiation_matrix(case.scenario, case.codebook)
-    covariance = fisher.covariance(case.scenario, patterns)
+    covariance = measurement.covariance(case.scenario, patterns)
     scale = np.abs(case.vectors['cov']).max()
     np.testing.assert_allclose(covariance, case.vectors['cov'], rtol=1e-8, atol=1e-8 * scale)
 
@@ -51,7 +51,7 @@ def test_everything_is_the_plain_one_when_correlations_are_low(faded, plain):
     p = plain(scenario, codebook.analog, codebook.digital)
     spatial = multipath_covariance(scenario)
     positions = scenario.sample_positions(3, np.random.default_rng(1))
-    covariance = fisher.covariance(scenario, radiation_matrix(scenario, codebook))
+    covariance = measurement.covariance(scenario, radiation_matrix(scenario, codebook))
     for band in range(3):
         expected = p.covariance(band, spatial[band])
         np.testing.assert_allclose(
@@ -72,7 +72,7 @@ def test_mean_derivative_is_the_limit_of_differences_of_plain_means(faded, plain
     patterns, step = radiation_matrix(scenario, codebook), 1e-5
     for band in range(3):
         slopes = los_derivative(scenario, positions, band)
-        derivative = fisher.mean_derivative(slopes, patterns[band])
+        derivative = measurement.mean_derivative(slopes, patterns[band])
         assert derivative.shape == (2, 3, 6)
         for u in range(3):
             shift = step * np.eye(3)[u]
@@ -83,7 +83,7 @@ def test_mean_derivative_is_the_limit_of_differences_of_plain_means(faded, plain
 
 
 def test_whitening_matrices_whiten_the_vectors(case):
-    whiteners = fisher.whitening_matrices(
+    whiteners = measurement.whitening_matrices(
         case.scenario, radiation_matrix(case.scenario, case.codebook))
     for whitener, covariance in zip(whiteners, case.vectors['cov'], strict=True):
         white = whitener @ covariance @ whitener.conj().T
@@ -215,7 +215,7 @@ def test_mean_derivative_takes_any_number_of_rows(faded, n_rows):
     scenario, codebook = faded
     rng, pattern = np.random.default_rng(7), radiation_matrix(scenario, codebook)[1]
     rows = rng.normal(size=(4, n_rows, 2, 9, 2)) @ [1, 1j]
-    means = fisher.mean_derivative(rows, pattern)
+    means = measurement.mean_derivative(rows, pattern)
     assert means.shape == (4, n_rows, 6)
     expected = np.einsum('jqm,ngjm->ngjq', pattern.reshape(2, 3, 9), rows)
     np.testing.assert_allclose(means, expected.reshape(4, n_rows, 6), rtol=1e-10)

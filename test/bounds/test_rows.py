@@ -5,10 +5,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import compressed_rows, factor, fisher, rows
+from rhs_isac_ros.bounds import compressed_rows, factor, rows
 from rhs_isac_ros.bounds.compressed_rows import CompressedRows
 from rhs_isac_ros.bounds.rows import ExactRows
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, measurement
 from rhs_isac_ros.model.los import los_derivative, los_gain
 
 N_ITEMS = 60
@@ -150,7 +150,7 @@ def test_compressed_passes_are_the_exact_ones_to_the_tolerance(
 
 def test_means_are_whitened_with_the_covariance(wide, factors):
     """Signals with the columns of L as their means come out as unit vectors."""
-    covariances = fisher.covariance(wide, factors.patterns)
+    covariances = measurement.covariance(wide, factors.patterns)
     lower = np.linalg.cholesky(covariances)
     items = np.stack([
         (np.linalg.pinv(block_diagonal(wide, pattern)) @ half).T
