@@ -1,68 +1,24 @@
-"""The Cramer-Rao lower bound of positioning and what it is made of."""
-
-from typing import NamedTuple
+"""Fisher information of the received signals and the Cramer-Rao lower bound of positioning."""
 
 import numpy as np
 
-from rhs_isac_ros.model.los import checked_positions, los_derivative
-from rhs_isac_ros.model.measurement import mean_derivative, whitening_matrices
-from rhs_isac_ros.model.scenario import Scenario
-from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.surface import Beamforming
 
+# Positions evaluated at a time.
 _BLOCK = 256
-# Pivot of a normalised matrix that rounding alone may make.
-_SINGULAR = 1e-14
+# A normalised matrix with a smaller pivot is singular up to rounding.
+_MIN_PIVOT = 1e-14
 
 
-class Factors(NamedTuple):
-    """What the bounds and the likelihood need of a codebook, whatever the position.
-
-    Attributes
-    ----------
-    patterns
-        T_i, complex128 [N_B, N_SB F, N_E].
-    whiteners
-        L_i^-1 with L_i L_i^H = Lambda_i, lower triangular, complex128 [N_B, N_SB F, N_SB F].
-    """
-
-    patterns: np.ndarray
-    whiteners: np.ndarray
-
-
-def factor(scenario: Scenario, codebook: Beamforming) -> Factors:
-    """Compute what depends on the codebook alone.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
-
-    Returns
-    -------
-    Factors
-        Patterns and whitening matrices, for all calls with the same codebook.
-    """
-    patterns = radiation_matrix(scenario, codebook)
-    return Factors(patterns, whitening_matrices(scenario, patterns))
-
-
-def crlb(
-        scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
-        factors: Factors | None = None) -> np.ndarray:
+def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound of the squared positioning error.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
     positions
         Positions of the user, float64 [N, 3] [m].
-    factors
-        What `factor` returns for the codebook, if it is at hand.
 
     Returns
     -------
@@ -74,8 +30,14 @@ def crlb(
     ValueError
         If `positions` is not a finite [N, 3] array.
     """
-    information = fisher_information(scenario, codebook, positions, factors)
-    return np.trace(inverse_information(information), axis1=1, axis2=2)
+    return crlb_of(MeasurementModel(scenario, codebook), positions)
+
+
+def crlb_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
+    """Compute `crlb` for a model, whose whitener is shared by all calls."""
+    inverse = inverse_information(fisher_information_of(model, positions))
+    bound: np.ndarray = np.trace(inverse, axis1=1, axis2=2)
+    return bound
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:
@@ -93,17 +55,18 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    # With ones on the diagonal, rounding is the same whatever the units and directions.
+    # With a unit diagonal, rounding does not depend on the units of the axes.
     scale = scale[:, :, None] * scale[:, None, :]
     normal = information / scale
-    # L D L^T by hand: as accurate as the condition allows, and much faster than a call for each.
+    # An explicit L D L^T factorisation is as accurate as the condition number allows, and much
+    # faster than a LAPACK call per matrix.
     first, third = normal[:, 1, 0], normal[:, 2, 0]
     pivot = 1.0 - first**2
-    regular = (diagonal > 0).all(axis=1) & (pivot > _SINGULAR)
+    regular = (diagonal > 0).all(axis=1) & (pivot > _MIN_PIVOT)
     pivot = np.where(regular, pivot, 1.0)
     second = (normal[:, 2, 1] - first * third) / pivot
     last = normal[:, 2, 2] - third**2 - second**2 * pivot
-    regular &= last > _SINGULAR * (1 + second**2)
+    regular &= last > _MIN_PIVOT * (1 + second**2)
     last = np.where(regular, last, 1.0)
     root = np.zeros_like(normal)
     root[:, 0, 0] = 1.0
@@ -111,26 +74,19 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
     root[:, 2, 0], root[:, 2, 1], root[:, 2, 2] = first * second - third, -second, 1.0
     root[:, 1] /= np.sqrt(pivot)[:, None]
     root[:, 2] /= np.sqrt(last)[:, None]
-    inverse = np.matmul(np.swapaxes(root, 1, 2), root) / scale
+    inverse: np.ndarray = np.matmul(np.swapaxes(root, 1, 2), root) / scale
     inverse[~regular] = np.diag([np.inf] * 3)
     return inverse
 
 
 def fisher_information(
-        scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
-        factors: Factors | None = None) -> np.ndarray:
+        scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (12). Fisher information of the received signals about the position.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
     positions
         Positions of the user, float64 [N, 3] [m].
-    factors
-        What `factor` returns for the codebook, if it is at hand.
 
     Returns
     -------
@@ -142,31 +98,36 @@ def fisher_information(
     ValueError
         If `positions` is not a finite [N, 3] array.
     """
+    return fisher_information_of(MeasurementModel(scenario, codebook), positions)
+
+
+def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
+    """Compute `fisher_information` for a model, whose whitener is shared by all calls."""
     positions = checked_positions(positions)
-    factors = factors or factor(scenario, codebook)
     information = np.zeros((len(positions), 3, 3))
     for start in range(0, len(positions), _BLOCK):
         block = slice(start, start + _BLOCK)
-        for band, (pattern, whitener) in enumerate(zip(*factors, strict=True)):
-            slopes = los_derivative(scenario, positions[block], band)
-            whitened = mean_derivative(slopes, pattern) @ whitener.T
-            information[block] += information_of(whitened)
+        for band, whitener in enumerate(model.whitener):
+            whitened = model.band_jacobian(positions[block], band) @ whitener.T
+            information[block] += quadratic_form(whitened)
     return information
 
 
-def information_of(whitened: np.ndarray) -> np.ndarray:
-    """One band's share of Eq. (12), from the whitened derivatives of its mean.
+def quadratic_form(whitened: np.ndarray) -> np.ndarray:
+    """Compute 2 Re(D^H Lambda^-1 D) of one band, its share of Eq. (12) if D is the derivative.
 
     Parameters
     ----------
     whitened
-        L^-1 dy_i/dp with L L^H = Lambda_i, complex128 [N, G, N_SB F] [1/m].
+        L^-1 D with L L^H = Lambda and one row for each of the G columns of D, complex128
+        [N, G, N_SB F]; for the derivative of the mean, in 1/m with G = 3.
 
     Returns
     -------
     numpy.ndarray
-        Float64 [N, G, G] [1/m^2]; G is 3.
+        Float64 [N, G, G]; for the derivative of the mean, in 1/m^2.
     """
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(float)
-    return 2 * np.matmul(parts, np.swapaxes(parts, 1, 2))
+    form: np.ndarray = 2 * np.matmul(parts, np.swapaxes(parts, 1, 2))
+    return form

@@ -1,4 +1,4 @@
-"""From the derivative by the beam patterns to those by the variables of a codebook."""
+"""Derivatives with respect to the codebook from those with respect to the radiation matrices."""
 
 import numpy as np
 
@@ -7,20 +7,16 @@ from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 
 
 def gradient_analog(
-        scenario: Scenario, codebook: Beamforming, by_pattern: np.ndarray) -> np.ndarray:
-    """Implements Proposition 2. Derivative by the configurations C_i.
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+    """Implements Proposition 2. Derivative with respect to the configurations C_i.
 
-    The paper writes the chain rule out for every pair of coordinates; here the pairs are summed
-    first, in the derivative by T_i.
+    The paper writes the chain rule for every pair of coordinates. Here, the pairs have already
+    been summed in the derivative with respect to T_i.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
-    by_pattern
-        Derivative of the objective by T_i (d/dRe + i d/dIm), complex128 [N_B, N_SB F, N_E].
+    by_radiation
+        d/dRe(T_i) + i d/dIm(T_i) of the objective, complex128 [N_B, N_SB F, N_E].
 
     Returns
     -------
@@ -28,30 +24,28 @@ def gradient_analog(
         Float64 [N_B, F, N_E].
     """
     weights = np.matmul(codebook.digital, onboard_matrix(scenario))
-    by_pattern = by_pattern.reshape(weights.shape)
-    return np.einsum('ijqm,ijqm->iqm', np.conj(by_pattern), weights).real
+    by_radiation = by_radiation.reshape(weights.shape)
+    gradient: np.ndarray = np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
+    return gradient
 
 
 def gradient_digital(
-        scenario: Scenario, codebook: Beamforming, by_pattern: np.ndarray) -> np.ndarray:
-    """Implements Proposition 3. Derivative by the combining vectors S_{i,j}.
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+    """Implements Proposition 3. Derivative with respect to the combining vectors S_{i,j}.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
-    by_pattern
-        Derivative of the objective by T_i (d/dRe + i d/dIm), complex128 [N_B, N_SB F, N_E].
+    by_radiation
+        d/dRe(T_i) + i d/dIm(T_i) of the objective, complex128 [N_B, N_SB F, N_E].
 
     Returns
     -------
     numpy.ndarray
-        d/dRe + i d/dIm, complex128 [N_B, N_SB, F, K].
+        d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K].
     """
     onboard = onboard_matrix(scenario)
     n_bands, n_subbands, _, n_elements = onboard.shape
-    by_pattern = by_pattern.reshape(n_bands, n_subbands, -1, n_elements)
-    weighted = by_pattern * codebook.analog[:, None]
-    return np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))
+    by_radiation = by_radiation.reshape(n_bands, n_subbands, -1, n_elements)
+    weighted = by_radiation * codebook.analog[:, None]
+    gradient: np.ndarray = np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))
+    return gradient

@@ -1,4 +1,4 @@
-"""Checking arrays against the sizes of a scenario."""
+"""Checks of array shapes against the sizes of a scenario."""
 
 import numpy as np
 
@@ -11,18 +11,14 @@ def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) 
     Parameters
     ----------
     name
-        What to call it in an error.
-    array
-        The array.
+        Name of the array for the error message.
     symbols
-        Its dimensions, symbols of `Scenario.sizes` with blanks between them.
-    scenario
-        The scenario.
+        Expected dimensions: keys of `Scenario.sizes`, separated by blanks.
 
     Raises
     ------
     ValueError
-        If the shape is another one; the text names it and what was expected.
+        If the shape differs. The message gives the actual and the expected shape.
     """
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import information_of
+from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
 from rhs_isac_ros.positioning.region import gap_to_region, loss
 from rhs_isac_ros.positioning.table import LEAST_CURVATURE, TemplateTable, separate
@@ -128,11 +128,11 @@ def _local(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Curvature [M, 3, 3], slope [M, 3] and value [M] of the log-likelihood, polar."""
     n = len(points)
-    mean, by_position = model.mean_and_derivative(to_positions(points))
+    mean, by_position = model.mean_and_jacobian(to_positions(points))
     # Re(a^H b) is the inner product of real and imaginary parts.
     residual = (whitened - mean).reshape(n, -1).view(float)
     slopes = by_position.reshape(n, 3, -1).view(float)
     slopes = np.matmul(np.swapaxes(jacobian(points), 1, 2), slopes)
-    curvature = information_of(slopes.view(complex)) + np.diag(LEAST_CURVATURE)
+    curvature = quadratic_form(slopes.view(complex)) + np.diag(LEAST_CURVATURE)
     slope = 2 * np.matmul(slopes, residual[..., None])[..., 0]
     return curvature, slope, -np.sum(residual**2, axis=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import CodebookError
-from rhs_isac_ros.model import Scenario, mean_received, simulate_received
+from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.positioning import simulate_pairs
 
 
@@ -14,7 +14,7 @@ def setting(random_beams):
     return scenario, random_beams(scenario, np.random.default_rng(0))
 
 
-def test_a_seed_stands_for_one_sequence_however_it_is_cut(setting):
+def test_a_seed_yields_the_same_bytes_however_the_sequence_is_divided(setting):
     positions, received = simulate_pairs(*setting, 1500, 3)
     for size in (1, 400, 512, 700):
         parts = [simulate_pairs(*setting, min(size, 1500 - first), 3, first)
@@ -25,7 +25,7 @@ def test_a_seed_stands_for_one_sequence_however_it_is_cut(setting):
 
 
 def test_pairs_are_the_same_in_later_versions(setting):
-    """What a seed means may not change: the first draws of NumPy's generator say what it is."""
+    """The positions of a seed are the first draws of NumPy's generator and must not change."""
     scenario = setting[0]
     rng = np.random.default_rng([11, 10, 0])
     expected = rng.uniform(*scenario.roi_bounds_m, (512, 3))
@@ -38,12 +38,13 @@ def test_seeds_and_chunks_differ(setting):
 
 
 def test_signals_have_the_distribution_of_eq_8(setting):
-    """Noise and multipath against those that `simulate_received` draws element by element."""
+    """Noise and multipath match those that `simulate_received` draws element by element."""
     positions, received = simulate_pairs(*setting, 20_000, 0)
-    scattered = received - mean_received(*setting, positions)
+    model = MeasurementModel(*setting)
+    scattered = received - model.mean(positions)
     fixed = np.tile(positions[:1], (20_000, 1))
     reference = simulate_received(*setting, fixed, np.random.default_rng(1))
-    reference -= mean_received(*setting, positions[:1])
+    reference -= model.mean(positions[:1])
     moments = []
     for sample in (scattered, reference):
         flat = sample.reshape(len(sample), -1)
@@ -52,7 +53,7 @@ def test_signals_have_the_distribution_of_eq_8(setting):
     scale = np.sqrt(np.diag(moments[1][0]).real)
     for own, expected in zip(*moments, strict=True):
         unit = np.multiply.outer(scale, scale) if own.ndim == 2 else scale
-        # Twice the 1 / sqrt(20 000) of either side, times five.
+        # Five standard deviations of the difference of two means of 20 000.
         assert np.abs((own - expected) / unit).max() < 0.05
 
 
@@ -72,7 +73,7 @@ def test_negative_numbers_are_errors(setting, arguments, words):
         simulate_pairs(*setting, *arguments)
 
 
-def test_no_pairs_and_a_codebook_that_does_not_fit(setting, small):
+def test_zero_pairs_are_empty_and_a_codebook_that_does_not_fit_is_an_error(setting, small):
     positions, received = simulate_pairs(*setting, 0, 0)
     assert (positions.shape, received.shape) == ((0, 3), (0, 2, 4))
     with pytest.raises(CodebookError):
