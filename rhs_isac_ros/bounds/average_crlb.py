@@ -13,16 +13,8 @@ def average_crlb(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> Gradient:
     """Compute the average bound, Eq. (17), with its gradients by Propositions 2 and 3.
 
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m].
-
-    Returns
-    -------
-    Gradient
-        A tuple: average CRLB [m^2]; derivative with respect to C, float64 [N_B, F, N_E] [m^2];
-        and d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K] [m^2/sqrt(W)].
+    Takes positions of the user, float64 [N, 3] [m]. The value is in m^2, as is the derivative
+    with respect to C; that with respect to S is in m^2/sqrt(W).
 
     Raises
     ------
@@ -33,14 +25,10 @@ def average_crlb(
 
 
 class AverageCrlb(Average):
-    """Average bound at fixed positions, for evaluation with many codebooks.
+    """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m].
-    tolerance
-        Relative error of the line-of-sight derivatives, see `CompressedRows`; 0 for exact ones.
+    `tolerance` is the relative error of the line-of-sight derivatives, see `CompressedRows`; 0
+    selects exact ones.
 
     Raises
     ------

@@ -19,19 +19,12 @@ class CompressedRows:
 
     Over a region of interest, the rows of all positions and sub-bands span, to a given accuracy,
     far fewer dimensions than there are elements and sub-bands. A randomised range finder with a
-    fixed seed finds a basis.
-
-    Parameters
-    ----------
-    n_rows
-        Number G of rows per item.
-    tolerance
-        Root mean square of the rows' relative errors, from `MIN_TOLERANCE` to 1.
+    fixed seed finds a basis. `tolerance` is the root mean square of the rows' relative errors.
 
     Raises
     ------
     ValueError
-        If the tolerance is out of range.
+        If the tolerance is not from `MIN_TOLERANCE` to 1.
     """
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,

@@ -15,15 +15,8 @@ _MIN_PIVOT = 1e-14
 def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound of the squared positioning error.
 
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m].
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N] [m^2]; infinite where the signals do not determine the position.
+    Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite where
+    the signals do not determine the position.
 
     Raises
     ------
@@ -41,17 +34,9 @@ def crlb_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:
-    """Invert Fisher information matrices.
+    """Invert Fisher information matrices, float64 [N, 3, 3] [1/m^2].
 
-    Parameters
-    ----------
-    information
-        Float64 [N, 3, 3] [1/m^2].
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N, 3, 3] [m^2]; infinite on the diagonal where a matrix is singular.
+    The result [m^2] is infinite on the diagonal where a matrix is singular.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -83,15 +68,7 @@ def fisher_information(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (12). Fisher information of the received signals about the position.
 
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m].
-
-    Returns
-    -------
-    numpy.ndarray
-        I_FIM, float64 [N, 3, 3] [1/m^2].
+    Takes positions of the user, float64 [N, 3] [m]. Returns I_FIM, float64 [N, 3, 3] [1/m^2].
 
     Raises
     ------
@@ -114,18 +91,10 @@ def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.
 
 
 def quadratic_form(whitened: np.ndarray) -> np.ndarray:
-    """Compute 2 Re(D^H Lambda^-1 D) of one band, its share of Eq. (12) if D is the derivative.
+    """Compute 2 Re(D^H Lambda^-1 D) of one band, float64 [N, G, G].
 
-    Parameters
-    ----------
-    whitened
-        L^-1 D with L L^H = Lambda and one row for each of the G columns of D, complex128
-        [N, G, N_SB F]; for the derivative of the mean, in 1/m with G = 3.
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N, G, G]; for the derivative of the mean, in 1/m^2.
+    This is the band's share of Eq. (12) [1/m^2] if D is the derivative of the mean [1/m]; G is 3.
+    Takes L^-1 D with L L^H = Lambda and a row for each column of D, complex128 [N, G, N_SB F].
     """
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(float)

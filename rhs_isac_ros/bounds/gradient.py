@@ -1,4 +1,7 @@
-"""Derivatives with respect to the codebook from those with respect to the radiation matrices."""
+"""Derivatives with respect to the codebook from those with respect to the radiation matrices.
+
+`by_radiation` is d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
+"""
 
 import numpy as np
 
@@ -8,20 +11,10 @@ from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 
 def gradient_analog(
         scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
-    """Implements Proposition 2. Derivative with respect to the configurations C_i.
+    """Implements Proposition 2. Derivative with respect to C_i, float64 [N_B, F, N_E].
 
     The paper writes the chain rule for every pair of coordinates. Here, the pairs have already
     been summed in the derivative with respect to T_i.
-
-    Parameters
-    ----------
-    by_radiation
-        d/dRe(T_i) + i d/dIm(T_i) of the objective, complex128 [N_B, N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N_B, F, N_E].
     """
     weights = np.matmul(codebook.digital, onboard_matrix(scenario))
     by_radiation = by_radiation.reshape(weights.shape)
@@ -31,18 +24,7 @@ def gradient_analog(
 
 def gradient_digital(
         scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
-    """Implements Proposition 3. Derivative with respect to the combining vectors S_{i,j}.
-
-    Parameters
-    ----------
-    by_radiation
-        d/dRe(T_i) + i d/dIm(T_i) of the objective, complex128 [N_B, N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K].
-    """
+    """Implements Proposition 3. Derivative d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K]."""
     onboard = onboard_matrix(scenario)
     n_bands, n_subbands, _, n_elements = onboard.shape
     by_radiation = by_radiation.reshape(n_bands, n_subbands, -1, n_elements)

@@ -70,13 +70,7 @@ class MeasurementRows(Protocol):
 
 
 class ExactRows:
-    """Rows without approximation, kept between evaluations if they fit the memory limit.
-
-    Parameters
-    ----------
-    n_rows
-        Number G of rows per item.
-    """
+    """Rows without approximation, kept between evaluations if they fit the memory limit."""
 
     def __init__(
             self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int) -> None:

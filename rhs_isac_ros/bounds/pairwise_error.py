@@ -27,9 +27,8 @@ class PairwiseErrorCost(Average):
     Raises
     ------
     ValueError
-        If the positions are not finite [N, 3] arrays of the same length, there are none, a
-        weight is negative or NaN, the number of weights differs, or the tolerance is neither 0
-        nor large enough.
+        If an argument has a wrong shape or a value that is not finite, there are no pairs, a
+        weight is negative, or the tolerance is neither 0 nor large enough.
     """
 
     def __init__(

@@ -10,10 +10,7 @@ from typing import BinaryIO
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
     """Write a temporary file and rename it, so that the file never exists in part.
 
-    Parameters
-    ----------
-    content
-        Complete content, or a callable that writes it to a binary stream.
+    The content is complete, or a callable that writes it to a binary stream.
 
     Raises
     ------

@@ -50,7 +50,8 @@ class GainPattern:
     Raises
     ------
     PatternError
-        If a function returns another shape, or values that are not real or out of range.
+        If a function returns another shape, or values that are not real or out of range. The
+        methods `amplitude` and `slope` check shape and type in the same way.
     """
 
     def __init__(self, amplitude: AngleFunction, slope: AngleFunction | None = None,
@@ -59,8 +60,8 @@ class GainPattern:
         gains = self.amplitude(_ANGLES)
         bad = ~((gains >= 0) & (gains <= _MAX_GAIN))
         if bad.any():
-            worst = np.argmax(bad)
-            raise PatternError(f'gain {gains[worst]:g} at {_ANGLES[worst]:.3f} rad, expected 0 to '
+            first = np.argmax(bad)
+            raise PatternError(f'gain {gains[first]:g} at {_ANGLES[first]:.3f} rad, expected 0 to '
                                f'{_MAX_GAIN:g} at all angles from 0 to pi')
         if not gains[_ANGLES < np.pi / 2].any():
             raise PatternError('gain 0 everywhere in front, expected some')
@@ -69,23 +70,11 @@ class GainPattern:
         self.digest = hashlib.sha256(content.astype('<f4').tobytes()).hexdigest()[:16]
 
     def amplitude(self, angles: np.ndarray) -> np.ndarray:
-        """Return the amplitude gains at angles from the boresight [rad], float64 of their shape.
-
-        Raises
-        ------
-        PatternError
-            If the function returns another shape, or values that are not real.
-        """
+        """Return the amplitude gains, float64, at angles from the boresight [rad]."""
         return _evaluate(self._amplitude, angles)
 
     def slope(self, angles: np.ndarray) -> np.ndarray:
-        """Return the derivative of the gains at angles from the boresight [rad], in 1/rad.
-
-        Raises
-        ------
-        PatternError
-            If the function returns another shape, or values that are not real.
-        """
+        """Return the derivative [1/rad] of the gains at angles from the boresight [rad]."""
         if self._slope is not None:
             return _evaluate(self._slope, angles)
 
@@ -100,11 +89,8 @@ class GainPattern:
     def named(cls, text: str) -> 'GainPattern':
         """Load the pattern of a plug-in.
 
-        Parameters
-        ----------
-        text
-            Name of an entry point of `plugins.GAIN_PATTERNS`, optionally with ``@`` and the
-            digest that the pattern must have, as `str` writes it.
+        `text` is the name of an entry point of `plugins.GAIN_PATTERNS`, optionally with ``@`` and
+        the digest that the pattern must have, as `str` writes it.
 
         Raises
         ------

@@ -1,6 +1,7 @@
 """Line-of-sight gains of the elements and their derivatives with respect to the user's position.
 
-Functions that take positions raise ValueError unless these are a finite [N, 3] array.
+Positions are those of the user, float64 [N, 3] [m]; `band` is an index from 0. Functions that take
+positions raise ValueError if their shape is another one or a value is not finite.
 """
 
 import numpy as np
@@ -16,25 +17,7 @@ _MIN_BORESIGHT_OFFSET_M = 1e-9
 
 
 def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
-    """Compute the line-of-sight gains that the paper defines below Eq. (1).
-
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m].
-    band
-        Index of the band, from 0.
-
-    Returns
-    -------
-    numpy.ndarray
-        h^LoS_{i,j,m}, complex128 [N, N_SB, N_E].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array.
-    """
+    """Compute the line-of-sight gains h^LoS, complex128 [N, N_SB, N_E], defined below Eq. (1)."""
     offsets, distances = _separation(scenario, positions)
     return _gain(scenario, distances, band, _amplitude(scenario, offsets))
 
@@ -69,21 +52,8 @@ def los_derivative_terms(
     with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the angle theta from the
     boresight, with dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
 
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m].
-    band
-        Index of the band, from 0.
-
-    Returns
-    -------
-    gain : numpy.ndarray
-        h^LoS, complex128 [N, N_SB, N_E].
-    radial : numpy.ndarray
-        a, of the same shape [1/m^2].
-    boresight_term : numpy.ndarray or None
-        b, of the same shape [1/m]; None without a gain pattern.
+    Returns h^LoS, complex128 [N, N_SB, N_E], and of the same shape the radial factor a [1/m^2]
+    and the boresight term b [1/m], which is None without a gain pattern.
     """
     offsets, distances = _separation(scenario, positions)
     gain = _gain(scenario, distances, band, _amplitude(scenario, offsets))

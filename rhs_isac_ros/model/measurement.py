@@ -32,18 +32,15 @@ _BLOCK = 256
 def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
     """Implements Eq. (13). Derivative of one band's mean signal with respect to the position.
 
+    Returns complex128 [N, G, N_SB F] [1/m], sub-band-major.
+
     Parameters
     ----------
     slopes
         Derivative of the line-of-sight gains, complex128 [N, G, N_SB, N_E] [1/m]; G is 3. Any
         other linear functions of the gains may take its place.
     radiation
-        T_i, complex128 [N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N, G, N_SB F] [1/m], sub-band-major.
+        T_i of the band, complex128 [N_SB F, N_E].
     """
     n, n_rows, n_subbands, n_elements = slopes.shape
     frames = radiation.reshape(n_subbands, -1, n_elements)
@@ -57,17 +54,8 @@ def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
 def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
     """Implements Eq. (14). Covariance of the received signals, independent of the position.
 
-    Parameters
-    ----------
-    scenario
-        Multipath and noise.
-    radiation
-        T_i of every band, complex128 [N_B, N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W].
+    Returns Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W], for the radiation matrices T_i of all
+    bands, complex128 [N_B, N_SB F, N_E].
     """
     spatial = multipath_covariance(scenario)
     scattered = np.matmul(np.matmul(radiation, spatial), np.conj(np.swapaxes(radiation, 1, 2)))
@@ -81,6 +69,9 @@ class MeasurementModel:
 
     Immutable. Construction computes the radiation matrices only; the factors of the covariance
     and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
+
+    Positions are those of the user, float64 [N, 3] [m]. Methods that take them raise ValueError
+    if their shape is another one or a value is not finite. Measurements are sub-band-major.
 
     Attributes
     ----------
@@ -109,19 +100,16 @@ class MeasurementModel:
 
     @functools.cached_property
     def root(self) -> np.ndarray:
-        """Lower triangular L_i with L_i L_i^H = Lambda_i, complex128 [N_B, N_SB F, N_SB F]."""
+        """Cholesky factor L_i of Lambda_i, complex128 [N_B, N_SB F, N_SB F], read-only."""
         return _read_only(np.linalg.cholesky(self.covariance()))
 
     @functools.cached_property
     def whitener(self) -> np.ndarray:
-        """L_i^-1, lower triangular, complex128 [N_B, N_SB F, N_SB F]."""
+        """L_i^-1, lower triangular, complex128 [N_B, N_SB F, N_SB F], read-only."""
         return _read_only(np.linalg.inv(self.root))
 
     def prepare(self, jacobian: bool = False) -> 'MeasurementModel':
-        """Compute the whitener now rather than at first use, and return the model.
-
-        With `jacobian`, compute the weights of `mean_and_jacobian` as well.
-        """
+        """Compute the whitener, and on request the weights of `mean_and_jacobian`, in advance."""
         _ = self.whitener
         if jacobian:
             _ = self._weights
@@ -134,25 +122,10 @@ class MeasurementModel:
         return whitened
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the mean signals: Eq. (8) without multipath and noise.
-
-        Parameters
-        ----------
-        positions
-            Positions of the user, float64 [N, 3] [m].
-
-        Returns
-        -------
-        numpy.ndarray
-            Complex128 [N, N_B, N_SB F], sub-band-major.
-
-        Raises
-        ------
-        ValueError
-            If `positions` is not a finite [N, 3] array.
-        """
+        """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
         positions = checked_positions(positions)
         mean = np.empty((len(positions), *self.shape), complex)
+        # Simulated signals of a seed keep their bytes only if this kernel and its blocks do.
         for band, radiation in enumerate(self.radiation):
             for start in range(0, len(positions), _BLOCK):
                 block = slice(start, start + _BLOCK)
@@ -163,17 +136,13 @@ class MeasurementModel:
     def band_jacobian(self, positions: np.ndarray, band: int) -> np.ndarray:
         """Compute the derivative of one band's mean signals, complex128 [N, 3, N_SB F] [1/m].
 
-        All N positions [m] are evaluated at once, with memory for [N, 3, N_SB, N_E] numbers.
-        Raises ValueError if `positions` is not a finite [N, 3] array.
+        All positions are evaluated at once, with memory for [N, 3, N_SB, N_E] numbers.
         """
         slopes = los_derivative(self.scenario, positions, band)
         return mean_derivative(slopes, self.radiation[band])
 
     def jacobian(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the derivative of the mean signals, complex128 [N, 3, N_B, N_SB F] [1/m].
-
-        Raises ValueError if `positions` is not a finite [N, 3] array.
-        """
+        """Compute the derivative of the mean signals, complex128 [N, 3, N_B, N_SB F] [1/m]."""
         positions = checked_positions(positions)
         jacobian = np.empty((len(positions), 3, *self.shape), complex)
         for start in range(0, len(positions), _BLOCK):
@@ -183,11 +152,7 @@ class MeasurementModel:
         return jacobian
 
     def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute `mean` and `jacobian` together, much faster and with other rounding.
-
-        Returns complex128 [N, N_B, N_SB F] and [N, 3, N_B, N_SB F] [1/m]. Raises ValueError if
-        `positions` is not a finite [N, 3] array.
-        """
+        """Compute `mean` and `jacobian` together, much faster and with other rounding."""
         positions = checked_positions(positions)
         mean = np.empty((len(positions), *self.shape), complex)
         jacobian = np.empty((len(positions), 3, *self.shape), complex)
@@ -200,28 +165,10 @@ class MeasurementModel:
         return mean, jacobian
 
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw signals of independent positioning phases, one at each position.
+        """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
 
-        Multipath and noise are drawn together, with the covariance Lambda_i.
-        `simulate_received` draws the gain of every element, for the same distribution in a
-        hundred times the time.
-
-        Parameters
-        ----------
-        positions
-            Positions of the user, float64 [N, 3] [m].
-        rng
-            Source of one standard normal complex number for each signal.
-
-        Returns
-        -------
-        numpy.ndarray
-            Complex128 [N, N_B, N_SB F], sub-band-major.
-
-        Raises
-        ------
-        ValueError
-            If `positions` is not a finite [N, 3] array.
+        Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
+        draws the gain of every element, for the same distribution in a hundred times the time.
         """
         signals = self.mean(positions)
         white = complex_normal(signals.shape, rng)
@@ -264,7 +211,7 @@ class MeasurementModel:
 
 
 class _Weights(NamedTuple):
-    """Weights of the elements in the form that `mean_and_jacobian` multiplies with.
+    """Weights of the elements for `mean_and_jacobian`.
 
     Attributes
     ----------

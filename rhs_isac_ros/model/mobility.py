@@ -25,13 +25,7 @@ class Mobility(Protocol):
 
 
 class Static:
-    """User that stands still.
-
-    Parameters
-    ----------
-    position
-        Float64 [3] [m].
-    """
+    """User that stands still at a position, float64 [3] [m]."""
 
     def __init__(self, position: ArrayLike) -> None:
         self._position = _checked_position(position)
@@ -42,14 +36,9 @@ class Static:
 
 
 class Waypoints:
-    """User that follows a closed polygon of waypoints at constant speed.
+    """User that follows a closed polygon of waypoints, float64 [N, 3] [m], at constant speed.
 
     The first call of `state` is at the first waypoint.
-
-    Parameters
-    ----------
-    waypoints
-        Float64 [N, 3] [m].
     """
 
     def __init__(self, waypoints: ArrayLike, speed_mps: float) -> None:
@@ -78,10 +67,7 @@ class Waypoints:
 class RandomWalk:
     """User that walks in straight lines between random positions of the region of interest.
 
-    Parameters
-    ----------
-    start
-        First position, float64 [3] [m]; random by default.
+    The first position is random, unless it is given as `start`, float64 [3] [m].
     """
 
     def __init__(
@@ -119,13 +105,8 @@ def make_plugin(
         start: Sequence[float] | None = None) -> Mobility:
     """Create the mobility of another package.
 
-    Parameters
-    ----------
-    name
-        Entry point of the group `plugins.MOBILITIES`. Its object is called with the other
-        arguments, as `RandomWalk` is.
-    start
-        First position, float64 [3] [m]; chosen by the plug-in if None.
+    `name` is an entry point of the group `plugins.MOBILITIES`. Its object is called with the
+    other arguments, as `RandomWalk` is. It chooses the first position if `start` is None.
 
     Raises
     ------

@@ -1,4 +1,7 @@
-"""Multipath: spatial covariance, correlation over sub-bands and frames, random gains."""
+"""Multipath: spatial covariance, correlation over sub-bands and frames, random gains.
+
+Indices of bands, sub-bands and frames start at 0. Bands are independent.
+"""
 
 import functools
 
@@ -22,12 +25,7 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     over the half space in front of the surface and scaled by the mean line-of-sight power in the
     region of interest. It is even in azimuth and elevation, which makes the covariance real, and
     it depends on the elements' lattice offsets only. A gain pattern of the elements weights the
-    profile.
-
-    Returns
-    -------
-    numpy.ndarray
-        V_i, complex128 [N_B, N_E, N_E], read-only.
+    profile. Returns V_i, complex128 [N_B, N_E, N_E], read-only.
     """
     side = scenario.elements_per_side
     azimuth, weights = _profile_quadrature(scenario)
@@ -76,18 +74,7 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
 
 def frequency_correlation(
         scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (3). Correlation of the multipath gains of two sub-bands.
-
-    Parameters
-    ----------
-    first, second
-        Indices of sub-bands, from 0, of shapes that broadcast.
-
-    Returns
-    -------
-    numpy.ndarray
-        rho_f, complex128 of the broadcast shape.
-    """
+    """Implements Eq. (3). Correlation rho_f of sub-bands, complex128; indices may broadcast."""
     frequencies = subband_frequencies_hz(scenario)[band]
     difference = frequencies[first] - frequencies[second]
     correlation: np.ndarray = 1 / (1 + 2j * np.pi * scenario.delay_spread_s * difference)
@@ -96,18 +83,7 @@ def frequency_correlation(
 
 def time_correlation(
         scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (4). Correlation of the multipath gains of two frames.
-
-    Parameters
-    ----------
-    first, second
-        Indices of frames, from 0, of shapes that broadcast.
-
-    Returns
-    -------
-    numpy.ndarray
-        rho_t, float64 of the broadcast shape.
-    """
+    """Implements Eq. (4). Correlation rho_t of frames, float64; indices may broadcast."""
     center_hz = scenario.center_frequencies_hz[band]
     doppler_hz = scenario.max_user_speed_mps * center_hz / SPEED_OF_LIGHT_MPS
     lag_s = (np.asarray(first) - np.asarray(second)) * scenario.frame_duration_s
@@ -122,10 +98,7 @@ def time_correlation(
 def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """Implements Eq. (15). Correlation of the multipath over sub-bands and over frames.
 
-    Returns
-    -------
-    tuple of numpy.ndarray
-        K_f, complex128 [N_B, N_SB, N_SB], and K_t, float64 [N_B, F, F]; read-only.
+    Returns K_f, complex128 [N_B, N_SB, N_SB], and K_t, float64 [N_B, F, F]; read-only.
     """
     subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
     bands = range(scenario.n_bands)
@@ -138,12 +111,9 @@ def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.lru_cache(maxsize=16)
 def measurement_correlation(scenario: Scenario) -> np.ndarray:
-    """Compute the multipath's correlation over all measurements of a band: the paper's K_ft.
+    """Compute the correlation K_ft over all measurements, complex128 [N_B, N_SB F, N_SB F].
 
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N_B, N_SB F, N_SB F], sub-band-major, read-only.
+    Rows and columns are sub-band-major; the array is read-only.
     """
     pairs = zip(*correlation_matrices(scenario), strict=True)
     correlation = np.stack([np.kron(over_f, over_t) for over_f, over_t in pairs])
@@ -155,11 +125,8 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
 def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Compute the factors with which `draw_multipath` correlates the gains.
 
-    Returns
-    -------
-    tuple
-        For each band G [N_E, r] with G G^H = V_i, and L [N_SB F, s] with L L^H the correlation of
-        the measurements (sub-band-major); r and s are the numerical ranks.
+    For each band, these are G [N_E, r] with G G^H = V_i, and L [N_SB F, s] with L L^H = K_ft;
+    r and s are the numerical ranks.
     """
     pairs = zip(multipath_covariance(scenario), measurement_correlation(scenario), strict=True)
     return tuple((_square_root(spatial), _square_root(correlation))
@@ -168,23 +135,10 @@ def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray]
 
 def draw_multipath(
         scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw multipath gains of independent positioning phases.
-
-    Parameters
-    ----------
-    band
-        Index of the band, from 0.
-    n
-        Number of phases.
-
-    Returns
-    -------
-    numpy.ndarray
-        h^MP, complex128 [n, N_SB F, N_E], rows sub-band-major.
-    """
-    spatial, temporal = multipath_factors(scenario)[band]
-    white = complex_normal((n, temporal.shape[1], spatial.shape[1]), rng)
-    gains: np.ndarray = temporal @ (white @ spatial.T)
+    """Draw multipath gains h^MP of n independent phases, complex128 [n, N_SB F, N_E]."""
+    spatial, over_rows = multipath_factors(scenario)[band]
+    white = complex_normal((n, over_rows.shape[1], spatial.shape[1]), rng)
+    gains: np.ndarray = over_rows @ (white @ spatial.T)
     return gains
 
 

@@ -14,7 +14,7 @@ _BLOCK = 256
 def received_signal(
         los: np.ndarray, multipath: np.ndarray | float, radiation: np.ndarray,
         noise: np.ndarray | float, symbol: complex = 1.0) -> np.ndarray:
-    """Implements Eq. (8). Received signals of one band over its sub-bands and frames.
+    """Implements Eq. (8). Received signals y_i of one band, complex128 [..., N_SB F].
 
     Parameters
     ----------
@@ -28,11 +28,6 @@ def received_signal(
         Thermal noise e, complex128 [..., N_SB F], or 0.
     symbol
         The user's symbol x.
-
-    Returns
-    -------
-    numpy.ndarray
-        y_i, complex128 [..., N_SB F].
     """
     n_subbands = los.shape[-2]
     frames = radiation.reshape(n_subbands, -1, radiation.shape[-1])
@@ -48,19 +43,10 @@ def received_signal(
 def simulate_received(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
         rng: np.random.Generator) -> np.ndarray:
-    """Simulate the received signals of independent positioning phases by Eq. (8).
+    """Simulate signals of independent positioning phases by Eq. (8), element by element.
 
-    Parameters
-    ----------
-    positions
-        Position of the user in each phase, float64 [N, 3] [m].
-    rng
-        Source of the multipath gains of all elements and of the noise.
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N, N_B, N_SB F], sub-band-major.
+    Takes the user's position in each phase, float64 [N, 3] [m], and returns complex128
+    [N, N_B, N_SB F], sub-band-major.
 
     Raises
     ------
@@ -86,21 +72,14 @@ def simulate_received(
 def receive_feeds(
         scenario: Scenario, codebook: Beamforming, feeds: np.ndarray,
         rng: np.random.Generator | None) -> np.ndarray:
-    """Combine the feed signals of a positioning phase by Eq. (7), as the base station does.
+    """Combine the feed signals of a phase by Eq. (7), complex128 [N_B, N_SB, F].
 
     Parameters
     ----------
-    codebook
-        Beamforming, of which only the digital part is used.
     feeds
         Signals at the feeds, complex128 [N_B, F, N_SB, K].
     rng
         Source of the thermal noise; None if the feed signals already contain noise.
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N_B, N_SB, F].
     """
     shape = codebook.digital.shape[:3]
     noise: np.ndarray | float = 0.0

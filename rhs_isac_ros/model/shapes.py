@@ -6,14 +6,7 @@ from rhs_isac_ros.model.scenario import Scenario
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Check that an array has the sizes of a scenario.
-
-    Parameters
-    ----------
-    name
-        Name of the array for the error message.
-    symbols
-        Expected dimensions: keys of `Scenario.sizes`, separated by blanks.
+    """Check that an array has the dimensions `symbols`: keys of `Scenario.sizes` with blanks.
 
     Raises
     ------

@@ -9,11 +9,7 @@ import numpy as np
 def generator(seed: int, stream: int, *key: int) -> np.random.Generator:
     """Create a generator that yields the same sequence for the same arguments.
 
-    Parameters
-    ----------
-    stream
-        Purpose, one of the constants of this module.
-    *key
-        Non-negative integers that distinguish uses of a stream, such as user and cycle.
+    `stream` is one of the constants of this module. Further non-negative integers, such as user
+    and cycle, distinguish the uses of a stream.
     """
     return np.random.default_rng([seed, stream, *key])

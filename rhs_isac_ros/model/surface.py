@@ -29,22 +29,14 @@ class Beamforming(Protocol):
 
 
 def element_signals(los: np.ndarray, multipath: np.ndarray, symbol: complex) -> np.ndarray:
-    """Implements Eq. (1). Signals tau that the elements receive, complex128 [..., N_E].
-
-    Parameters
-    ----------
-    los, multipath
-        Gains of the two paths, complex128 [..., N_E].
-    symbol
-        The user's symbol x.
-    """
+    """Implements Eq. (1). Signals tau of the elements for the gains of both paths, [..., N_E]."""
     signals: np.ndarray = (los + multipath) * symbol
     return signals
 
 
 def feed_signals(
         scenario: Scenario, band: int, analog: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Implements Eq. (5). Signals that the feeds receive from the elements.
+    """Implements Eq. (5). Signals that the feeds receive from the elements, [N_SB, K].
 
     The elements apply their radiation coefficients here; the paper introduces them with Eq. (9).
 
@@ -56,11 +48,6 @@ def feed_signals(
         Configuration c of the frame, float64 [N_E].
     elements
         Element signals tau, complex128 [N_SB, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 [N_SB, K].
     """
     signals: np.ndarray = np.einsum(
         'jm,jkm->jk', analog * elements, onboard_matrix(scenario)[band])
@@ -70,19 +57,9 @@ def feed_signals(
 def onboard_gain(
         scenario: Scenario, frequency_hz: float | np.ndarray, source: np.ndarray,
         sink: np.ndarray) -> np.ndarray:
-    """Implements Eq. (6). Propagation kappa on the board between two points.
+    """Implements Eq. (6). Propagation kappa on the board between two points, complex128.
 
-    Parameters
-    ----------
-    frequency_hz
-        Frequency [Hz], of a shape that broadcasts with those of the points.
-    source, sink
-        Positions, float64 [..., 3] [m], of shapes that broadcast.
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 of the broadcast shape.
+    Frequencies [Hz] and positions, float64 [..., 3] [m], may have any shapes that broadcast.
     """
     distance = np.linalg.norm(sink - source, axis=-1)
     wavenumber = 2 * np.pi * scenario.refractive_index * frequency_hz / SPEED_OF_LIGHT_MPS
@@ -91,16 +68,14 @@ def onboard_gain(
 
 
 def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
-    """Implements Eq. (7). Combined signal of the feeds with thermal noise, complex128 [...].
+    """Implements Eq. (7). Combined signal of the feeds, complex128 [...].
 
     Parameters
     ----------
-    digital
-        Combining vectors s, complex128 [..., K].
-    feeds
-        Signals at the feeds, complex128 [..., K].
+    digital, feeds
+        Combining vectors s and signals at the feeds, complex128 [..., K].
     noise
-        Noise e, complex128 [...], or 0.
+        Thermal noise e, complex128 [...], or 0.
     """
     combined: np.ndarray = np.einsum('...k,...k->...', digital, feeds) + noise
     return combined
@@ -109,10 +84,7 @@ def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -
 def radiation_matrix(scenario: Scenario, beams: Beamforming) -> np.ndarray:
     """Implements Eq. (9). Weight of every element in every measurement.
 
-    Returns
-    -------
-    numpy.ndarray
-        T_i, complex128 [N_B, N_SB F, N_E], rows sub-band-major (row j F + q).
+    Returns T_i, complex128 [N_B, N_SB F, N_E], rows sub-band-major (row j F + q).
 
     Raises
     ------
@@ -128,12 +100,9 @@ def radiation_matrix(scenario: Scenario, beams: Beamforming) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def onboard_matrix(scenario: Scenario) -> np.ndarray:
-    """Compute the on-board propagation between elements and feeds, B below Eq. (9).
+    """Compute B_{i,j} below Eq. (9), the on-board propagation from all elements to all feeds.
 
-    Returns
-    -------
-    numpy.ndarray
-        B_{i,j}, complex128 [N_B, N_SB, K, N_E], read-only.
+    Returns complex128 [N_B, N_SB, K, N_E], read-only.
     """
     frequencies = subband_frequencies_hz(scenario)[:, :, None, None]
     elements, feeds = element_positions(scenario), feed_positions(scenario)
