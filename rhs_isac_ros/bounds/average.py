@@ -1,4 +1,4 @@
-"""Averages over positions of functions of quadratic forms, with their gradients."""
+"""Averages of losses that depend on a codebook through quadratic forms, with gradients."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,15 +6,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.bounds.compressed_rows import CompressedRows
-from rhs_isac_ros.bounds.fisher import factor, information_of, measurement_correlation
+from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.bounds.gradient import gradient_analog, gradient_digital
-from rhs_isac_ros.bounds.rows import ExactRows, Rows, RowSource, blocks
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.bounds.measurement_rows import ExactRows, MeasurementRows, RowSource, blocks
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import Beamforming
 
-# Function of (block of items, forms [n, G, G]) that returns the items' values [n] and minus their
-# derivatives by the forms, float64 [n, G, G].
+# Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses
+# [n] and their negative derivatives with respect to the forms, float64 [n, G, G].
 Loss = Callable[[slice, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -23,10 +23,8 @@ class Gradient(NamedTuple):
 
     Attributes
     ----------
-    value
-        The average.
     by_analog
-        Derivative by C, float64 [N_B, F, N_E].
+        Derivative with respect to C, float64 [N_B, F, N_E].
     by_digital
         d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K].
     """
@@ -37,26 +35,12 @@ class Gradient(NamedTuple):
 
 
 class Average:
-    """Mean loss of items that depend on a codebook through a quadratic form each.
+    """Mean loss of items, each of which depends on a codebook through a quadratic form.
 
-    The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, with one column of D_i for each of its
-    rows: the Fisher information if these are derivatives, twice the squared distance of two mean
-    signals if they are differences.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    source
-        Gives the rows of some items in a band.
-    n_items
-        How many items there are.
-    n_rows
-        Rows an item, G.
-    loss
-        Loss of items by their forms.
-    tolerance
-        Relative error of the rows, see `CompressedRows`; 0 for exact ones.
+    The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where D_i has one column for each of
+    the item's G = `n_rows` rows. With derivatives as rows it is the Fisher information; with
+    differences, it is twice the squared distance of two mean signals. `tolerance` is the
+    relative error of the rows, see `CompressedRows`; 0 selects exact ones.
 
     Raises
     ------
@@ -67,60 +51,44 @@ class Average:
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                  loss: Loss, tolerance: float) -> None:
         self.scenario, self._loss = scenario, loss
-        self.rows: Rows = (
+        self.rows: MeasurementRows = (
             ExactRows(scenario, source, n_items, n_rows) if tolerance == 0
             else CompressedRows(scenario, source, n_items, n_rows, tolerance))
 
     def value(self, codebook: Beamforming) -> float:
-        """Evaluate the average alone.
-
-        Parameters
-        ----------
-        codebook
-            Analog and digital beamforming.
-
-        Returns
-        -------
-        float
-            The average.
-        """
-        ongoing = self.rows.begin(*factor(self.scenario, codebook))
-        bands = range(self.scenario.n_bands)
+        """Compute the average without its gradients."""
+        evaluation = self.rows.begin(MeasurementModel(self.scenario, codebook))
         total = 0.0
         for block in blocks(self.rows.n_items):
-            forms = sum(information_of(ongoing.whitened(block, band)) for band in bands)
-            total += float(self._loss(block, forms)[0].sum())
+            whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
+            total += float(self._loss(block, _sum_of_forms(whitened))[0].sum())
         return total / self.rows.n_items
 
     def __call__(self, codebook: Beamforming) -> Gradient:
-        """Evaluate the average and its gradients.
-
-        Parameters
-        ----------
-        codebook
-            Analog and digital beamforming.
-
-        Returns
-        -------
-        Gradient
-            Value and derivatives.
-        """
-        patterns, whiteners = factor(self.scenario, codebook)
-        ongoing = self.rows.begin(patterns, whiteners)
+        """Compute the average and its gradients."""
+        model = MeasurementModel(self.scenario, codebook)
+        evaluation = self.rows.begin(model)
         bands = range(self.scenario.n_bands)
         total = 0.0
         for block in blocks(self.rows.n_items):
-            whitened = [ongoing.whitened(block, band) for band in bands]
-            values, weights = self._loss(block, sum(map(information_of, whitened)))
-            total += float(values.sum())
+            whitened = [evaluation.whitened(block, band) for band in bands]
+            losses, weights = self._loss(block, _sum_of_forms(whitened))
+            total += float(losses.sum())
             for band in bands:
                 weighted = np.matmul(weights, whitened[band].view(float)).view(complex)
-                ongoing.collect(block, band, weighted)
-        by_mean, spread = map(np.stack, zip(*map(ongoing.collected, bands), strict=True))
-        by_covariance = np.matmul(
-            np.conj(measurement_correlation(self.scenario)) * spread,
-            np.matmul(patterns, multipath_covariance(self.scenario)))
-        by_pattern = 4 * (by_covariance - by_mean) / self.rows.n_items
+                evaluation.accumulate(block, band, weighted)
+        mean_terms, covariance_terms = map(
+            np.stack, zip(*map(evaluation.sums, bands), strict=True))
+        through_covariance = np.matmul(
+            np.conj(measurement_correlation(self.scenario)) * covariance_terms,
+            np.matmul(model.radiation, multipath_covariance(self.scenario)))
+        by_radiation = 4 * (through_covariance - mean_terms) / self.rows.n_items
         return Gradient(
-            total / self.rows.n_items, gradient_analog(self.scenario, codebook, by_pattern),
-            gradient_digital(self.scenario, codebook, by_pattern))
+            total / self.rows.n_items, gradient_analog(self.scenario, codebook, by_radiation),
+            gradient_digital(self.scenario, codebook, by_radiation))
+
+
+def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:
+    """Sum of the bands' quadratic forms [n, G, G]."""
+    total: np.ndarray = np.sum([quadratic_form(means) for means in whitened], axis=0)
+    return total

@@ -1,4 +1,4 @@
-"""The average bound over many positions."""
+"""Average Cramer-Rao bound over positions."""
 
 import numpy as np
 
@@ -11,47 +11,30 @@ from rhs_isac_ros.model.surface import Beamforming
 
 def average_crlb(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> Gradient:
-    """Average bound over positions, Eq. (17), with its gradients by Propositions 2 and 3.
+    """Compute the average bound, Eq. (17), with its gradients by Propositions 2 and 3.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
-    positions
-        Positions of the user, float64 [N, 3] [m].
-
-    Returns
-    -------
-    Gradient
-        A tuple: average CRLB [m^2]; derivative by C, float64 [N_B, F, N_E] [m^2]; and
-        d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K] [m^2/sqrt(W)].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array.
-    """
-    return AverageCrlb(scenario, positions)(codebook)
-
-
-class AverageCrlb(Average):
-    """Average bound at fixed positions, to be evaluated for many codebooks.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    positions
-        Positions of the user, float64 [N, 3] [m].
-    tolerance
-        Relative error of the line-of-sight derivatives, see `CompressedRows`; 0 for exact ones.
+    Takes positions of the user, float64 [N, 3] [m]. The value is in m^2, as is the derivative
+    with respect to C; that with respect to S is in m^2/sqrt(W).
 
     Raises
     ------
     ValueError
         If `positions` is not a finite [N, 3] array, or holds no position.
+    """
+    return AverageCrlb(scenario, positions)(codebook)
+
+
+class AverageCrlb(Average):
+    """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
+
+    `tolerance` is the relative error of the line-of-sight derivatives, see `CompressedRows`; 0
+    selects exact ones.
+
+    Raises
+    ------
+    ValueError
+        If `positions` is not a finite [N, 3] array or holds no position, or the tolerance is
+        neither 0 nor large enough.
     """
 
     def __init__(
@@ -61,15 +44,14 @@ class AverageCrlb(Average):
             raise ValueError('positions: none given, expected at least one')
         super().__init__(
             scenario,
-            lambda start, stop, band: los_derivative(
-                scenario, self.positions[start:stop], band),
-            len(self.positions), 3, _bound, tolerance)
+            lambda block, band: los_derivative(scenario, self.positions[block], band),
+            len(self.positions), 3, _trace_of_inverse, tolerance)
 
 
-def _bound(block: slice, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Trace of the inverse, and minus its derivative."""
+def _trace_of_inverse(block: slice, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Trace of the inverse [n] and its negative derivative [n, 3, 3]."""
     inverse = inverse_information(information)
     values = np.trace(inverse, axis1=1, axis2=2)
-    # Where the signals do not determine the position, the value is infinite and has no slope.
+    # Where the signals do not determine the position, the value is infinite and the slope zero.
     finite = np.where(np.isfinite(values)[:, None, None], inverse, 0.0)
     return values, np.matmul(finite, finite)

@@ -1,132 +1,111 @@
-"""Rows of a quadratic form in a basis of low rank."""
+"""Rows of quadratic forms in a basis of low rank."""
 
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rhs_isac_ros.bounds.rows import GradientSums, Pass, RowSource, blocks
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.bounds.measurement_rows import Evaluation, GradientSums, RowSource, blocks
+from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 
-# Least columns of the first sketch; each next one has twice as many.
-_SKETCH = 128
-# Gram matrices resolve no smaller relative error.
+# Minimum number of columns of the first sketch. Each further sketch has twice as many.
+_MIN_SKETCH = 128
+# Smaller relative errors are lost in the rounding of Gram matrices.
 MIN_TOLERANCE = 1e-7
 
 
 class CompressedRows:
-    """Rows as coefficients in a basis: fewer numbers, and one large product a band.
+    """Rows as coefficients in a basis: less memory, and one large matrix product per band.
 
-    Over a region of interest the rows of all positions and sub-bands span, to a given accuracy,
+    Over a region of interest, the rows of all positions and sub-bands span, to a given accuracy,
     far fewer dimensions than there are elements and sub-bands. A randomised range finder with a
-    fixed seed finds them.
+    fixed seed finds a basis. `tolerance` is the root mean square of the rows' relative errors.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    source
-        Gives the rows.
-    n_items
-        How many items there are.
-    n_rows
-        Rows an item, G.
-    tolerance
-        Root mean square of the rows' relative errors, from `MIN_TOLERANCE` to 1.
-
-    Attributes
-    ----------
-    ranks
-        Dimensions of the basis of each band.
+    Raises
+    ------
+    ValueError
+        If the tolerance is not from `MIN_TOLERANCE` to 1.
     """
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                  tolerance: float) -> None:
         self.n_items, self._n_rows = n_items, n_rows
-        self._shape = scenario.n_subbands, scenario.n_elements
-        self.coefficients, self.bases = [], []
+        n_subbands, n_elements = scenario.n_subbands, scenario.n_elements
+
+        def flat_rows(block: slice, band: int) -> np.ndarray:
+            return source(block, band).reshape(-1, n_subbands * n_elements)
+
+        self.coefficients: list[np.ndarray] = []
+        self.bases: list[np.ndarray] = []
         for band in range(scenario.n_bands):
             coefficients, basis = _compress(
-                lambda block, band=band: source(block.start, block.stop, band).reshape(
-                    -1, scenario.n_subbands * scenario.n_elements),
-                n_items, n_rows, tolerance, _first_sketch(scenario))
+                functools.partial(flat_rows, band=band), n_items, n_rows, tolerance,
+                _first_sketch(scenario))
             self.coefficients.append(coefficients)
-            self.bases.append(basis.reshape(*self._shape, -1))
+            self.bases.append(basis.reshape(n_subbands, n_elements, -1))
 
     @property
     def ranks(self) -> tuple[int, ...]:
         """Dimensions of the basis of each band."""
         return tuple(basis.shape[-1] for basis in self.bases)
 
-    def begin(self, patterns: np.ndarray, whiteners: np.ndarray) -> Pass:
-        """Begin an evaluation.
-
-        Parameters
-        ----------
-        patterns
-            T_i, complex128 [N_B, N_SB F, N_E].
-        whiteners
-            L_i^-1, complex128 [N_B, N_SB F, N_SB F].
-
-        Returns
-        -------
-        Pass
-            The evaluation.
-        """
-        return _CompressedPass(self.coefficients, self.bases, self._n_rows, patterns, whiteners)
+    def begin(self, model: MeasurementModel) -> Evaluation:
+        """Begin an evaluation with the radiation and whitening matrices of a model."""
+        return _CompressedEvaluation(self.coefficients, self.bases, self._n_rows, model)
 
 
-class _CompressedPass:
-    """One evaluation with coefficients."""
+class _CompressedEvaluation:
+    """Evaluation with coefficients."""
 
     def __init__(self, coefficients: Sequence[np.ndarray], bases: Sequence[np.ndarray],
-                 n_rows: int, patterns: np.ndarray, whiteners: np.ndarray) -> None:
+                 n_rows: int, model: MeasurementModel) -> None:
         self._coefficients, self._bases, self._n_rows = coefficients, bases, n_rows
-        self._whiteners = whiteners
-        # Whitening is part of the filters: it costs nothing per item.
+        self._whitener = model.whitener
+        # The filters include whitening, which therefore costs no time per item.
         self._filters = [
-            _filters(basis, pattern) @ whitener.T
-            for basis, pattern, whitener in zip(bases, patterns, whiteners, strict=True)]
+            _filters(basis, radiation) @ whitener.T
+            for basis, radiation, whitener in zip(
+                bases, model.radiation, model.whitener, strict=True)]
         self._weights = [np.zeros_like(filters) for filters in self._filters]
 
     def _rows(self, block: slice, band: int) -> np.ndarray:
         return self._coefficients[band][block.start * self._n_rows:block.stop * self._n_rows]
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
-        whitened = self._rows(block, band) @ self._filters[band]
+        whitened: np.ndarray = self._rows(block, band) @ self._filters[band]
         return whitened.reshape(-1, self._n_rows, whitened.shape[1])
 
-    def collect(self, block: slice, band: int, weighted: np.ndarray) -> None:
+    def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
         weighted = weighted.reshape(-1, weighted.shape[-1])
-        # The conjugate of what is wanted: coefficients stay as they lie in memory.
+        # Accumulate the conjugate, so that the coefficients need not be copied.
         self._weights[band] += self._rows(block, band).T @ np.conj(weighted)
 
-    def collected(self, band: int) -> GradientSums:
-        basis, whitener = self._bases[band], self._whiteners[band]
+    def sums(self, band: int) -> GradientSums:
+        basis, whitener = self._bases[band], self._whitener[band]
         n_subbands, n_elements, _ = basis.shape
         weights = np.conj(self._weights[band]) @ np.conj(whitener)
         zeta = self._filters[band] @ np.conj(whitener)
         frames = np.moveaxis(weights.reshape(len(weights), n_subbands, -1), 1, 0)
-        by_mean = np.matmul(basis, frames)
-        return GradientSums(np.swapaxes(by_mean, 1, 2).reshape(-1, n_elements),
-                         weights.T @ np.conj(zeta))
+        mean_term = np.swapaxes(np.matmul(basis, frames), 1, 2).reshape(-1, n_elements)
+        return GradientSums(mean_term, weights.T @ np.conj(zeta))
 
 
 def _first_sketch(scenario: Scenario) -> int:
-    """Columns of the first sketch: about what Table I needs, and larger surfaces accordingly."""
-    return max(_SKETCH, scenario.n_elements // 2)
+    """Columns of the first sketch: enough for Table I, and more for larger surfaces."""
+    return max(_MIN_SKETCH, scenario.n_elements // 2)
 
 
-def _filters(basis: np.ndarray, pattern: np.ndarray) -> np.ndarray:
-    """What a pattern makes of the vectors of a basis: [R, N_SB F]."""
+def _filters(basis: np.ndarray, radiation: np.ndarray) -> np.ndarray:
+    """Means of the vectors of a basis, complex128 [R, N_SB F]."""
     n_subbands, n_elements, rank = basis.shape
-    frames = pattern.reshape(n_subbands, -1, n_elements)
+    frames = radiation.reshape(n_subbands, -1, n_elements)
     products = np.matmul(frames, np.conj(basis))
     return np.ascontiguousarray(products.reshape(-1, rank).T)
 
 
 def _compress(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
               tolerance: float, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients [n_items n_rows, R] and an orthonormal basis [N_SB N_E, R] of some rows."""
+    """Coefficients [n_items n_rows, R] and an orthonormal basis [N_SB N_E, R] of the rows."""
     if not MIN_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f'tolerance: {tolerance:g}, expected {MIN_TOLERANCE:g} to 1, or 0 for exact rows')
@@ -142,7 +121,7 @@ def _compress(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
             coefficients[part] = rows @ basis
         relative = coefficients[norms > 0] / norms[norms > 0, None]
         values, vectors = np.linalg.eigh(np.conj(relative.T) @ relative / max(len(relative), 1))
-        # Rows have unit length: what the coefficients lack of it lies outside of the basis.
+        # Rows have unit length. The part that the coefficients lack lies outside the basis.
         missing = max(1.0 - float(values.sum()), 0.0)
         tails = missing + np.concatenate([[0.0], np.cumsum(np.maximum(values, 0.0))])
         cut = int(np.searchsorted(tails, tolerance**2, side='right')) - 1
@@ -154,13 +133,14 @@ def _compress(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
 
 def _sketch(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
             size: int) -> np.ndarray:
-    """Orthonormal basis of random mixtures of the rows, each of which counts by its direction."""
+    """Orthonormal basis of random combinations of the rows, normalised to unit length."""
     rng = streams.generator(0, streams.SKETCH, size)
-    mixtures: np.ndarray | float = 0.0
+    mixtures: np.ndarray = np.zeros(())
     for block in blocks(n_items):
         rows = rows_of(block)
         norms = np.linalg.norm(rows, axis=1)
         weights = rng.normal(size=(size, len(rows))) / np.where(norms == 0, 1.0, norms)
-        # A real product: a quarter of the work of a complex one.
+        # A real product takes a quarter of the operations of a complex one.
         mixtures = mixtures + weights @ rows.view(float)
-    return np.linalg.qr(np.conj(mixtures.view(complex).T))[0]
+    basis: np.ndarray = np.linalg.qr(np.conj(mixtures.view(complex).T))[0]
+    return basis

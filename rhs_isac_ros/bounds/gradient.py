@@ -1,4 +1,7 @@
-"""From the derivative by the beam patterns to those by the variables of a codebook."""
+"""Derivatives with respect to the codebook from those with respect to the radiation matrices.
+
+`by_radiation` is d/dRe(T_i) + i d/dIm(T_i) of an objective, complex128 [N_B, N_SB F, N_E].
+"""
 
 import numpy as np
 
@@ -7,51 +10,24 @@ from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 
 
 def gradient_analog(
-        scenario: Scenario, codebook: Beamforming, by_pattern: np.ndarray) -> np.ndarray:
-    """Implements Proposition 2. Derivative by the configurations C_i.
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+    """Implements Proposition 2. Derivative with respect to C_i, float64 [N_B, F, N_E].
 
-    The paper writes the chain rule out for every pair of coordinates; here the pairs are summed
-    first, in the derivative by T_i.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
-    by_pattern
-        Derivative of the objective by T_i (d/dRe + i d/dIm), complex128 [N_B, N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N_B, F, N_E].
+    The paper writes the chain rule for every pair of coordinates. Here, the pairs have already
+    been summed in the derivative with respect to T_i.
     """
     weights = np.matmul(codebook.digital, onboard_matrix(scenario))
-    by_pattern = by_pattern.reshape(weights.shape)
-    return np.einsum('ijqm,ijqm->iqm', np.conj(by_pattern), weights).real
+    by_radiation = by_radiation.reshape(weights.shape)
+    gradient: np.ndarray = np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
+    return gradient
 
 
 def gradient_digital(
-        scenario: Scenario, codebook: Beamforming, by_pattern: np.ndarray) -> np.ndarray:
-    """Implements Proposition 3. Derivative by the combining vectors S_{i,j}.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    codebook
-        Analog and digital beamforming.
-    by_pattern
-        Derivative of the objective by T_i (d/dRe + i d/dIm), complex128 [N_B, N_SB F, N_E].
-
-    Returns
-    -------
-    numpy.ndarray
-        d/dRe + i d/dIm, complex128 [N_B, N_SB, F, K].
-    """
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+    """Implements Proposition 3. Derivative d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K]."""
     onboard = onboard_matrix(scenario)
     n_bands, n_subbands, _, n_elements = onboard.shape
-    by_pattern = by_pattern.reshape(n_bands, n_subbands, -1, n_elements)
-    weighted = by_pattern * codebook.analog[:, None]
-    return np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))
+    by_radiation = by_radiation.reshape(n_bands, n_subbands, -1, n_elements)
+    weighted = by_radiation * codebook.analog[:, None]
+    gradient: np.ndarray = np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))
+    return gradient

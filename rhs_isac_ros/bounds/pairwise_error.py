@@ -1,4 +1,4 @@
-"""How often far positions are taken for one another, which no local bound tells."""
+"""Error by confusion of distant positions, which the local Cramer-Rao bound does not include."""
 
 import numpy as np
 
@@ -8,29 +8,27 @@ from rhs_isac_ros.model.scenario import Scenario
 
 
 class PairwiseErrorCost(Average):
-    """Mean squared error that the confusion of pairs of positions causes.
+    """Mean squared error caused by the confusion of pairs of positions.
 
-    With q = sum_i dmu_i^H Lambda_i^-1 dmu_i, dmu being the difference of the mean signals, the
-    likelier of two positions is the wrong one with probability Q(sqrt(q / 2)); the average of
-    ``|p - p'|^2 Q(sqrt(q / 2))`` is in square metres, as the bound is. The quadratic form is that
-    of Eq. (12), with the difference h(p) - h(p') in the place of the derivative.
+    A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
+    where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
+    cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. The quadratic
+    form is that of Eq. (12), with the difference h(p) - h(p') instead of the derivative.
 
     Parameters
     ----------
-    scenario
-        The scenario.
     firsts, seconds
         The two positions of each pair, float64 [N, 3] [m].
     weights
-        Weights of the pairs, float64 [N]; by default 1.
+        Weights of the pairs, float64 [N]; 1 by default.
     tolerance
         Relative error of the differences, see `CompressedRows`; 0 for exact ones.
 
     Raises
     ------
     ValueError
-        If the positions are not finite [N, 3] arrays of the same length, there are none, or a
-        weight is negative or missing.
+        If an argument has a wrong shape or a value that is not finite, there are no pairs, a
+        weight is negative, or the tolerance is neither 0 nor large enough.
     """
 
     def __init__(
@@ -48,17 +46,17 @@ class PairwiseErrorCost(Average):
         self._costs = weights * np.sum((firsts - seconds)**2, axis=1)
         super().__init__(
             scenario,
-            lambda start, stop, band: (
-                los_gain(scenario, firsts[start:stop], band)
-                - los_gain(scenario, seconds[start:stop], band))[:, None],
+            lambda block, band: (
+                los_gain(scenario, firsts[block], band)
+                - los_gain(scenario, seconds[block], band))[:, None],
             len(firsts), 1, self._confusion, tolerance)
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cost times Q(sqrt(q / 2)), and minus its derivative by the form, which is 2 q."""
+        """Cost times Q(sqrt(q / 2)) [n], and its negative derivative by the form 2 q [n, 1, 1]."""
         from scipy.special import ndtr
 
         root = np.sqrt(forms[:, 0, 0])
         costs = self._costs[block]
-        # Two equal signals have no slope towards either side.
+        # The derivative is undefined for equal signals; the limit keeps it finite.
         slope = np.exp(-root**2 / 8) / (4 * np.sqrt(2 * np.pi) * np.maximum(root, 1e-9))
         return costs * ndtr(-root / 2), (costs * slope)[:, None, None]

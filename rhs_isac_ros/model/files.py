@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic writing of files."""
 
 import os
 import tempfile
@@ -8,32 +8,27 @@ from typing import BinaryIO
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
-    """Write a file aside and rename it: at no time is it there in part.
+    """Write a temporary file and rename it, so that the file never exists in part.
 
-    Parameters
-    ----------
-    path
-        The file.
-    content
-        All of it, or a function that writes it to a stream.
+    The content is complete, or a callable that writes it to a binary stream.
 
     Raises
     ------
     OSError
-        If it cannot be written; an old file is kept.
+        If the file cannot be written; an existing file is left as it was.
     """
     path = Path(path)
-    descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
     try:
         with os.fdopen(descriptor, 'wb') as stream:
             if callable(content):
                 content(stream)
             else:
                 stream.write(content.encode() if isinstance(content, str) else content)
-        os.chmod(aside, 0o644)
-        os.replace(aside, path)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
     except BaseException:
-        os.unlink(aside)
+        os.unlink(temporary)
         raise
 
 

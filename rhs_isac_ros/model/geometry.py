@@ -1,4 +1,4 @@
-"""Where elements and feeds lie, and the frequencies of the sub-bands."""
+"""Positions of the elements and feeds, and centre frequencies of the sub-bands."""
 
 import functools
 
@@ -8,45 +8,18 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
 
 def mean_wavelength_m(scenario: Scenario) -> float:
-    """Mean wavelength of the bands' centre frequencies.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    float
-        lambda_avr [m], the paper's Section V.
-    """
+    """Return lambda_avr [m], the mean wavelength of the bands' centres (Section V)."""
     return float(np.mean(SPEED_OF_LIGHT_MPS / np.array(scenario.center_frequencies_hz)))
 
 
 def element_interval_m(scenario: Scenario) -> float:
-    """Interval between neighbouring elements.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    float
-        Delta_E [m].
-    """
+    """Return the interval Delta_E [m] between neighbouring elements."""
     return scenario.element_interval_wavelengths * mean_wavelength_m(scenario)
 
 
 @functools.lru_cache(maxsize=16)
 def element_positions(scenario: Scenario) -> np.ndarray:
-    """Positions of the elements in the plane x = 0, centred on the origin.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
+    """Compute the positions of the elements in the plane x = 0, centred on the origin.
 
     Returns
     -------
@@ -63,18 +36,9 @@ def element_positions(scenario: Scenario) -> np.ndarray:
 
 
 def feed_positions(scenario: Scenario) -> np.ndarray:
-    """Positions of the feeds.
+    """Return the positions of the feeds, float64 [K, 3] [m].
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [K, 3] [m]: the scenario's, or K places spread evenly over the horizontal centre
-        line of the board.
+    Unless the scenario specifies them, they are evenly spaced on the horizontal centre line.
     """
     if scenario.feed_positions_m is not None:
         return np.array(scenario.feed_positions_m)
@@ -87,20 +51,9 @@ def feed_positions(scenario: Scenario) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def subband_frequencies_hz(scenario: Scenario) -> np.ndarray:
-    """Centre frequencies of the sub-bands.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    numpy.ndarray
-        f_{i,j}, float64 [N_B, N_SB] [Hz], read-only.
-    """
+    """Compute the sub-bands' centre frequencies f_{i,j}, float64 [N_B, N_SB] [Hz], read-only."""
     centers = np.array(scenario.center_frequencies_hz)[:, None]
     offsets = np.arange(scenario.n_subbands) - (scenario.n_subbands - 1) / 2
-    frequencies = centers + offsets * scenario.subband_width_hz
+    frequencies: np.ndarray = centers + offsets * scenario.subband_width_hz
     frequencies.flags.writeable = False
     return frequencies

@@ -1,4 +1,7 @@
-"""The multipath: spatial covariance, correlation over sub-bands and frames, random gains."""
+"""Multipath: spatial covariance, correlation over sub-bands and frames, random gains.
+
+Indices of bands, sub-bands and frames start at 0. Bands are independent.
+"""
 
 import functools
 
@@ -8,7 +11,7 @@ from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
-# Gauss-Legendre nodes on a quarter of the angular domain, where the profile is smooth.
+# Gauss-Legendre nodes on the quarter of the angular domain in which the profile is smooth.
 _ANGLE_NODES = 160
 # Nodes along each side of the region of interest, where 1 / r^2 is smooth.
 _ROI_NODES = 24
@@ -21,17 +24,8 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     The power-angle profile is a product of two Laplacians of `angular_spread_deg`, normalised
     over the half space in front of the surface and scaled by the mean line-of-sight power in the
     region of interest. It is even in azimuth and elevation, which makes the covariance real, and
-    it depends on the elements' lattice offsets only. A pattern of the elements weighs the profile.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    numpy.ndarray
-        V_i, complex128 [N_B, N_E, N_E], read-only.
+    it depends on the elements' lattice offsets only. A gain pattern of the elements weights the
+    profile. Returns V_i, complex128 [N_B, N_E, N_E], read-only.
     """
     side = scenario.elements_per_side
     azimuth, weights = _profile_quadrature(scenario)
@@ -60,20 +54,10 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
 
 
 def mean_los_power(scenario: Scenario, band: int) -> float:
-    """Mean power gain of the line of sight in the region of interest, for unit element gain.
+    """Compute the mean line-of-sight power gain in the region of interest, for g^E = 1.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    band
-        Index of the band, from 0.
-
-    Returns
-    -------
-    float
-        Mean of (v_0 g^U / (4 pi f_c,i r))^2, r being the distance from the surface's centre; a
-        pattern g^U is taken at the angle from there.
+    This is the mean of (v_0 g^U / (4 pi f_c,i r))^2, with the distance r from the surface's
+    centre. A gain pattern g^U is evaluated at the angle from the boresight there.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
     low, high = scenario.roi_bounds_m
@@ -90,120 +74,78 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
 
 def frequency_correlation(
         scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (3). Correlation of the multipath gains of two sub-bands.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    band
-        Index of the band, from 0.
-    first, second
-        Indices of sub-bands, from 0, of shapes that broadcast.
-
-    Returns
-    -------
-    numpy.ndarray
-        rho_f, complex128, of the broadcast shape.
-    """
+    """Implements Eq. (3). Correlation rho_f of sub-bands, complex128; indices may broadcast."""
     frequencies = subband_frequencies_hz(scenario)[band]
     difference = frequencies[first] - frequencies[second]
-    return 1 / (1 + 2j * np.pi * scenario.delay_spread_s * difference)
+    correlation: np.ndarray = 1 / (1 + 2j * np.pi * scenario.delay_spread_s * difference)
+    return correlation
 
 
 def time_correlation(
         scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (4). Correlation of the multipath gains of two frames.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    band
-        Index of the band, from 0.
-    first, second
-        Indices of frames, from 0, of shapes that broadcast.
-
-    Returns
-    -------
-    numpy.ndarray
-        rho_t, float64, of the broadcast shape.
-    """
+    """Implements Eq. (4). Correlation rho_t of frames, float64; indices may broadcast."""
     center_hz = scenario.center_frequencies_hz[band]
     doppler_hz = scenario.max_user_speed_mps * center_hz / SPEED_OF_LIGHT_MPS
     lag_s = (np.asarray(first) - np.asarray(second)) * scenario.frame_duration_s
-    # Here, as in all that every node imports: SciPy takes longer to load than ROS.
+    # Every node imports this module, and SciPy takes longer to load than ROS.
     from scipy.special import j0
 
-    return j0(2 * np.pi * doppler_hz * lag_s)
+    correlation: np.ndarray = j0(2 * np.pi * doppler_hz * lag_s)
+    return correlation
+
+
+@functools.lru_cache(maxsize=16)
+def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Implements Eq. (15). Correlation of the multipath over sub-bands and over frames.
+
+    Returns K_f, complex128 [N_B, N_SB, N_SB], and K_t, float64 [N_B, F, F]; read-only.
+    """
+    subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
+    bands = range(scenario.n_bands)
+    over_frequency = np.stack(
+        [frequency_correlation(scenario, i, subbands[:, None], subbands) for i in bands])
+    over_time = np.stack([time_correlation(scenario, i, frames[:, None], frames) for i in bands])
+    over_frequency.flags.writeable = over_time.flags.writeable = False
+    return over_frequency, over_time
+
+
+@functools.lru_cache(maxsize=16)
+def measurement_correlation(scenario: Scenario) -> np.ndarray:
+    """Compute the correlation K_ft over all measurements, complex128 [N_B, N_SB F, N_SB F].
+
+    Rows and columns are sub-band-major; the array is read-only.
+    """
+    pairs = zip(*correlation_matrices(scenario), strict=True)
+    correlation = np.stack([np.kron(over_f, over_t) for over_f, over_t in pairs])
+    correlation.flags.writeable = False
+    return correlation
 
 
 @functools.lru_cache(maxsize=16)
 def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Square roots of the covariances, from which gains are drawn.
+    """Compute the factors with which `draw_multipath` correlates the gains.
 
-    Parameters
-    ----------
-    scenario
-        The scenario.
-
-    Returns
-    -------
-    tuple
-        For each band G [N_E, r] with G G^H = V_i, and L [N_SB F, s] with L L^H the correlation of
-        the measurements (sub-band-major); r and s are the numerical ranks.
+    For each band, these are G [N_E, r] with G G^H = V_i, and L [N_SB F, s] with L L^H = K_ft;
+    r and s are the numerical ranks.
     """
-    subbands, frames = np.divmod(
-        np.arange(scenario.n_subbands * scenario.n_frames), scenario.n_frames)
-    factors = []
-    for band, covariance in enumerate(multipath_covariance(scenario)):
-        correlation = frequency_correlation(scenario, band, subbands[:, None], subbands)
-        correlation = correlation * time_correlation(scenario, band, frames[:, None], frames)
-        factors.append((_square_root(covariance), _square_root(correlation)))
-    return tuple(factors)
+    pairs = zip(multipath_covariance(scenario), measurement_correlation(scenario), strict=True)
+    return tuple((_square_root(spatial), _square_root(correlation))
+                 for spatial, correlation in pairs)
 
 
 def draw_multipath(
         scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw multipath gains of independent positioning phases.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    band
-        Index of the band, from 0. Bands are independent.
-    n
-        Number of independent realisations.
-    rng
-        Source of randomness.
-
-    Returns
-    -------
-    numpy.ndarray
-        h^MP, complex128 [n, N_SB F, N_E], rows sub-band-major.
-    """
-    spatial, row_factor = multipath_factors(scenario)[band]
-    white = complex_normal((n, row_factor.shape[1], spatial.shape[1]), rng)
-    return row_factor @ (white @ spatial.T)
+    """Draw multipath gains h^MP of n independent phases, complex128 [n, N_SB F, N_E]."""
+    spatial, over_rows = multipath_factors(scenario)[band]
+    white = complex_normal((n, over_rows.shape[1], spatial.shape[1]), rng)
+    gains: np.ndarray = over_rows @ (white @ spatial.T)
+    return gains
 
 
 def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Draw circular complex normal numbers of unit variance.
-
-    Parameters
-    ----------
-    shape
-        Shape of the result.
-    rng
-        Source of randomness.
-
-    Returns
-    -------
-    numpy.ndarray
-        Complex128 array of that shape.
-    """
-    return rng.standard_normal((*shape, 2)).view(complex)[..., 0] * np.sqrt(0.5)
+    """Draw circularly symmetric complex normal numbers of unit variance, complex128."""
+    numbers: np.ndarray = rng.standard_normal((*shape, 2)).view(complex)[..., 0] * np.sqrt(0.5)
+    return numbers
 
 
 def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +153,7 @@ def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
     angles = (nodes + 1) * np.pi / 4
     spread = np.deg2rad(scenario.angular_spread_deg)
-    # The cusp at zero is an end of the interval. A narrow profile gets its nodes where it lives.
+    # The cusp at zero is an end of the interval, and a narrow profile shortens the interval.
     reach = min(1.0, 30 * spread / (np.pi / 2))
     angles = angles * reach
     density = weights * np.exp(-np.sqrt(2) * angles / spread)
@@ -219,9 +161,9 @@ def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _square_root(matrix: np.ndarray) -> np.ndarray:
-    """Return R with R R^H = matrix, without the directions that rounding alone makes."""
+    """Return R with R R^H = matrix, without eigenvectors that are due to rounding alone."""
     values, vectors = np.linalg.eigh(matrix)
     keep = values > values[-1] * len(values) * np.finfo(float).eps
-    root = vectors[:, keep] * np.sqrt(values[keep])
+    root: np.ndarray = vectors[:, keep] * np.sqrt(values[keep])
     root.flags.writeable = False
     return root

@@ -1,4 +1,4 @@
-"""The scenario: every number that the model depends on, declared once."""
+"""The scenario: all parameters of the model, with their ranges and units."""
 
 import dataclasses
 import functools
@@ -33,8 +33,8 @@ class Scenario:
     Lengths are in metres in the frame ``map``: the surface lies in the plane x = 0, centred on
     the origin, with x pointing outward and z up.
 
-    A gain is a number, or a pattern: a function of the angle from the boresight, a `GainPattern`,
-    or the name of one that is installed as a plug-in, which is what a file can hold.
+    A gain is a number, a `GainPattern`, a function of the angle from the boresight, or the name
+    of an installed plug-in. Files can hold numbers and names only.
 
     Raises
     ------
@@ -46,7 +46,7 @@ class Scenario:
         (2.5e9, 3.0e9), 1e6, 1e13, 'Centre frequency f_c,i of each band.', 'Hz')
     n_subbands: int = _field(8, 1, 4096, 'Sub-bands N_SB of each band.')
     subband_width_hz: float = _field(125e3, 1.0, 1e10, 'Width W of a sub-band.', 'Hz')
-    n_frames: int = _field(4, 1, 4096, 'FrameBuffer F of each band.')
+    n_frames: int = _field(4, 1, 4096, 'Frames F of each band.')
     frame_duration_s: float = _field(4e-6, 1e-12, 1.0, 'Duration of a frame.', 's')
     elements_per_side: int = _field(10, 1, 128, 'Elements along one side of the square surface.')
     element_interval_wavelengths: float = _field(
@@ -72,7 +72,7 @@ class Scenario:
         (10.0, 10.0, 2.0), 1e-6, 1e6, 'Side lengths of the region of interest.', 'm')
 
     def __post_init__(self) -> None:
-        """Bring every field to its declared type and check it."""
+        """Convert every field to its declared type and check it."""
         for field in dataclasses.fields(self):
             value = _checked(field, getattr(self, field.name))
             object.__setattr__(self, field.name, value)
@@ -94,24 +94,16 @@ class Scenario:
     def from_yaml(cls, path: str | Path) -> 'Scenario':
         """Read a scenario from a YAML file that maps field names to values.
 
-        Parameters
-        ----------
-        path
-            The file. Fields it leaves out keep their defaults.
-
-        Returns
-        -------
-        Scenario
-            The scenario of the file.
+        Fields that are not in the file have their defaults.
 
         Raises
         ------
         ScenarioError
-            If the file cannot be read, is no mapping, names an unknown field or holds a bad value.
+            If the file cannot be read, is not a mapping, or has an unknown field or invalid value.
         """
         try:
             content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-        # YAML's own errors, and what it raises for bytes and dates that are none.
+        # PyYAML also raises ValueError, for invalid bytes and dates.
         except (OSError, ValueError, yaml.YAMLError) as error:
             reason = ' '.join(str(error).split())
             raise ScenarioError(f'{path}: cannot be read: {reason}') from error
@@ -128,13 +120,9 @@ class Scenario:
             raise ScenarioError(f'{path}: {error}') from None
 
     def changes(self) -> dict[str, Any]:
-        """Return what differs from Table I.
+        """Return the fields that differ from Table I, as values that `from_yaml` can read.
 
-        Returns
-        -------
-        dict
-            Values by field names, in the form that `from_yaml` reads; a pattern with its digest.
-            One that is no plug-in can be told apart, but not read.
+        Gain patterns have their digest. A pattern that is no plug-in cannot be read again.
         """
         return {field.name: _plain(value) for field in dataclasses.fields(self)
                 if (value := getattr(self, field.name)) != field.default}
@@ -169,20 +157,7 @@ class Scenario:
         return bounds
 
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw positions uniformly from the region of interest.
-
-        Parameters
-        ----------
-        n
-            How many.
-        rng
-            Source of randomness.
-
-        Returns
-        -------
-        numpy.ndarray
-            Positions, float64 [n, 3] [m].
-        """
+        """Draw positions uniformly from the region of interest, float64 [n, 3] [m]."""
         low, high = self.roi_bounds_m
         return rng.uniform(low, high, size=(n, 3))
 
@@ -193,7 +168,7 @@ def _plain(value: Any) -> Any:
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
-def _checked(field: dataclasses.Field, value: Any) -> Any:
+def _checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """Return a field's value in its declared type, or raise ScenarioError."""
     name = field.name
     if name == 'feed_positions_m':
@@ -203,14 +178,15 @@ def _checked(field: dataclasses.Field, value: Any) -> Any:
     if field.type is int or isinstance(field.default, int):
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
             raise ScenarioError(f'{name}: {value!r}, expected an integer')
-        return _in_range(field, int(value))
+        _check_range(field, int(value))
+        return int(value)
     if isinstance(field.default, tuple):
         length = None if name == 'center_frequencies_hz' else 3
         return _numbers(field, value, length)
     return _number(field, value)
 
 
-def _gain(field: dataclasses.Field, value: Any) -> float | GainPattern:
+def _gain(field: dataclasses.Field[Any], value: Any) -> float | GainPattern:
     try:
         if isinstance(value, GainPattern) or callable(value):
             return value if isinstance(value, GainPattern) else GainPattern(value)
@@ -229,38 +205,38 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _vectors(field: dataclasses.Field, value: Any) -> tuple[tuple[float, ...], ...]:
+def _vectors(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[float, ...], ...]:
     if not isinstance(value, list | tuple | np.ndarray) or len(value) == 0:
         raise ScenarioError(f'{field.name}: {value!r}, expected a list of [x, y, z]')
     return tuple(_numbers(field, row, 3) for row in value)
 
 
-def _numbers(field: dataclasses.Field, value: Any, length: int | None) -> tuple[float, ...]:
-    wanted = 'a list of numbers' if length is None else f'a list of {length} numbers'
+def _numbers(field: dataclasses.Field[Any], value: Any, length: int | None) -> tuple[float, ...]:
+    expected = 'a list of numbers' if length is None else f'a list of {length} numbers'
     if not isinstance(value, list | tuple | np.ndarray) or len(value) == 0:
-        raise ScenarioError(f'{field.name}: {value!r}, expected {wanted}')
+        raise ScenarioError(f'{field.name}: {value!r}, expected {expected}')
     if length is not None and len(value) != length:
-        raise ScenarioError(f'{field.name}: {len(value)} values, expected {wanted}')
+        raise ScenarioError(f'{field.name}: {len(value)} values, expected {expected}')
     return tuple(_number(field, entry) for entry in value)
 
 
-def _number(field: dataclasses.Field, value: Any) -> float:
-    # YAML reads 28e9 as a string: take what float() understands.
+def _number(field: dataclasses.Field[Any], value: Any) -> float:
+    # YAML reads 28e9 as a string, so that strings must be accepted.
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ScenarioError(f'{field.name}: {value!r}, expected a number') from None
     if isinstance(value, bool) or not math.isfinite(number):
         raise ScenarioError(f'{field.name}: {value!r}, expected a finite number')
-    return _in_range(field, number)
+    _check_range(field, number)
+    return number
 
 
-def _in_range(field: dataclasses.Field, value: float) -> Any:
+def _check_range(field: dataclasses.Field[Any], value: float) -> None:
     low, high = field.metadata['low'], field.metadata['high']
     if not low <= value <= high:
         unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''
-        # Not every integer fits a float.
+        # Integers may be too large for a float.
         shown = value if isinstance(value, int) else f'{value:g}'
         raise ScenarioError(
             f'{field.name}: {shown}{unit}, expected {low:g} to {high:g}{unit}')
-    return value

@@ -1,4 +1,4 @@
-"""Checking arrays against the sizes of a scenario."""
+"""Checks of array shapes against the sizes of a scenario."""
 
 import numpy as np
 
@@ -6,23 +6,12 @@ from rhs_isac_ros.model.scenario import Scenario
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Check that an array has the sizes of a scenario.
-
-    Parameters
-    ----------
-    name
-        What to call it in an error.
-    array
-        The array.
-    symbols
-        Its dimensions, symbols of `Scenario.sizes` with blanks between them.
-    scenario
-        The scenario.
+    """Check that an array has the dimensions `symbols`: keys of `Scenario.sizes` with blanks.
 
     Raises
     ------
     ValueError
-        If the shape is another one; the text names it and what was expected.
+        If the shape differs. The message gives the actual and the expected shape.
     """
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:

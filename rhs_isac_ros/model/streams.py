@@ -1,4 +1,4 @@
-"""Random generators that depend on what they are for, not on when they are used."""
+"""Random generators that depend on their purpose, not on the order in which they are used."""
 
 import numpy as np
 
@@ -7,20 +7,9 @@ import numpy as np
 
 
 def generator(seed: int, stream: int, *key: int) -> np.random.Generator:
-    """Make the generator of one purpose.
+    """Create a generator that yields the same sequence for the same arguments.
 
-    Parameters
-    ----------
-    seed
-        Seed of the run.
-    stream
-        The purpose, one of this module's constants.
-    *key
-        What tells its uses apart, such as user and cycle; not negative.
-
-    Returns
-    -------
-    numpy.random.Generator
-        The same sequence for the same arguments.
+    `stream` is one of the constants of this module. Further non-negative integers, such as user
+    and cycle, distinguish the uses of a stream.
     """
     return np.random.default_rng([seed, stream, *key])

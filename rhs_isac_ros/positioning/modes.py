@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import information_of
+from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable, separate
@@ -108,11 +108,11 @@ def _local_model(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Curvature [M, 3, 3], gradient [M, 3] and value [M] of the log-likelihood, polar."""
     n = len(points)
-    mean, by_position = model.mean_and_derivative(to_positions(points))
+    mean, by_position = model.mean_and_jacobian(to_positions(points))
     # Re(a^H b) is the inner product of real and imaginary parts.
     residual = (whitened - mean).reshape(n, -1).view(float)
     derivative = by_position.reshape(n, 3, -1).view(float)
     derivative = np.matmul(np.swapaxes(jacobian(points), 1, 2), derivative)
-    curvature = information_of(derivative.view(complex)) + np.diag(MIN_CURVATURE)
+    curvature = quadratic_form(derivative.view(complex)) + np.diag(MIN_CURVATURE)
     gradient = 2 * np.matmul(derivative, residual[..., None])[..., 0]
     return curvature, gradient, -np.sum(residual**2, axis=1)

@@ -1,14 +1,12 @@
-"""Pairs of positions and received signals: for training, and to measure estimators with."""
+"""Simulated pairs of positions and received signals, to train and to measure estimators."""
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import covariance
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, mean_received, streams
-from rhs_isac_ros.model.multipath import complex_normal
-from rhs_isac_ros.model.surface import radiation_matrix
+from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 
-# Pairs that share a random generator and every matrix product: part of what a seed means.
+# Pairs that share a random generator and every matrix product. A seed yields other pairs with
+# another size.
 _CHUNK = 512
 
 
@@ -17,21 +15,15 @@ def simulate_pairs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate positioning phases at random positions of the region of interest.
 
-    A seed stands for one endless sequence of pairs, of which this returns a part, bit for bit the
-    same however the sequence is cut. Multipath and noise are drawn as the signals see them, with
-    the covariance of Eq. (14); `simulate_received` draws every element's gain, for the same
-    distribution in a hundred times the time.
+    A seed stands for one endless sequence of pairs. This returns a part of it, bit for bit the
+    same however the sequence is divided. Signals are drawn by `MeasurementModel.sample`.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    codebook
-        The codebook.
     n
-        How many pairs.
+        Number of pairs.
     seed
-        Which sequence.
+        Number of the sequence.
     first
         Index of the first pair in the sequence.
 
@@ -53,19 +45,16 @@ def simulate_pairs(
         if value < 0:
             raise ValueError(f'{name}: {value}, expected 0 or more')
     codebook.check(scenario)
-    roots = np.linalg.cholesky(covariance(scenario, radiation_matrix(scenario, codebook)))
+    model = MeasurementModel(scenario, codebook)
     positions = np.empty((n, 3))
-    received = np.empty((n, *roots.shape[:2]), complex)
+    received = np.empty((n, *model.shape), complex)
     for chunk in range(first // _CHUNK, -(-(first + n) // _CHUNK)):
         begin = chunk * _CHUNK
         part = slice(max(first - begin, 0), min(first + n - begin, _CHUNK))
-        place = slice(begin + part.start - first, begin + part.stop - first)
-        # The whole chunk, whatever the part: rounding in products depends on their sizes.
+        target = slice(begin + part.start - first, begin + part.stop - first)
+        # Always the whole chunk, because rounding in products depends on their sizes.
         rng = streams.generator(seed, streams.PHASES, chunk)
-        there = scenario.sample_positions(_CHUNK, rng)
-        random = complex_normal((_CHUNK, *roots.shape[:2]), rng)
-        signals = mean_received(scenario, codebook, there)
-        for band, root in enumerate(roots):
-            signals[:, band] += random[:, band] @ root.T
-        positions[place], received[place] = there[part], signals[part]
+        drawn = scenario.sample_positions(_CHUNK, rng)
+        positions[target] = drawn[part]
+        received[target] = model.sample(drawn, rng)[part]
     return positions, received

@@ -6,7 +6,7 @@ range, so that a coarse grid suffices.
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import information_of
+from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 from rhs_isac_ros.positioning.polar import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.whitened import WhitenedModel
@@ -50,7 +50,7 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
     wavenumbers = carrier_wavenumbers(model.scenario)
     for start in range(0, n, _BLOCK):
         block = slice(start, start + _BLOCK)
-        mean, by_position = model.mean_and_derivative(to_positions(points[block]))
+        mean, by_position = model.mean_and_jacobian(to_positions(points[block]))
         by_point = np.matmul(
             np.swapaxes(jacobian(points[block]), 1, 2), by_position.reshape(len(mean), 3, -1))
         carrier = np.exp(1j * wavenumbers * points[block, :1])[..., None]
@@ -60,7 +60,7 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
         flat = mean.reshape(len(mean), -1)
         table['energy'][block] = np.sum(np.abs(flat)**2, axis=1)
         table['energy_slope'][block] = 2 * np.matmul(by_point.conj(), flat[..., None])[..., 0].real
-        table['curvature'][block] = information_of(by_point)
+        table['curvature'][block] = quadratic_form(by_point)
     return table
 
 

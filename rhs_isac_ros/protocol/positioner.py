@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds import Factors, crlb, factor
+from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import Estimator, SignalError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.codebook_cache import CodebookCache
@@ -43,7 +43,7 @@ class _Made(NamedTuple):
     """An estimator, what it was made of, and what tells its bound."""
 
     job: _Job
-    factors: Factors
+    model: MeasurementModel
     estimator: Estimator
 
 
@@ -155,7 +155,8 @@ class Positioner(PlainRole):
         is_wanted = job.settings == self._settings.newest
         if not is_wanted and codebook.id in self._estimators:
             return []
-        self._estimators.put(codebook.id, _Made(job, factor(self._scenario, codebook), estimator))
+        model = MeasurementModel(self._scenario, codebook).prepare()
+        self._estimators.put(codebook.id, _Made(job, model, estimator))
         self._settings.in_use = job.settings
         return [LogMessage(f'{estimator.name} is ready for codebook {codebook.id} after '
                      f'{elapsed_s:.1f} s')]
@@ -197,7 +198,7 @@ class Positioner(PlainRole):
         return []
 
     def _locate(self, received: m.ReceivedSignals) -> list[Action]:
-        job, factors, estimator = self._estimators.take(received.codebook_id)
+        _, model, estimator = self._estimators.take(received.codebook_id)
         begin = self._stopwatch()
         signals = received.signals.reshape(len(received.signals), -1)
         try:
@@ -208,7 +209,7 @@ class Positioner(PlainRole):
         if not estimate.fix:
             return self._no_fix(received, estimate.reason)
         self._is_lost = False
-        bound = float(crlb(self._scenario, job.codebook, estimate.mean[None], factors)[0])
+        bound = float(crlb_of(model, estimate.mean[None])[0])
         return [Send(m.PositionEstimate(
             received.cycle_id, received.user, received.codebook_id,
             np.array(estimate.mean), np.array(estimate.covariance), bound, estimator.name,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import compressed_rows, rows
+from rhs_isac_ros.bounds import compressed_rows, measurement_rows
 from rhs_isac_ros.bounds.average import Average, Gradient
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -27,19 +27,19 @@ def faded(random_beams):
 
 @pytest.fixture(scope='module', params=[1, 2, 3], ids='{} rows'.format)
 def items(request):
-    """Rows of some items, complex [N_ITEMS, G, N_B, N_SB, N_E], of nothing in particular."""
+    """Random rows, complex [N_ITEMS, G, N_B, N_SB, N_E]."""
     return 1e-4 * complex_array(np.random.default_rng(request.param), N_ITEMS, request.param,
                                 2, 3, 9)
 
 
 def make(scenario, items, loss, tolerance=0.0):
     return Average(
-        scenario, lambda start, stop, band: items[start:stop, :, band], N_ITEMS, items.shape[1],
+        scenario, lambda block, band: items[block, :, band], N_ITEMS, items.shape[1],
         loss, tolerance)
 
 
 def plain_forms(p, items, spatial):
-    """The forms [N_ITEMS, G, G] by their definition, one number at a time."""
+    """The forms [N_ITEMS, G, G] by their definition."""
     n_items, n_rows, n_bands = items.shape[:3]
     forms = np.zeros((n_items, n_rows, n_rows))
     for i in range(n_bands):
@@ -52,7 +52,7 @@ def plain_forms(p, items, spatial):
 
 @pytest.fixture(scope='module')
 def loss(items):
-    """Other for every item: the product of its matrix and the form, plus log(1 + trace)."""
+    """Product of the form and a matrix of the item, plus log(1 + trace)."""
     roots = np.random.default_rng(4).normal(size=(N_ITEMS, *[items.shape[1]] * 2))
     matrices = roots + np.swapaxes(roots, 1, 2)
 
@@ -109,7 +109,7 @@ def test_gradients_are_the_limit_of_differences_of_the_plain_average(
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
-def test_value_alone_is_that_with_gradients(faded, items, loss, tolerance):
+def test_value_alone_equals_the_value_with_gradients(faded, items, loss, tolerance):
     scenario, codebook = faded
     average = make(scenario, items, loss, tolerance)
     value = average.value(codebook)
@@ -122,17 +122,17 @@ def test_value_alone_is_that_with_gradients(faded, items, loss, tolerance):
 @pytest.mark.parametrize('size', [1, 3, 7])
 def test_results_do_not_depend_on_the_blocks(
         faded, items, loss, monkeypatch, tolerance, size):
-    """With the last block shorter, equal or the only one; the loss knows its items."""
+    """The last block is shorter, of equal size, or the only one; the loss depends on the item."""
     scenario, codebook = faded
     expected = make(scenario, items, loss)(codebook)
-    monkeypatch.setattr(rows, '_BLOCK', size)
+    monkeypatch.setattr(measurement_rows, '_BLOCK', size)
     average = make(scenario, items, loss, tolerance)
-    assert len(list(rows.blocks(average.rows.n_items))) == -(-N_ITEMS // size)
+    assert len(list(measurement_rows.blocks(average.rows.n_items))) == -(-N_ITEMS // size)
     assert_is(average(codebook), expected, max(1e-12, 10 * tolerance))
     assert average.value(codebook) == pytest.approx(expected.value, rel=max(1e-12, 10 * tolerance))
 
 
-def test_the_next_codebook_is_not_affected_by_the_last(faded, items, loss, random_beams):
+def test_evaluations_do_not_affect_each_other(faded, items, loss, random_beams):
     scenario, codebook = faded
     average = make(scenario, items, loss)
     expected = average(codebook)
@@ -151,9 +151,9 @@ def test_a_constant_loss_has_its_value_and_no_gradient(faded, items):
     np.testing.assert_array_equal(by_digital, 0)
 
 
-def test_the_loss_gets_every_item_once_and_in_order(faded, items, plain, monkeypatch):
+def test_the_loss_receives_every_item_once_and_in_order(faded, items, plain, monkeypatch):
     scenario, codebook = faded
-    monkeypatch.setattr(rows, '_BLOCK', 3)
+    monkeypatch.setattr(measurement_rows, '_BLOCK', 3)
     seen = []
 
     def record(block, forms):
@@ -172,11 +172,11 @@ def test_the_loss_gets_every_item_once_and_in_order(faded, items, plain, monkeyp
 
 def test_rows_are_exact_unless_there_is_a_tolerance(faded, items, loss):
     scenario, _ = faded
-    assert isinstance(make(scenario, items, loss).rows, rows.ExactRows)
+    assert isinstance(make(scenario, items, loss).rows, measurement_rows.ExactRows)
     assert isinstance(make(scenario, items, loss, 1e-3).rows, compressed_rows.CompressedRows)
 
 
 @pytest.mark.parametrize('tolerance', [compressed_rows.MIN_TOLERANCE / 2, -1.0, -0.1, np.nan])
-def test_a_tolerance_that_cannot_be_held_is_an_error(faded, items, loss, tolerance):
+def test_a_tolerance_out_of_range_is_an_error(faded, items, loss, tolerance):
     with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
         make(faded[0], items, loss, tolerance)

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import AverageCrlb, average_crlb, crlb, rows
+from rhs_isac_ros.bounds import AverageCrlb, average_crlb, crlb, measurement_rows
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 
-def assert_is_the_vectors(outcome, vectors, tolerance=1e-8, value_tolerance=1e-8):
+def assert_matches_vectors(outcome, vectors, tolerance=1e-8, value_tolerance=1e-8):
     value, by_analog, by_digital = outcome
     assert value == pytest.approx(float(vectors['average_crlb']), rel=value_tolerance)
     for actual, expected in ((by_analog, vectors['grad_analog']),
@@ -23,32 +23,32 @@ def assert_is_the_vectors(outcome, vectors, tolerance=1e-8, value_tolerance=1e-8
             actual, expected, rtol=tolerance, atol=tolerance * scale)
 
 
-def test_value_and_gradients_are_the_vectors(case):
+def test_value_and_gradients_match_the_vectors(case):
     outcome = average_crlb(case.scenario, case.codebook, case.vectors['positions'])
     assert type(outcome.value) is float
-    assert_is_the_vectors(outcome, case.vectors)
+    assert_matches_vectors(outcome, case.vectors)
     value = AverageCrlb(case.scenario, case.vectors['positions']).value(case.codebook)
     assert type(value) is float
     assert value == pytest.approx(float(case.vectors['average_crlb']), rel=1e-8)
 
 
-def test_evaluating_again_changes_nothing(case):
+def test_evaluations_are_repeatable(case):
     average = AverageCrlb(case.scenario, case.vectors['positions'])
     for _ in range(2):
-        assert_is_the_vectors(average(case.codebook), case.vectors)
+        assert_matches_vectors(average(case.codebook), case.vectors)
 
 
 def test_result_does_not_depend_on_the_blocks(case, monkeypatch):
-    monkeypatch.setattr(rows, '_BLOCK', 4)
-    assert_is_the_vectors(
+    monkeypatch.setattr(measurement_rows, '_BLOCK', 4)
+    assert_matches_vectors(
         average_crlb(case.scenario, case.codebook, case.vectors['positions']), case.vectors)
 
 
 @pytest.mark.parametrize('tolerance', [1e-7, 1e-6, 1e-5, 1e-4])
-def test_compressed_rows_give_the_vectors_to_a_multiple_of_their_tolerance(case, tolerance):
-    """The bound is about the directions of which the signals tell little: errors grow."""
+def test_compressed_rows_match_the_vectors_to_a_multiple_of_the_tolerance(case, tolerance):
+    """The bound depends most on directions with little information, which amplifies errors."""
     average = AverageCrlb(case.scenario, case.vectors['positions'], tolerance)
-    assert_is_the_vectors(average(case.codebook), case.vectors, 2000 * tolerance, 50 * tolerance)
+    assert_matches_vectors(average(case.codebook), case.vectors, 2000 * tolerance, 50 * tolerance)
 
 
 # N_B, N_SB, F, K, elements along a side.
@@ -76,7 +76,7 @@ def test_gradients_are_the_limit_of_differences_of_plain_bounds(
     analog, digital = codebook.analog, codebook.digital
     assert value == pytest.approx(bound(analog, digital), rel=1e-7)
     size, scale, step = np.linalg.norm(analog), np.linalg.norm(digital), 1e-5
-    # One feed's weights hardly count, next to rounding in the bound itself.
+    # The weights of a single feed have little effect compared with rounding in the bound.
     slack = 1e-6 * value
     for _ in range(2):
         way = rng.normal(size=analog.shape)
@@ -92,7 +92,7 @@ def test_gradients_are_the_limit_of_differences_of_plain_bounds(
 
 
 def test_value_is_the_mean_over_the_positions(small):
-    """The vectors hold the bound of every position; any choice of them has their mean."""
+    """The vectors contain the bound of every position."""
     average = AverageCrlb(small.scenario, small.vectors['positions'][[4, 1, 1]])
     expected = small.vectors['crlb'][[4, 1, 1]].mean()
     assert average(small.codebook).value == pytest.approx(expected, rel=1e-8)
@@ -107,8 +107,8 @@ def test_value_is_the_mean_of_the_bounds_of_many_positions(small):
         assert average(small.codebook).value == pytest.approx(expected, rel=allowed)
 
 
-def test_a_common_phase_of_a_frame_changes_nothing(small):
-    """So the gradient has no part along it; noise and multipath are circular."""
+def test_the_value_does_not_depend_on_a_common_phase_of_a_frame(small):
+    """Noise and multipath are circular, so the gradient has no component along the phase."""
     value, _, by_digital = average_crlb(
         small.scenario, small.codebook, small.vectors['positions'])
     turned = dataclasses.replace(
@@ -139,6 +139,6 @@ def test_malformed_positions_are_errors(small, positions):
 
 
 @pytest.mark.parametrize('tolerance', [1e-8, -1e-3, np.nan])
-def test_a_tolerance_that_cannot_be_held_is_an_error(small, tolerance):
+def test_a_tolerance_out_of_range_is_an_error(small, tolerance):
     with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1'):
         AverageCrlb(small.scenario, small.vectors['positions'], tolerance)

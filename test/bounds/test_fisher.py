@@ -1,32 +1,21 @@
-"""Covariance, Fisher information and the bound."""
+"""Fisher information and the bound."""
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import crlb, fisher, fisher_information
+from rhs_isac_ros.bounds import (
+    crlb,
+    crlb_of,
+    fisher,
+    fisher_information,
+    fisher_information_of,
+)
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.los import los_derivative
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.model.surface import radiation_matrix
 
 
-def test_correlation_matrices_are_the_vectors(case):
-    over_frequency, over_time = fisher.correlation_matrices(case.scenario)
-    np.testing.assert_allclose(over_frequency, case.vectors['K_f'], rtol=1e-8)
-    np.testing.assert_allclose(over_time, case.vectors['K_t'], rtol=1e-8)
-    assert not over_frequency.flags.writeable
-    assert not over_time.flags.writeable
-
-
-def test_covariance_is_the_vectors(case):
-    patterns = radiation_matrix(case.scenario, case.codebook)
-    covariance = fisher.covariance(case.scenario, patterns)
-    scale = np.abs(case.vectors['cov']).max()
-    np.testing.assert_allclose(covariance, case.vectors['cov'], rtol=1e-8, atol=1e-8 * scale)
-
-
-def test_information_and_bound_are_the_vectors(case):
+def test_information_and_bound_match_the_vectors(case):
     positions = case.vectors['positions']
     information = fisher_information(case.scenario, case.codebook, positions)
     scale = np.abs(case.vectors['fim']).max()
@@ -46,16 +35,11 @@ def faded(random_beams):
     return scenario, random_beams(scenario, np.random.default_rng(0))
 
 
-def test_everything_is_the_plain_one_when_correlations_are_low(faded, plain):
+def test_information_and_bound_match_the_definition_for_low_correlation(faded, plain):
     scenario, codebook = faded
     p = plain(scenario, codebook.analog, codebook.digital)
     spatial = multipath_covariance(scenario)
     positions = scenario.sample_positions(3, np.random.default_rng(1))
-    covariance = fisher.covariance(scenario, radiation_matrix(scenario, codebook))
-    for band in range(3):
-        expected = p.covariance(band, spatial[band])
-        np.testing.assert_allclose(
-            covariance[band], expected, rtol=0, atol=1e-10 * np.abs(expected).max())
     information = fisher_information(scenario, codebook, positions)
     for n, position in enumerate(positions):
         expected = p.information(position, spatial)
@@ -65,42 +49,20 @@ def test_everything_is_the_plain_one_when_correlations_are_low(faded, plain):
         crlb(scenario, codebook, positions), p.crlb(positions, spatial), rtol=1e-8)
 
 
-def test_mean_derivative_is_the_limit_of_differences_of_plain_means(faded, plain):
-    scenario, codebook = faded
-    p = plain(scenario, codebook.analog, codebook.digital)
-    positions = scenario.sample_positions(2, np.random.default_rng(2))
-    patterns, step = radiation_matrix(scenario, codebook), 1e-5
-    for band in range(3):
-        slopes = los_derivative(scenario, positions, band)
-        derivative = fisher.mean_derivative(slopes, patterns[band])
-        assert derivative.shape == (2, 3, 6)
-        for u in range(3):
-            shift = step * np.eye(3)[u]
-            difference = (p.mean(positions + shift, band)
-                          - p.mean(positions - shift, band)) / (2 * step)
-            np.testing.assert_allclose(
-                derivative[:, u], difference, rtol=0, atol=1e-7 * np.abs(derivative).max())
+def test_a_model_serves_all_positions(case, monkeypatch):
+    model = MeasurementModel(case.scenario, case.codebook).prepare()
 
+    def fail(*arguments):
+        raise AssertionError('factored again')
 
-def test_whitening_matrices_whiten_the_vectors(case):
-    whiteners = fisher.whitening_matrices(
-        case.scenario, radiation_matrix(case.scenario, case.codebook))
-    for whitener, covariance in zip(whiteners, case.vectors['cov'], strict=True):
-        white = whitener @ covariance @ whitener.conj().T
-        np.testing.assert_allclose(white, np.eye(len(white)), atol=1e-8)
-        assert np.abs(np.triu(whitener, 1)).max() < 1e-12 * np.abs(whitener).max()
-
-
-def test_factors_of_a_codebook_serve_all_positions(case, monkeypatch):
-    factors = fisher.factor(case.scenario, case.codebook)
-
-    def fail(*args):
-        raise AssertionError('computed again')
-
-    monkeypatch.setattr(fisher, 'whitening_matrices', fail)
+    monkeypatch.setattr(np.linalg, 'cholesky', fail)
     for n, position in enumerate(case.vectors['positions']):
-        bound = crlb(case.scenario, case.codebook, position[None], factors)
-        np.testing.assert_allclose(bound, case.vectors['crlb'][n], rtol=1e-8)
+        np.testing.assert_allclose(
+            crlb_of(model, position[None]), case.vectors['crlb'][n], rtol=1e-8)
+        scale = np.abs(case.vectors['fim'][n]).max()
+        np.testing.assert_allclose(
+            fisher_information_of(model, position[None])[0], case.vectors['fim'][n], rtol=1e-8,
+            atol=1e-8 * scale)
 
 
 def test_bound_does_not_depend_on_the_blocks(case, monkeypatch):
@@ -116,12 +78,12 @@ def test_bound_is_infinite_where_signals_do_not_determine_the_position(small):
     codebook = Codebook(np.full((1, 1, 16), 0.5), np.full((1, 1, 1, 1), np.sqrt(1e-3)))
     positions = scenario.sample_positions(50, np.random.default_rng(0))
     assert (crlb(scenario, codebook, positions) == np.inf).all()
-    # Nothing reaches a surface that is switched off.
+    # A surface with all elements off receives nothing.
     dark = Codebook(np.zeros((1, 2, 16)), small.codebook.digital)
     assert (crlb(small.scenario, dark, positions) == np.inf).all()
 
 
-def test_inverse_information_inverts_what_it_can():
+def test_inverse_information_inverts_regular_matrices_only():
     rng = np.random.default_rng(3)
     roots = rng.normal(size=(3, 3, 3))
     information = roots @ np.swapaxes(roots, 1, 2)
@@ -136,8 +98,8 @@ def random_directions(rng, n):
     return np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
 
 
-def test_inverse_information_is_the_inverse_whatever_the_units():
-    """Each axis has its own unit, up to nine orders apart."""
+def test_inverse_information_does_not_depend_on_the_units():
+    """The units of the axes differ by up to nine orders of magnitude."""
     rng = np.random.default_rng(4)
     roots = rng.normal(size=(200, 3, 5))
     matrices = roots @ np.swapaxes(roots, 1, 2)
@@ -164,7 +126,7 @@ def test_inverse_information_is_as_accurate_as_the_condition_allows(eigenvalues)
     inverse = fisher.inverse_information(matrices * scale) * scale
     expected = np.linalg.inv(matrices)
     errors = np.linalg.norm(inverse - expected, axis=(1, 2))
-    # Both have errors; with a matrix that is off by one unit in the last place, so is its inverse.
+    # Both inverses have errors: rounding the matrix alone changes its inverse this much.
     allowed = 2e-15 * np.linalg.cond(matrices) * np.linalg.norm(expected, axis=(1, 2))
     assert (errors <= allowed).all()
 
@@ -187,7 +149,7 @@ def test_an_axis_without_information_makes_the_bound_infinite(axes):
     np.testing.assert_array_equal(np.diagonal(inverse[0]), np.inf)
 
 
-def test_a_singular_matrix_leaves_the_others_alone():
+def test_a_singular_matrix_does_not_affect_the_others():
     information = np.stack([np.diag([1.0, 4.0, 0.25]), np.ones((3, 3)), np.zeros((3, 3)),
                             np.diag([2.0, 5.0, 10.0])])
     inverse = fisher.inverse_information(information)
@@ -198,7 +160,7 @@ def test_a_singular_matrix_leaves_the_others_alone():
 
 @pytest.mark.parametrize('distance', [10, 100, 1000])
 def test_bound_is_the_inverse_near_and_far(shipped, distance):
-    """Far away, all information is about the distance, but there is some of the rest."""
+    """Far away, nearly all of the information is about the distance."""
     scenario = Scenario()
     positions = distance * np.array([[1.0, 1.0, 0.3], [1.0, 0.0, 0.0], [2.0, -1.0, 0.1]])
     information = fisher_information(scenario, shipped, positions)
@@ -209,28 +171,16 @@ def test_bound_is_the_inverse_near_and_far(shipped, distance):
         rtol=1e-15 * np.linalg.cond(information).max())
 
 
-@pytest.mark.parametrize('n_rows', [1, 2, 3])
-def test_mean_derivative_takes_any_number_of_rows(faded, n_rows):
-    """One a pair of positions, three a position."""
-    scenario, codebook = faded
-    rng, pattern = np.random.default_rng(7), radiation_matrix(scenario, codebook)[1]
-    rows = rng.normal(size=(4, n_rows, 2, 9, 2)) @ [1, 1j]
-    means = fisher.mean_derivative(rows, pattern)
-    assert means.shape == (4, n_rows, 6)
-    expected = np.einsum('jqm,ngjm->ngjq', pattern.reshape(2, 3, 9), rows)
-    np.testing.assert_allclose(means, expected.reshape(4, n_rows, 6), rtol=1e-10)
-
-
-def test_information_is_twice_the_real_part_of_the_products():
+def test_quadratic_form_is_twice_the_real_part_of_the_products():
     whitened = np.random.default_rng(8).normal(size=(4, 2, 5, 2)) @ [1, 1j]
     expected = 2 * np.einsum('nga,nha->ngh', whitened.conj(), whitened).real
-    # In whatever order it lies in memory.
+    # The memory layout does not matter.
     for layout in (whitened, np.asfortranarray(whitened)):
         np.testing.assert_allclose(
-            fisher.information_of(layout), expected, rtol=1e-12, atol=1e-12)
+            fisher.quadratic_form(layout), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_no_positions_have_no_bounds(small):
+def test_no_positions_give_no_bounds(small):
     assert crlb(small.scenario, small.codebook, np.zeros((0, 3))).shape == (0,)
 
 

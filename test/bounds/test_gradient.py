@@ -1,4 +1,4 @@
-"""The chain rule from beam patterns to a codebook."""
+"""The chain rule from radiation matrices to a codebook."""
 
 import numpy as np
 import pytest
@@ -21,10 +21,10 @@ def odd(random_beams):
 
 @pytest.fixture(scope='module')
 def distance(odd, plain):
-    """Sum of |T - A|^2 with plain patterns T and some A, as a function of a codebook.
+    """Callable that returns the sum of |T - A|^2 for random A, and its derivative by T.
 
-    It is quadratic in the analog and in the digital variables, for which central differences are
-    exact. The second result is its derivative by the patterns.
+    It is quadratic in the analog and in the digital variables, so that central differences are
+    exact.
     """
     scenario, _ = odd
     targets = 0.05 * complex_array(np.random.default_rng(1), 2, 6, 9)

@@ -1,11 +1,11 @@
-"""The error that the confusion of pairs of positions causes."""
+"""The error caused by the confusion of pairs of positions."""
 
 import math
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import rows
+from rhs_isac_ros.bounds import measurement_rows
 from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -23,7 +23,7 @@ def make_scenario(noise_psd_dbm_hz):
 
 @pytest.fixture(scope='module')
 def scenario():
-    """With noise that lets pairs be told apart sometimes."""
+    """The noise is such that pairs are sometimes confused."""
     return make_scenario(-95)
 
 
@@ -38,7 +38,7 @@ def pairs(scenario):
 
 
 def plain_distances(p, firsts, seconds, spatial):
-    """q of every pair, band by band as the model is written."""
+    """q of every pair, by its definition."""
     q = np.zeros(len(firsts))
     for i in range(p.scenario.n_bands):
         inverse = np.linalg.inv(p.covariance(i, spatial[i]))
@@ -57,7 +57,7 @@ def plain_terms(p, firsts, seconds, spatial):
 
 @pytest.fixture(scope='module')
 def plain_of(scenario, plain):
-    """Function of analog, digital and positions: the terms of all pairs."""
+    """Callable that takes analog, digital and positions and returns the terms of all pairs."""
     spatial = multipath_covariance(scenario)
 
     def of(analog, digital, firsts, seconds):
@@ -72,7 +72,7 @@ def assert_near(outcome, expected, tolerance):
             actual, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
 
 
-def test_the_pairs_of_these_tests_are_neither_clear_nor_hopeless(
+def test_the_pairs_of_these_tests_are_confused_sometimes(
         scenario, codebook, pairs, plain):
     p = plain(scenario, codebook.analog, codebook.digital)
     q = plain_distances(p, *pairs, multipath_covariance(scenario))
@@ -80,11 +80,11 @@ def test_the_pairs_of_these_tests_are_neither_clear_nor_hopeless(
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
-def test_value_is_the_plain_one(scenario, codebook, pairs, plain_of, tolerance):
-    confusion = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)
+def test_value_matches_the_definition(scenario, codebook, pairs, plain_of, tolerance):
+    cost = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)
     expected = plain_of(codebook.analog, codebook.digital, *pairs).mean()
-    assert confusion.value(codebook) == pytest.approx(expected, rel=1e-8)
-    value = confusion(codebook).value
+    assert cost.value(codebook) == pytest.approx(expected, rel=1e-8)
+    value = cost(codebook).value
     assert type(value) is float
     assert value == pytest.approx(expected, rel=1e-8)
     for n in range(N_PAIRS):
@@ -93,15 +93,15 @@ def test_value_is_the_plain_one(scenario, codebook, pairs, plain_of, tolerance):
             plain_of(codebook.analog, codebook.digital, *pairs[:, n:n + 1])[0], rel=1e-7)
 
 
-def test_the_likelier_of_two_positions_is_wrong_as_often_as_that(
+def test_the_cost_contains_the_error_probability_of_a_likelihood_decision(
         scenario, codebook, pairs, plain):
-    """Signals of the first position are drawn, and the second one's likelihood is compared."""
+    """Signals of the first position are drawn and the likelihoods of both are compared."""
     p = plain(scenario, codebook.analog, codebook.digital)
     rng, n_draws = np.random.default_rng(2), 20_000
     spatial = multipath_covariance(scenario)
     q = plain_distances(p, *pairs, spatial)
     n = int(np.argmin(np.abs(q - 2)))
-    ahead = np.zeros(n_draws)
+    ratio = np.zeros(n_draws)
     for i in range(2):
         covariance = p.covariance(i, spatial[i])
         inverse = np.linalg.inv(covariance)
@@ -110,8 +110,8 @@ def test_the_likelier_of_two_positions_is_wrong_as_often_as_that(
         signals = first + noise @ np.linalg.cholesky(covariance).T
         for sign, mean in ((1, first), (-1, second)):
             offsets = signals - mean
-            ahead += sign * np.einsum('na,ab,nb->n', offsets.conj(), inverse, offsets).real
-    wrong = np.mean(ahead > 0)
+            ratio += sign * np.einsum('na,ab,nb->n', offsets.conj(), inverse, offsets).real
+    wrong = np.mean(ratio > 0)
     single = PairwiseErrorCost(scenario, *pairs[:, n:n + 1], tolerance=1e-7)
     expected = single.value(codebook) / math.dist(*pairs[:, n])**2
     assert 0.1 < expected < 0.3
@@ -120,7 +120,7 @@ def test_the_likelier_of_two_positions_is_wrong_as_often_as_that(
 
 @pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
 @pytest.mark.parametrize('seed', [0, 1, 2])
-def test_gradients_are_the_limit_of_differences_of_plain_values(
+def test_gradients_are_the_limit_of_differences_of_the_value(
         scenario, pairs, plain_of, random_beams, seed, tolerance):
     rng, step = np.random.default_rng(seed), 1e-5
     codebook = random_beams(scenario, rng)
@@ -149,15 +149,15 @@ def test_gradients_are_the_limit_of_differences_of_plain_values(
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
-def test_pairs_count_by_their_weights_in_all_blocks(
+def test_pairs_are_weighted_in_all_blocks(
         scenario, codebook, pairs, plain_of, monkeypatch, tolerance):
-    monkeypatch.setattr(rows, '_BLOCK', 4)
+    monkeypatch.setattr(measurement_rows, '_BLOCK', 4)
     weights = np.random.default_rng(3).uniform(0, 2, N_PAIRS)
     weights[5] = 0
     expected = np.mean(weights * plain_of(codebook.analog, codebook.digital, *pairs))
     outcome = PairwiseErrorCost(scenario, *pairs, weights, tolerance)(codebook)
     assert outcome.value == pytest.approx(expected, rel=1e-5)
-    # A pair of weight two is the same pair twice, and one of no weight is one less.
+    # A pair of weight 2 counts twice, and a pair of weight 0 does not count.
     ones = PairwiseErrorCost(
         scenario, *pairs, np.where(np.arange(N_PAIRS) == 2, 2.0, weights > 1), tolerance)
     chosen = [*np.flatnonzero((weights > 1) & (np.arange(N_PAIRS) != 2)), 2, 2]
@@ -167,7 +167,7 @@ def test_pairs_count_by_their_weights_in_all_blocks(
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
-def test_without_weights_all_pairs_count_alike(scenario, codebook, pairs, tolerance):
+def test_weights_are_one_by_default(scenario, codebook, pairs, tolerance):
     assert_near(PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook),
                 PairwiseErrorCost(scenario, *pairs, np.ones(N_PAIRS), tolerance)(codebook), 1e-14)
 
@@ -192,9 +192,9 @@ def test_a_pair_of_the_same_position_costs_nothing(scenario, codebook, pairs, to
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
-def test_positions_that_look_alike_are_confused_every_other_time(
+def test_pairs_with_equal_signals_are_confused_half_of_the_time(
         scenario, codebook, pairs, tolerance):
-    """Nothing reaches a surface that is switched off."""
+    """A surface with all elements off receives nothing."""
     dark = Codebook(np.zeros_like(codebook.analog), codebook.digital)
     value, by_analog, by_digital = PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(dark)
     assert value == pytest.approx(np.mean(np.sum((pairs[0] - pairs[1])**2, axis=1)) / 2, rel=1e-14)
@@ -203,8 +203,9 @@ def test_positions_that_look_alike_are_confused_every_other_time(
 
 
 @pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
-def test_clear_pairs_cost_nothing_without_a_warning(scenario, codebook, pairs, tolerance):
-    """One of the positions is so near to the surface that there is no mistaking it."""
+def test_pairs_that_are_never_confused_cost_nothing_without_a_warning(
+        scenario, codebook, pairs, tolerance):
+    """One position is so near the surface that it cannot be confused with the other."""
     near = np.tile([1e-4, 0.0, 0.0], (N_PAIRS, 1))
     value, by_analog, by_digital = PairwiseErrorCost(
         scenario, pairs[0], near, tolerance=tolerance)(codebook)
@@ -213,14 +214,14 @@ def test_clear_pairs_cost_nothing_without_a_warning(scenario, codebook, pairs, t
     np.testing.assert_array_equal(by_digital, 0)
 
 
-def test_clearer_signals_are_confused_less(codebook, pairs):
+def test_the_cost_decreases_with_the_noise(codebook, pairs):
     values = [PairwiseErrorCost(make_scenario(noise), *pairs, tolerance=1e-6).value(codebook)
               for noise in (-80, -95, -110)]
     assert values[0] > values[1] > values[2] > 0
 
 
 @pytest.mark.parametrize('tolerance', [1e-7, 1e-5, 1e-3])
-def test_compressed_differences_give_the_exact_result_to_the_tolerance(
+def test_compressed_differences_match_exact_ones_to_the_tolerance(
         scenario, codebook, pairs, tolerance):
     assert_near(PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)(codebook),
                 PairwiseErrorCost(scenario, *pairs)(codebook), 10 * tolerance)
@@ -244,6 +245,6 @@ def test_positions_that_are_not_pairs_are_errors(scenario, n_firsts, n_seconds):
 
 
 @pytest.mark.parametrize('tolerance', [1e-8, -1.0, np.nan])
-def test_a_tolerance_that_cannot_be_held_is_an_error(scenario, pairs, tolerance):
+def test_a_tolerance_out_of_range_is_an_error(scenario, pairs, tolerance):
     with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
         PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic writing of files."""
 
 import os
 
@@ -18,7 +18,7 @@ def test_a_file_has_the_content_and_is_readable_by_all(tmp_path, content):
 
 
 @pytest.mark.parametrize('failing', ['replace', 'chmod', 'fdopen', 'content'])
-def test_a_failing_write_keeps_the_old_file_alone(tmp_path, monkeypatch, failing):
+def test_a_failing_write_leaves_only_the_old_file(tmp_path, monkeypatch, failing):
     path = tmp_path / 'file'
     write_whole(path, 'old')
 
@@ -36,7 +36,7 @@ def test_a_failing_write_keeps_the_old_file_alone(tmp_path, monkeypatch, failing
     assert os.listdir(tmp_path) == ['file']
 
 
-def test_no_folder_is_an_error(tmp_path):
+def test_a_missing_folder_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match='none'):
         write_whole(tmp_path / 'none' / 'file', 'x')
 

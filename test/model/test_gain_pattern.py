@@ -1,4 +1,4 @@
-"""Gain patterns, and all of the model that depends on them."""
+"""Gain patterns and their effect on the model."""
 
 import dataclasses
 import itertools
@@ -10,15 +10,14 @@ import yaml
 from scipy.integrate import dblquad
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.bounds.fisher import factor
 from rhs_isac_ros.codebook import directional_codebook
 from rhs_isac_ros.link import capacity, steer
 from rhs_isac_ros.model import (
     SPEED_OF_LIGHT_MPS,
     GainPattern,
+    MeasurementModel,
     Scenario,
     ScenarioError,
-    mean_received,
     plugins,
     simulate_received,
 )
@@ -31,7 +30,7 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
 def patch(angles):
-    """A lobe towards the front, nothing behind, and no kink at its rim."""
+    """One smooth lobe in front, and no gain behind."""
     return 2 * np.maximum(np.cos(angles), 0)**3
 
 
@@ -45,7 +44,7 @@ def ripple_slope(angles):
 
 @pytest.fixture(scope='module')
 def scenario() -> Scenario:
-    """Near and wide, so that every element sees the user at an angle of its own."""
+    """The region is near and wide, so that angles differ between the elements."""
     return Scenario(n_subbands=3, n_frames=2, elements_per_side=4, element_gain=patch,
                     user_gain=GainPattern(ripple, ripple_slope), roi_center_m=(2, 0, 0),
                     roi_size_m=(2, 3, 2))
@@ -56,8 +55,7 @@ def codebook(scenario, random_beams):
     return random_beams(scenario, np.random.default_rng(3))
 
 
-def test_a_number_is_that_very_number(case):
-    """And one that is written as a pattern is the same to rounding, with no slope."""
+def test_a_constant_pattern_equals_the_number(case):
     numbers = dataclasses.replace(case.scenario, element_gain=1.3, user_gain=0.7)
     patterns = dataclasses.replace(
         numbers, element_gain=lambda angles: np.full(angles.shape, 1.3),
@@ -72,15 +70,15 @@ def test_a_number_is_that_very_number(case):
                                crlb(numbers, case.codebook, positions), rtol=1e-9)
 
 
-def test_gains_are_those_of_the_plain_formula(scenario):
+def test_gains_match_the_definition(scenario):
     positions = scenario.sample_positions(3, np.random.default_rng(0))
     elements = element_positions(scenario)
     for band in range(scenario.n_bands):
         gains = los_gain(scenario, positions, band)
         for n, j, m in itertools.product(range(3), range(3), range(16)):
-            way = positions[n] - elements[m]
-            distance = np.sqrt(way @ way)
-            angle = np.arccos(way[0] / distance)
+            offset = positions[n] - elements[m]
+            distance = np.sqrt(offset @ offset)
+            angle = np.arccos(offset[0] / distance)
             frequency = subband_frequencies_hz(scenario)[band, j]
             wavelength = SPEED_OF_LIGHT_MPS / frequency
             expected = (patch(angle) * ripple(angle) * wavelength / (4 * np.pi * distance)
@@ -103,8 +101,8 @@ def test_derivatives_are_limits_of_differences(scenario, user_gain):
                 slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
 
 
-def test_the_part_of_the_pattern_in_a_derivative_is_right(scenario):
-    """Along a sphere around an element, distance and phase stay: only the pattern changes."""
+def test_along_a_sphere_only_the_pattern_contributes_to_the_derivative(scenario):
+    """On a sphere around an element, distance and phase are constant."""
     scenario = dataclasses.replace(scenario, elements_per_side=1, user_gain=1.0)
     angle, radius = 0.6, 1.5
     place = radius * np.array([[np.cos(angle), 0.0, np.sin(angle)]])
@@ -115,17 +113,17 @@ def test_the_part_of_the_pattern_in_a_derivative_is_right(scenario):
     np.testing.assert_allclose(along / gain[0], -3 * np.tan(angle) / radius, rtol=1e-9)
 
 
-def test_straight_ahead_a_smooth_pattern_adds_nothing(scenario):
+def test_on_boresight_a_smooth_pattern_has_no_slope(scenario):
     scenario = dataclasses.replace(scenario, elements_per_side=1)
     isotropic = dataclasses.replace(
         scenario, element_gain=float(patch(0.0)), user_gain=float(ripple(0.0)))
-    ahead = np.array([[1.7, 0.0, 0.0]])
-    for first, second in zip(los_and_derivative(scenario, ahead, 0),
-                             los_and_derivative(isotropic, ahead, 0), strict=True):
+    on_boresight = np.array([[1.7, 0.0, 0.0]])
+    for first, second in zip(los_and_derivative(scenario, on_boresight, 0),
+                             los_and_derivative(isotropic, on_boresight, 0), strict=True):
         np.testing.assert_allclose(first, second, rtol=1e-12, atol=1e-15)
 
 
-def test_numerical_slopes_are_good_to_ten_digits():
+def test_numerical_slopes_are_accurate_to_ten_digits():
     angles = np.linspace(0, np.pi, 1001)
     np.testing.assert_allclose(
         GainPattern(ripple).slope(angles), ripple_slope(angles), rtol=0, atol=1e-10)
@@ -134,32 +132,32 @@ def test_numerical_slopes_are_good_to_ten_digits():
 
 
 def test_covariance_of_the_multipath_is_the_integral(scenario):
-    """Eq. (2) of two elements by adaptive quadrature, the pattern weighing the profile."""
+    """Eq. (2) for two elements by adaptive quadrature, with a weighted profile."""
     band, first, second = 1, 0, 7
     spread = np.deg2rad(scenario.angular_spread_deg)
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
-    way = np.subtract(*element_positions(scenario)[[first, second]])
+    offset = np.subtract(*element_positions(scenario)[[first, second]])
 
     def weight(azimuth, elevation):
         return np.exp(-np.sqrt(2) * (abs(azimuth) + abs(elevation)) / spread)
 
     def integrand(azimuth, elevation):
-        toward = np.array([np.cos(elevation) * np.cos(azimuth),
+        direction = np.array([np.cos(elevation) * np.cos(azimuth),
                            np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-        return (weight(azimuth, elevation) * patch(np.arccos(toward[0]))**2
-                * np.cos(wavenumber * way @ toward))
+        return (weight(azimuth, elevation) * patch(np.arccos(direction[0]))**2
+                * np.cos(wavenumber * offset @ direction))
 
-    def over_all(function):
-        # The profile has a cusp at 0.
+    def integral(function):
+        # Split at 0, where the profile has a cusp.
         ends = ((-np.pi / 2, 0), (0, np.pi / 2))
         return sum(dblquad(function, *a, *b, epsabs=1e-11, epsrel=1e-9)[0]
                    for a, b in itertools.product(ends, ends))
-    expected = over_all(integrand) / over_all(weight) * mean_los_power(scenario, band)
+    expected = integral(integrand) / integral(weight) * mean_los_power(scenario, band)
     covariance = multipath_covariance(scenario)[band, first, second]
     np.testing.assert_allclose(covariance, expected, rtol=1e-6)
 
 
-def test_mean_power_weighs_the_users_pattern(scenario):
+def test_mean_power_is_weighted_by_the_users_pattern(scenario):
     positions = scenario.sample_positions(400_000, np.random.default_rng(5))
     squares = np.sum(positions**2, axis=1)
     gains = ripple(np.arccos(positions[:, 0] / np.sqrt(squares)))
@@ -168,17 +166,16 @@ def test_mean_power_weighs_the_users_pattern(scenario):
     assert mean_los_power(scenario, 0) == pytest.approx(expected, rel=3e-3)
 
 
-def test_bounds_are_those_of_differences(scenario, codebook):
+def test_bounds_match_differences_of_the_mean(scenario, codebook):
     """Eq. (11) from the mean signals alone."""
     positions = scenario.sample_positions(5, np.random.default_rng(2))
-    whiteners = factor(scenario, codebook).whiteners
+    model = MeasurementModel(scenario, codebook)
     step = 1e-5
     slopes = []
     for u in range(3):
         shift = step * np.eye(3)[u]
-        difference = (mean_received(scenario, codebook, positions + shift)
-                      - mean_received(scenario, codebook, positions - shift)) / (2 * step)
-        slopes.append(np.einsum('irs,nis->nir', whiteners, difference).reshape(5, -1))
+        difference = (model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
+        slopes.append(model.whiten(difference).reshape(5, -1))
     slopes = np.stack(slopes, axis=1)
     information = 2 * np.einsum('nur,nvr->nuv', slopes.conj(), slopes).real
     expected = np.trace(np.linalg.inv(information), axis1=1, axis2=2)
@@ -187,10 +184,10 @@ def test_bounds_are_those_of_differences(scenario, codebook):
     assert not np.allclose(crlb(isotropic, codebook, positions), expected, rtol=0.1)
 
 
-def test_the_slopes_that_estimators_climb_are_those_of_their_means(scenario, codebook):
+def test_whitened_jacobian_is_the_limit_of_differences(scenario, codebook):
     model = WhitenedModel(scenario, codebook)
     positions = scenario.sample_positions(6, np.random.default_rng(6))
-    mean, slopes = model.mean_and_derivative(positions)
+    mean, slopes = model.mean_and_jacobian(positions)
     np.testing.assert_allclose(mean, model.mean(positions), rtol=1e-9)
     step = 1e-5
     for u in range(3):
@@ -200,7 +197,7 @@ def test_the_slopes_that_estimators_climb_are_those_of_their_means(scenario, cod
             slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
 
 
-def test_estimators_of_the_pattern_are_better_than_those_that_know_none(scenario, codebook):
+def test_estimators_need_the_pattern(scenario, codebook):
     rng = np.random.default_rng(7)
     positions = scenario.sample_positions(40, rng)
     received = simulate_received(scenario, codebook, positions, rng)
@@ -215,10 +212,10 @@ def test_estimators_of_the_pattern_are_better_than_those_that_know_none(scenario
 
 
 def test_beams_are_steered_with_the_pattern(scenario):
-    """A beam for the true pattern carries more than the one for none, at a place off the side."""
+    """Off boresight, a beam for the true pattern has more capacity than an isotropic one."""
     scenario = dataclasses.replace(
         scenario, user_gain=1.0, elements_per_side=8, roi_center_m=(2, 0, 0),
-        # Blind in a cone around 45 degrees: each element sees the user at another angle.
+        # Nearly zero gain at 45 degrees; the angle differs between the elements.
         element_gain=lambda angles: 0.01 + np.abs(np.sin(8 * (angles - np.pi / 4))))
     isotropic = dataclasses.replace(scenario, element_gain=1.0)
     place = np.array([0.9, 0.8, 0.4])
@@ -227,8 +224,8 @@ def test_beams_are_steered_with_the_pattern(scenario):
     assert rates[0] > 1.01 * rates[1]
 
 
-def test_where_a_pattern_is_blind_only_the_multipath_is_left(scenario, codebook):
-    """No position is told there, and a beam is still steered to what is scattered."""
+def test_at_a_null_of_the_pattern_only_the_multipath_remains(scenario, codebook):
+    """The bound is infinite there, and beams use the multipath."""
     blind = dataclasses.replace(scenario, user_gain=1.0, element_gain=lambda angles: np.where(
         angles < 0.4, 1 + np.cos(angles * np.pi / 0.4), 0.0))
     places = np.array([[1.1, 1.4, 0.9], [2.0, 0.1, 0.0]])
@@ -242,7 +239,7 @@ def test_where_a_pattern_is_blind_only_the_multipath_is_left(scenario, codebook)
 
 
 class TestIdentity:
-    """What tells patterns, and scenarios with them, apart."""
+    """Equality and hashes of patterns, and of scenarios with patterns."""
 
     def test_patterns_with_the_same_gains_are_equal(self):
         twin = GainPattern(lambda angles: patch(angles))
@@ -269,17 +266,17 @@ class TestIdentity:
         assert repr(GainPattern(patch)) == repr(GainPattern(lambda angles: patch(angles)))
         assert '0x' not in repr(Scenario(element_gain=patch))
 
-    def test_changes_tell_patterns_apart(self):
+    def test_changes_identify_patterns(self):
         first, second = (Scenario(element_gain=gain).changes() for gain in (patch, ripple))
         assert first != second
         assert yaml.safe_load(yaml.safe_dump(first)) == first
         with pytest.raises(ScenarioError, match='element_gain: .* no plug-in, expected a number'):
             Scenario(**first)
 
-    def test_a_scenario_with_a_function_of_a_module_can_be_sent_to_a_process(self):
-        there = pickle.loads(pickle.dumps(GainPattern(np.cosh)))
-        assert there == GainPattern(np.cosh)
-        np.testing.assert_array_equal(there.amplitude(np.ones(2)), np.cosh(np.ones(2)))
+    def test_a_pattern_with_a_function_of_a_module_can_be_pickled(self):
+        copy = pickle.loads(pickle.dumps(GainPattern(np.cosh)))
+        assert copy == GainPattern(np.cosh)
+        np.testing.assert_array_equal(copy.amplitude(np.ones(2)), np.cosh(np.ones(2)))
 
 
 class TestPlugins:
@@ -316,7 +313,7 @@ def broken(angles):
         names = ('patch', 'sharp', 'number', 'short', 'minus', 'complex_', 'none', 'broken')
         install('antennas', self.CODE, {plugins.GAIN_PATTERNS: {name: name for name in names}})
 
-    def test_a_file_may_name_one(self, tmp_path):
+    def test_a_file_may_name_a_pattern(self, tmp_path):
         (tmp_path / 'my.yaml').write_text('element_gain: patch\nuser_gain: sharp\n')
         scenario = Scenario.from_yaml(tmp_path / 'my.yaml')
         assert scenario.element_gain == GainPattern(patch)
@@ -324,7 +321,7 @@ def broken(angles):
         assert Scenario(**scenario.changes()) == scenario
         assert scenario.changes()['element_gain'] == f'patch@{GainPattern(patch).digest}'
 
-    def test_one_that_has_changed_since_is_refused(self):
+    def test_a_pattern_with_another_digest_is_an_error(self):
         with pytest.raises(ScenarioError, match=(
                 r'element_gain: .*antennas:patch of antennas: digest \w+, expected 0123: the '
                 'pattern has changed')):
@@ -339,16 +336,16 @@ def broken(angles):
         ('none', r'antennas:none .* gain 0 everywhere in front'),
         ('broken', r"antennas:broken .* KeyError: 'table', expected a function of an array"),
     ])
-    def test_what_is_no_pattern_is_named(self, name, words):
+    def test_the_error_for_an_invalid_pattern_names_it(self, name, words):
         with pytest.raises(ScenarioError, match=f'user_gain: .*{words}'):
             Scenario(user_gain=name)
 
 
 @pytest.mark.parametrize('gain', [np.nan, np.inf, -1.0, 2e6])
-def test_gains_out_of_range_are_refused(gain):
+def test_gains_out_of_range_are_errors(gain):
     with pytest.raises(PatternError, match=f'gain {gain:g} at 0.000 rad'.replace('+', r'\+')):
         GainPattern(lambda angles: np.full(angles.shape, gain))
 
 
-def test_numbers_in_quotes_are_still_numbers():
+def test_a_number_may_be_a_string():
     assert Scenario(element_gain='2e0').element_gain == 2.0

@@ -9,7 +9,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import geometry as g
 
 
-def test_positions_and_frequencies_are_the_vectors(case):
+def test_positions_and_frequencies_match_the_vectors(case):
     s, vectors = case.scenario, case.vectors
     np.testing.assert_allclose(
         g.element_positions(s), vectors['element_positions'], rtol=1e-12, atol=1e-15)
@@ -23,7 +23,7 @@ def test_positions_and_frequencies_are_the_vectors(case):
     Scenario(elements_per_side=5, n_feeds=4, n_subbands=5, center_frequencies_hz=(1e9, 2e9, 9e9),
              element_interval_wavelengths=0.5),
 ], ids=['one of each', 'odd'])
-def test_positions_and_frequencies_are_the_plain_ones(scenario, plain):
+def test_positions_and_frequencies_match_the_definition(scenario, plain):
     p = plain(scenario)
     n_elements, n_feeds = scenario.n_elements, scenario.n_feeds
     assert g.element_interval_m(scenario) == pytest.approx(p.interval, rel=1e-14)
@@ -43,6 +43,6 @@ def test_mean_wavelength_is_that_of_the_bands_not_of_the_mean_frequency():
 
 
 def test_given_feed_positions_are_used():
-    wanted = ((0.0, -0.1, 0.2), (0.01, 0.1, 0.0), (0.0, 0.0, 0.3))
-    scenario = dataclasses.replace(Scenario(), feed_positions_m=wanted)
-    np.testing.assert_array_equal(g.feed_positions(scenario), wanted)
+    positions = ((0.0, -0.1, 0.2), (0.01, 0.1, 0.0), (0.0, 0.0, 0.3))
+    scenario = dataclasses.replace(Scenario(), feed_positions_m=positions)
+    np.testing.assert_array_equal(g.feed_positions(scenario), positions)

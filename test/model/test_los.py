@@ -1,4 +1,4 @@
-"""The line of sight and its derivative."""
+"""Line-of-sight gains and their derivatives."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative, los_derivative, los_gain
 
 
-def test_gains_are_the_vectors(case):
+def test_gains_match_the_vectors(case):
     for band, expected in enumerate(case.vectors['los']):
         gains = los_gain(case.scenario, case.vectors['positions'], band)
         assert gains.shape == expected.shape
@@ -23,7 +23,7 @@ def wide() -> Scenario:
         roi_size_m=(3, 4, 2))
 
 
-def test_gains_and_derivatives_are_the_plain_ones(wide, plain):
+def test_gains_and_derivatives_match_the_definition(wide, plain):
     positions = wide.sample_positions(3, np.random.default_rng(0))
     p = plain(wide)
     for band in range(wide.n_bands):
@@ -40,7 +40,7 @@ def test_gains_and_derivatives_are_the_plain_ones(wide, plain):
                         slopes[n, :, j, m], p.los_slope(position, band, j, m), rtol=1e-10)
 
 
-def test_derivative_is_the_limit_of_differences_of_plain_gains(wide, plain):
+def test_derivative_is_the_limit_of_differences_of_the_gains(wide, plain):
     step = 1e-5
     positions = wide.sample_positions(4, np.random.default_rng(1))
     p = plain(wide)
@@ -57,7 +57,7 @@ def test_derivative_is_the_limit_of_differences_of_plain_gains(wide, plain):
                         slopes[:, u, j, m], difference, rtol=0, atol=1e-7 * scale)
 
 
-def test_both_in_one_are_the_two(case):
+def test_gain_and_derivative_together_equal_each_alone(case):
     positions = case.vectors['positions']
     for band in range(case.scenario.n_bands):
         gains, slopes = los_and_derivative(case.scenario, positions, band)
@@ -83,7 +83,7 @@ def test_malformed_positions_are_errors(function, positions, words):
         function(Scenario(), np.array(positions), 0)
 
 
-def test_checked_positions_takes_lists():
+def test_checked_positions_accepts_lists():
     positions = checked_positions([[1, 2, 3]])
     assert positions.dtype == float
     assert positions.tolist() == [[1.0, 2.0, 3.0]]

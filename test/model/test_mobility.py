@@ -1,4 +1,4 @@
-"""How users move."""
+"""Movement of the users."""
 
 import itertools
 
@@ -16,7 +16,7 @@ def track(moves, times):
     return tuple(np.array(part) for part in zip(*(moves.state(t) for t in times), strict=True))
 
 
-def test_kinds_are_the_three():
+def test_kinds_are_complete():
     assert mobility.KINDS == ('static', 'waypoints', 'random_walk')
 
 
@@ -31,7 +31,7 @@ def test_static_stands_still():
     lambda: mobility.Waypoints(SQUARE, 0.0),
     lambda: mobility.RandomWalk(Scenario(), 0.0, np.random.default_rng(0)),
 ], ids=['static', 'waypoints', 'random_walk'])
-def test_without_speed_nobody_moves(make):
+def test_users_without_speed_do_not_move(make):
     moves = make()
     positions, velocities = track(moves, [0.0, 5.0, 50.0])
     assert (positions == positions[0]).all()
@@ -45,7 +45,7 @@ def test_without_speed_nobody_moves(make):
     lambda: mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0)),
     lambda: mobility.RandomWalk(Scenario(), 0.0, np.random.default_rng(0)),
 ], ids=['static', 'waypoints', 'standing at one', 'random_walk', 'standing on a walk'])
-def test_who_changes_an_answer_does_not_move_the_user(make):
+def test_modifying_a_returned_state_does_not_affect_the_user(make):
     moves = make()
     position, velocity = moves.state(0.0)
     kept = position.copy(), velocity.copy()
@@ -55,7 +55,7 @@ def test_who_changes_an_answer_does_not_move_the_user(make):
         np.testing.assert_array_equal(a, b)
 
 
-def test_waypoints_go_round_a_closed_line():
+def test_waypoints_form_a_closed_polygon():
     moves = mobility.Waypoints(SQUARE, 0.5)
     seconds = np.array([0, 2, 4, 7, 10, 12, 14, 17, 20, 24])
     positions, velocities = track(moves, START_S + seconds)
@@ -67,13 +67,13 @@ def test_waypoints_go_round_a_closed_line():
     np.testing.assert_allclose(velocities, [along[name] for name in names], atol=1e-12)
 
 
-def test_waypoints_begin_with_the_first_call():
+def test_the_first_call_is_at_the_first_waypoint():
     moves = mobility.Waypoints(SQUARE, 1.0)
     np.testing.assert_array_equal(moves.state(1e5)[0], SQUARE[0])
     np.testing.assert_allclose(moves.state(1e5 + 1)[0], (7, 0, 0), atol=1e-9)
 
 
-def test_waypoints_keep_on_the_line_for_long():
+def test_users_stay_on_the_polygon_for_a_long_time():
     moves = mobility.Waypoints(SQUARE, 3.0)
     positions, _ = track(moves, np.concatenate([[0.0], np.sort(
         np.random.default_rng(0).uniform(0, 1e6, 500))]))
@@ -84,13 +84,13 @@ def test_waypoints_keep_on_the_line_for_long():
     assert (positions <= np.array([8, 3, 0]) + 1e-6).all()
 
 
-def test_one_waypoint_is_a_place():
+def test_a_single_waypoint_is_a_fixed_position():
     positions, velocities = track(mobility.Waypoints([(7, 1, 0)], 2.0), [0.0, 3.0])
     assert (positions == [7, 1, 0]).all()
     assert (velocities == 0).all()
 
 
-def test_doubled_waypoints_change_nothing():
+def test_repeated_waypoints_have_no_effect():
     times = np.linspace(0, 30, 301)
     doubled = [point for point in SQUARE for _ in (0, 1)]
     plain = track(mobility.Waypoints(SQUARE, 0.7), times)
@@ -99,21 +99,22 @@ def test_doubled_waypoints_change_nothing():
         np.testing.assert_allclose(a, b, atol=1e-9)
 
 
-def movers():
+def moving_users():
     yield 'waypoints', lambda: mobility.Waypoints(SQUARE, 1.5)
     for seed in range(3):
         yield f'walk {seed}', lambda seed=seed: mobility.RandomWalk(
             Scenario(), 1.5, np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize('make', [m for _, m in movers()], ids=[name for name, _ in movers()])
-def test_movers_keep_their_speed_and_never_jump(make):
+@pytest.mark.parametrize(
+    'make', [m for _, m in moving_users()], ids=[name for name, _ in moving_users()])
+def test_speed_is_constant_and_paths_are_continuous(make):
     step_s = 0.05
     positions, velocities = track(make(), START_S + np.arange(4000) * step_s)
     np.testing.assert_allclose(np.linalg.norm(velocities, axis=1), 1.5)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     assert steps.max() <= 1.5 * step_s * (1 + 1e-6)
-    # A step is shorter only where it goes round a corner.
+    # Steps are shorter only at corners.
     full = np.isclose(steps, 1.5 * step_s, rtol=1e-6)
     assert full.mean() > 0.95
     assert not full.all()
@@ -133,13 +134,13 @@ def test_a_walk_stays_in_the_region_and_crosses_it(seed):
     assert (np.ptp(positions, axis=0) > 0.8 * (high - low)).all()
 
 
-def test_a_walk_begins_where_it_is_told():
+def test_a_walk_begins_at_the_given_position():
     walk = mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0), (6.0, 2.0, 0.1))
     np.testing.assert_array_equal(walk.state(START_S)[0], (6, 2, 0.1))
     assert np.linalg.norm(walk.state(START_S + 1.0)[0] - (6, 2, 0.1)) > 0.1
 
 
-def test_walks_repeat_with_their_seed():
+def test_walks_are_reproducible():
     def positions(seed):
         walk = mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(seed))
         return track(walk, np.arange(0, 100, 1.0))[0]
@@ -148,7 +149,7 @@ def test_walks_repeat_with_their_seed():
     assert not np.isclose(positions(1), positions(2)).all(axis=1).any()
 
 
-def test_a_walk_does_not_depend_on_when_one_looks():
+def test_a_walk_does_not_depend_on_the_times_of_the_calls():
     scenario = Scenario()
     often = mobility.RandomWalk(scenario, 1.5, np.random.default_rng(3))
     rarely = mobility.RandomWalk(scenario, 1.5, np.random.default_rng(3))
@@ -172,6 +173,6 @@ def test_a_walk_changes_its_direction():
     lambda: mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0), (1, 2)),
     lambda: mobility.RandomWalk(Scenario(), 1.0, np.random.default_rng(0), (1, 2, np.nan)),
 ])
-def test_a_place_that_is_none_is_an_error(make):
+def test_malformed_positions_are_errors(make):
     with pytest.raises(ValueError, match='positions'):
         make()

@@ -10,7 +10,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import multipath as mp
 
 
-def test_covariance_is_the_vectors(case):
+def test_covariance_matches_the_vectors(case):
     covariance = mp.multipath_covariance(case.scenario)
     assert covariance.shape == case.vectors['V'].shape
     np.testing.assert_allclose(covariance, case.vectors['V'], rtol=1e-6)
@@ -41,7 +41,7 @@ def test_mean_los_power_is_the_adaptive_integral(other, band):
 
 @pytest.mark.parametrize(('band', 'm', 'n'), [(0, 0, 8), (1, 0, 1), (1, 7, 3), (1, 2, 6)])
 def test_covariance_is_the_adaptive_integral(other, plain, band, m, n):
-    """Integrates every quadrant on its own, the profile having a cusp along both axes."""
+    """Integrate each quadrant separately, because the profile has a cusp along both axes."""
     p = plain(other)
     wavenumber = 2 * np.pi * other.center_frequencies_hz[band] / 299_792_458
     offset = wavenumber * (p.element(m) - p.element(n))
@@ -68,7 +68,7 @@ def test_covariance_is_the_adaptive_integral(other, plain, band, m, n):
         mp.multipath_covariance(other)[band, m, n], power * (real + 1j * imag), rtol=1e-6)
 
 
-def test_correlations_are_the_vectors(case):
+def test_correlations_match_the_vectors(case):
     subbands, frames = np.arange(case.scenario.n_subbands), np.arange(case.scenario.n_frames)
     for band in range(case.scenario.n_bands):
         over_f = mp.frequency_correlation(case.scenario, band, subbands[:, None], subbands)
@@ -79,13 +79,13 @@ def test_correlations_are_the_vectors(case):
 
 @pytest.fixture(scope='module')
 def fading() -> Scenario:
-    """A small scenario whose sub-bands and frames are correlated by a half or so."""
+    """A small scenario whose sub-bands and frames have correlations of about one half."""
     return Scenario(
         center_frequencies_hz=(2.5e9, 4e9), n_subbands=2, n_frames=3, elements_per_side=2,
         subband_width_hz=3e5, frame_duration_s=4e-3, angular_spread_deg=60.0)
 
 
-def test_correlations_are_the_plain_ones_when_they_are_low(fading, plain):
+def test_correlations_match_the_definition_when_they_are_low(fading, plain):
     p = plain(fading)
     for band in range(2):
         for a in range(3):
@@ -100,9 +100,25 @@ def test_correlations_are_the_plain_ones_when_they_are_low(fading, plain):
     assert abs(p.rho_f(0, 0, 1)) < 0.8
 
 
+def test_correlation_matrices_match_the_vectors(case):
+    over_frequency, over_time = mp.correlation_matrices(case.scenario)
+    np.testing.assert_allclose(over_frequency, case.vectors['K_f'], rtol=1e-8)
+    np.testing.assert_allclose(over_time, case.vectors['K_t'], rtol=1e-8)
+    assert not over_frequency.flags.writeable
+    assert not over_time.flags.writeable
+
+
+def test_measurement_correlation_is_the_kronecker_product_of_the_vectors(case):
+    correlation = mp.measurement_correlation(case.scenario)
+    for band, (over_f, over_t) in enumerate(
+            zip(case.vectors['K_f'], case.vectors['K_t'], strict=True)):
+        np.testing.assert_allclose(correlation[band], np.kron(over_f, over_t), rtol=1e-8)
+    assert not correlation.flags.writeable
+
+
 def test_factors_square_to_the_covariances(case):
-    kept = mp.multipath_factors(case.scenario)
-    for band, (spatial, rows) in enumerate(kept):
+    factors = mp.multipath_factors(case.scenario)
+    for band, (spatial, rows) in enumerate(factors):
         v = case.vectors['V'][band]
         np.testing.assert_allclose(
             spatial @ spatial.conj().T, v, rtol=0, atol=1e-10 * np.abs(v).max())
@@ -112,7 +128,7 @@ def test_factors_square_to_the_covariances(case):
 
 
 N_DRAWS = 20_000
-# Deviations of sample statistics, in standard deviations; a few hundred are looked at at once.
+# Allowed deviation in standard deviations; a few hundred statistics are checked at once.
 SIGMAS = 5.0
 
 
@@ -158,14 +174,14 @@ def test_complex_normal_is_circular_with_unit_variance():
     assert np.mean(np.abs(z)**2) == pytest.approx(1, abs=SIGMAS / np.sqrt(n))
     assert abs(np.mean(z)) < SIGMAS / np.sqrt(n)
     assert abs(np.mean(z * z)) < SIGMAS * np.sqrt(2 / n)
-    # The fourth moment tells a normal from others.
+    # The fourth moment is characteristic of the normal distribution.
     assert np.mean(np.abs(z)**4) == pytest.approx(2, abs=SIGMAS * np.sqrt(20 / n))
     # Successive numbers are independent.
     assert abs(np.mean(z[1:] * z[:-1].conj())) < SIGMAS / np.sqrt(n)
 
 
 def test_a_narrow_spread_makes_the_multipath_one_wave(small):
-    """Nearly all power comes from the front: the elements are coherent."""
+    """All power arrives from the boresight, so that the elements are coherent."""
     narrow = dataclasses.replace(small.scenario, angular_spread_deg=0.05)
     v = mp.multipath_covariance(narrow)[0]
     np.testing.assert_allclose(v / v[0, 0], 1, atol=1e-4)

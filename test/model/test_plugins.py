@@ -1,4 +1,4 @@
-"""What other packages add by entry points."""
+"""Plug-ins of other packages."""
 
 import re
 
@@ -17,13 +17,13 @@ def test_names_are_those_of_the_installed_packages(install):
     assert plugins.names(GROUP) == ('amble', 'march', 'stroll')
 
 
-def test_what_is_named_is_imported_and_called(install):
+def test_the_object_of_an_entry_point_is_imported_and_called(install):
     install('strolls', 'def stroll(a, *, b): return a, b', {GROUP: {'stroll': 'stroll'}})
     assert plugins.load(GROUP, 'stroll').__name__ == 'stroll'
     assert plugins.make(GROUP, 'stroll', 1, b=2) == (1, 2)
 
 
-def test_an_unknown_name_lists_what_is_there(install):
+def test_the_error_for_an_unknown_name_lists_the_installed_plugins(install):
     with pytest.raises(PluginError, match=f"'stroll', expected a plug-in of {GROUP}; .*: none"):
         plugins.load(GROUP, 'stroll')
     install('strolls', '', {GROUP: {'b': 'x', 'a': 'x'}})
@@ -37,14 +37,14 @@ def test_an_unknown_name_lists_what_is_there(install):
     ('', "AttributeError: module 'strolls' has no attribute 'stroll'"),
     ('def', 'SyntaxError: '),
 ])
-def test_what_cannot_be_imported_names_its_entry_point(install, code, words):
+def test_the_error_for_a_failed_import_names_the_entry_point(install, code, words):
     install('strolls', code, {GROUP: {'stroll': 'stroll'}})
-    culprit = f'entry point {GROUP}: stroll = strolls:stroll of strolls: cannot be loaded: '
-    with pytest.raises(PluginError, match=re.escape(culprit + words)):
+    prefix = f'entry point {GROUP}: stroll = strolls:stroll of strolls: cannot be loaded: '
+    with pytest.raises(PluginError, match=re.escape(prefix + words)):
         plugins.load(GROUP, 'stroll')
 
 
-def test_a_call_that_fails_names_its_entry_point(install):
+def test_the_error_for_a_failed_call_names_the_entry_point(install):
     install('strolls', 'def stroll(): raise KeyError("speed")', {GROUP: {'stroll': 'stroll'}})
     with pytest.raises(PluginError, match=r"strolls:stroll of strolls: failed: KeyError: 'speed'"):
         plugins.make(GROUP, 'stroll')
@@ -52,7 +52,7 @@ def test_a_call_that_fails_names_its_entry_point(install):
         plugins.make(GROUP, 'stroll', 1)
 
 
-def test_two_packages_with_one_name_are_both_named(install):
+def test_the_error_for_a_duplicate_name_names_both_packages(install):
     install('strolls', 'def stroll(): return 1', {GROUP: {'stroll': 'stroll'}})
     install('ambles', 'def stroll(): return 2', {GROUP: {'stroll': 'stroll'}})
     with pytest.raises(PluginError, match=r"'stroll': .*ambles.* and .*strolls.*, expected one"):

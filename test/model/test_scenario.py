@@ -1,4 +1,4 @@
-"""The scenario: defaults, checks, files and derived numbers."""
+"""The scenario: defaults, checks, files and derived values."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ def test_defaults_are_table_1_of_the_paper():
     assert dataclasses.asdict(Scenario()) == expected
 
 
-def test_defaults_are_the_vectors(table1):
+def test_defaults_match_the_vectors(table1):
     assert table1.scenario == Scenario()
 
 
@@ -37,7 +37,7 @@ def test_derived_numbers(case):
     assert SPEED_OF_LIGHT_MPS == 299_792_458
 
 
-def test_values_take_their_declared_type():
+def test_values_are_converted_to_the_declared_type():
     s = Scenario(
         center_frequencies_hz=np.array([1e9]), n_feeds=np.int64(2), max_power_w=1,
         feed_positions_m=[[0, 1, 2], (0, '1e-1', 0)], roi_size_m=[1, 2, 3])
@@ -48,7 +48,7 @@ def test_values_take_their_declared_type():
     assert s.roi_size_m == (1.0, 2.0, 3.0)
 
 
-def test_equal_scenarios_hash_alike():
+def test_equal_scenarios_have_equal_hashes():
     one = Scenario(center_frequencies_hz=[28e9, 29e9], feed_positions_m=np.zeros((3, 3)))
     same = Scenario(center_frequencies_hz=('28e9', 29e9), feed_positions_m=[[0, 0, 0]] * 3)
     assert one == same
@@ -58,7 +58,7 @@ def test_equal_scenarios_hash_alike():
         one.n_feeds = 4
 
 
-# Field, value, how the message shows the value, what it says is expected.
+# Field, value, value and expectation in the message.
 BAD = [
     ('n_feeds', 2.5, '2.5', 'expected an integer'),
     ('n_feeds', True, 'True', 'expected an integer'),
@@ -105,7 +105,7 @@ def test_message_names_field_value_and_expectation(field, value, shown, expected
 
 
 @pytest.mark.parametrize('field', dataclasses.fields(Scenario), ids=lambda field: field.name)
-def test_bounds_are_inclusive_and_beyond_them_is_an_error(field):
+def test_values_just_outside_the_bounds_are_errors(field):
     if isinstance(field.default, int):
         outside = (field.metadata['low'] - 1, field.metadata['high'] + 1)
     else:
@@ -125,13 +125,13 @@ def test_bounds_are_inclusive_and_beyond_them_is_an_error(field):
 @pytest.mark.parametrize(('field', 'value'), [
     ('n_feeds', 1), ('n_feeds', 256), ('delay_spread_s', 0.0), ('delay_spread_s', 1.0),
     ('refractive_index', 1.0), ('max_power_w', 1e6), ('noise_psd_dbm_hz', -400.0)])
-def test_bounds_themselves_are_allowed(field, value):
+def test_bounds_are_inclusive(field, value):
     assert getattr(Scenario(**{field: value}), field) == value
 
 
 @pytest.mark.parametrize(('field', 'value'), [('n_feeds', 10**400), ('max_power_w', 10**400)],
                          ids=['integer', 'number'])
-def test_a_number_beyond_all_floats_is_out_of_range(field, value):
+def test_an_integer_too_large_for_a_float_is_out_of_range(field, value):
     with pytest.raises(ScenarioError, match=f'^{field}: '):
         Scenario(**{field: value})
 
@@ -158,21 +158,21 @@ CHANGES = [
 
 
 @pytest.mark.parametrize('changes', CHANGES, ids=str)
-def test_changes_are_what_differs_from_table_1(changes):
+def test_changes_are_the_differences_from_table_1(changes):
     found = Scenario(**changes).changes()
     assert found == changes
-    # Plain lists, not tuples: YAML's safe form has no others.
+    # Safe YAML has lists, but no tuples.
     assert yaml.safe_load(yaml.safe_dump(found)) == changes
 
 
 @pytest.mark.parametrize('changes', CHANGES, ids=str)
-def test_changes_make_a_file_of_the_same_scenario(tmp_path, changes):
+def test_changes_written_to_a_file_give_the_same_scenario(tmp_path, changes):
     path, scenario = tmp_path / 'scenario.yaml', Scenario(**changes)
     path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
     assert Scenario.from_yaml(path) == scenario
 
 
-def test_a_default_that_is_given_is_no_change(case):
+def test_a_given_default_is_not_a_change(case):
     whole = dataclasses.asdict(Scenario())
     assert Scenario(**whole).changes() == {}
     assert Scenario(center_frequencies_hz=['2.5e9', 3e9], max_power_w='1e-3').changes() == {}
@@ -196,7 +196,7 @@ def test_an_empty_file_is_table_1(tmp_path):
     ('roi_center_m: [1, 2]', ['roi_center_m: 2 values', 'expected a list of 3 numbers']),
     ('max_power_w: 2023-99-99', ['cannot be read']),
 ])
-def test_from_yaml_message_names_file_and_fault(tmp_path, text, words):
+def test_from_yaml_message_names_the_file_and_the_fault(tmp_path, text, words):
     path = tmp_path / 'scenario.yaml'
     path.write_text(text, encoding='utf-8')
     with pytest.raises(ScenarioError) as caught:

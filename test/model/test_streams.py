@@ -1,4 +1,4 @@
-"""Random generators that depend on their purpose alone."""
+"""Random generators that depend on their purpose only."""
 
 import itertools
 
@@ -9,7 +9,7 @@ from rhs_isac_ros.model import streams
 
 PURPOSES = {'CHANNEL': 0, 'RECEIVER': 1, 'USER': 2, 'BASE_STATION': 3, 'SAMPLES': 4, 'START': 5,
             'HELD_OUT': 6}
-# As the roles use them: multipath by user, cycle and band; noise by user and cycle; users.
+# Keys as the roles use them: multipath by user, cycle and band; noise by user and cycle; users.
 KEYS = [
     *((seed, streams.CHANNEL, user, cycle, band)
       for seed in (0, 1) for user in (1, 2) for cycle in (1, 2) for band in (0, 1)),
@@ -25,7 +25,7 @@ def first(key, n=4):
 
 
 def test_purposes_keep_their_numbers():
-    """Runs of older versions stay reproducible."""
+    """Otherwise, runs of older versions would not be reproducible."""
     assert {name: getattr(streams, name) for name in PURPOSES} == PURPOSES
 
 
@@ -61,7 +61,7 @@ def test_the_order_within_a_key_matters():
     assert first((0, streams.CHANNEL, 1, 2, 3)) != first((0, streams.CHANNEL, 2, 1, 3))
 
 
-def test_large_keys_are_fine():
+def test_large_keys_are_distinct():
     big = 2**31 - 1
     keys = [(big, streams.CHANNEL, big, 2**63, 4000), (big, streams.CHANNEL, big, 2**63, 4001)]
     assert first(keys[0]) != first(keys[1])

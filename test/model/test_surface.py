@@ -21,14 +21,14 @@ def complex_array(rng, *shape):
     return rng.normal(size=(*shape, 2)) @ [1, 1j]
 
 
-def test_onboard_matrix_is_the_vectors(case):
+def test_onboard_matrix_matches_the_vectors(case):
     matrix = surface.onboard_matrix(case.scenario)
     assert matrix.shape == case.vectors['B'].shape
     np.testing.assert_allclose(matrix, case.vectors['B'], rtol=1e-8)
     assert not matrix.flags.writeable
 
 
-def test_onboard_matrix_is_the_plain_one(odd, plain):
+def test_onboard_matrix_matches_the_definition(odd, plain):
     scenario, _ = odd
     p = plain(scenario)
     matrix = surface.onboard_matrix(scenario)
@@ -37,7 +37,7 @@ def test_onboard_matrix_is_the_plain_one(odd, plain):
         np.testing.assert_allclose(matrix[index], p.onboard(*index), rtol=1e-10)
 
 
-def test_onboard_gain_is_the_plain_one(plain):
+def test_onboard_gain_matches_the_definition(plain):
     scenario, rng = Scenario(refractive_index=3.0), np.random.default_rng(1)
     sources, sinks = rng.normal(size=(2, 4, 3))
     gains = surface.onboard_gain(scenario, 2.5e9, sources, sinks)
@@ -54,7 +54,7 @@ def test_element_signals_add_both_paths_and_carry_the_symbol():
             assert signals[j, m] == pytest.approx((los[j, m] + multipath[j, m]) * (0.5 - 2j))
 
 
-def test_feed_signals_are_the_plain_sum(odd, plain):
+def test_feed_signals_match_the_definition(odd, plain):
     scenario, codebook = odd
     p = plain(scenario)
     elements = complex_array(np.random.default_rng(3), 3, 9)
@@ -70,19 +70,19 @@ def test_feed_signals_are_the_plain_sum(odd, plain):
                     np.testing.assert_allclose(feeds[j, k], expected, rtol=1e-10)
 
 
-def test_combine_is_the_plain_sum():
+def test_combine_is_the_weighted_sum_plus_noise():
     rng = np.random.default_rng(4)
     digital, feeds = complex_array(rng, 2, 5, 3)
     noise = complex_array(rng, 5)
     combined = surface.combine(digital, feeds, noise)
-    quiet = surface.combine(digital, feeds, 0)
+    noiseless = surface.combine(digital, feeds, 0)
     for j in range(5):
         expected = sum(digital[j, k] * feeds[j, k] for k in range(3))
-        assert quiet[j] == pytest.approx(expected, rel=1e-12)
+        assert noiseless[j] == pytest.approx(expected, rel=1e-12)
         assert combined[j] == pytest.approx(expected + noise[j], rel=1e-12)
 
 
-def test_radiation_matrix_is_the_plain_one(odd, plain):
+def test_radiation_matrix_matches_the_definition(odd, plain):
     scenario, codebook = odd
     p = plain(scenario, codebook.analog, codebook.digital)
     matrix = surface.radiation_matrix(scenario, codebook)
@@ -113,10 +113,11 @@ def test_the_matched_configuration_follows_the_interference(small):
     los = los_gain(scenario, np.array([[8.0, 1.0, 0.2]]), 0)[0]
     onboard = surface.onboard_matrix(scenario)[0]
     matched = surface.matched_configuration(los, onboard)
-    pattern = [sum(los[j, m] * onboard[j, k, m] for j in range(3) for k in range(2)).real
-               for m in range(16)]
-    assert (np.argsort(matched) == np.argsort(pattern)).all()
-    np.testing.assert_allclose(2 * matched - 1, np.array(pattern) / np.abs(pattern).max())
+    interference = [sum(los[j, m] * onboard[j, k, m] for j in range(3) for k in range(2)).real
+                    for m in range(16)]
+    assert (np.argsort(matched) == np.argsort(interference)).all()
+    np.testing.assert_allclose(
+        2 * matched - 1, np.array(interference) / np.abs(interference).max())
     assert matched.min() >= 0
     assert matched.max() <= 1
     assert np.isclose(matched, 0).any() or np.isclose(matched, 1).any()
@@ -129,7 +130,7 @@ def test_the_matched_configuration_does_not_depend_on_scale_and_spans_the_range(
     matched = surface.matched_configuration(los, onboard)
     assert matched.shape == (9,)
     np.testing.assert_allclose(surface.matched_configuration(1e-4 * los, onboard), matched)
-    # What agrees on one side is the opposite on the other.
+    # A change of sign turns constructive into destructive interference.
     np.testing.assert_allclose(surface.matched_configuration(-los, onboard), 1 - matched)
     np.testing.assert_allclose(surface.matched_configuration(los, -onboard), 1 - matched)
     assert np.abs(matched - 0.5).max() == pytest.approx(0.5)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import qmc
 
 from rhs_isac_ros.codebook import CodebookError
-from rhs_isac_ros.model import Scenario, mean_received, simulate_received
+from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning import ESTIMATORS, SignalError, make_estimator
 
@@ -99,7 +99,7 @@ def test_strong_signals_give_accurate_positions(single_mode):
     errors = estimate.mean - positions
     assert np.linalg.norm(errors, axis=1).max() < 0.1
     assert 1.5 < squared_normalised(errors, estimate.covariance).mean() < 5
-    noiseless = estimator.estimate(mean_received(scenario, codebook, positions))
+    noiseless = estimator.estimate(MeasurementModel(scenario, codebook).mean(positions))
     assert np.linalg.norm(noiseless.mean - positions, axis=1).max() < 0.02
 
 

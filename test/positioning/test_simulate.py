@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import CodebookError
-from rhs_isac_ros.model import Scenario, mean_received, simulate_received
+from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.positioning import simulate_pairs
 
 
@@ -40,10 +40,11 @@ def test_seeds_and_chunks_give_different_pairs(setting):
 def test_signals_have_the_distribution_of_eq_8(setting):
     """The reference is `simulate_received`, which draws multipath element by element."""
     positions, received = simulate_pairs(*setting, 20_000, 0)
-    scattered = received - mean_received(*setting, positions)
+    model = MeasurementModel(*setting)
+    scattered = received - model.mean(positions)
     fixed = np.tile(positions[:1], (20_000, 1))
     reference = simulate_received(*setting, fixed, np.random.default_rng(1))
-    reference -= mean_received(*setting, positions[:1])
+    reference -= model.mean(positions[:1])
     moments = []
     for sample in (scattered, reference):
         flat = sample.reshape(len(sample), -1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import Scenario, mean_received, simulate_received
+from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning.polar import to_polar
 from rhs_isac_ros.positioning.table import TemplateTable, separate
@@ -78,7 +78,7 @@ def test_log_likelihood_matches_the_exact_one(scenario, model, table, plain):
 def test_modes_of_noiseless_signals_contain_the_true_position(scenario, model, table):
     """Its accuracy is that of one Gauss-Newton step."""
     positions = scenario.sample_positions(20, np.random.default_rng(3))
-    whitened = model.whiten(mean_received(scenario, model.codebook, positions))
+    whitened = model.mean(positions)
     for point, y in zip(to_polar(positions), whitened, strict=True):
         modes = table.modes(y, 30, 10.0)
         assert 1 <= len(modes) <= 30

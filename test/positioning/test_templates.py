@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rhs_isac_ros.bounds.fisher import fisher_information
-from rhs_isac_ros.model import Scenario, mean_received
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning.polar import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.templates import (
     DIRECTION_STEP,
@@ -50,7 +50,7 @@ def test_arrays_of_the_table_match_their_definitions(random_beams):
 
     def template(points):
         """Whitened means times the carriers at the grid points."""
-        received = mean_received(scenario, codebook, to_positions(points))
+        received = MeasurementModel(scenario, codebook).mean(to_positions(points))
         return model.whiten(received) * carrier[..., None]
 
     templates = template(points)

@@ -14,8 +14,8 @@ def model(case) -> WhitenedModel:
     return WhitenedModel(case.scenario, case.codebook)
 
 
-def test_whitening_makes_the_vectors_covariance_the_identity(case, model):
-    """Whitens the columns of a square root of the covariance, one as a signal each."""
+def test_whiten_makes_the_covariance_of_the_vectors_the_identity(case, model):
+    """The columns of a square root of the covariance serve as signals."""
     n_bands, n_rows = case.vectors['cov'].shape[:2]
     roots = np.linalg.cholesky(case.vectors['cov'])
     columns = np.moveaxis(roots, 2, 0)
@@ -26,7 +26,7 @@ def test_whitening_makes_the_vectors_covariance_the_identity(case, model):
         np.testing.assert_allclose(root @ root.conj().T, np.eye(n_rows), atol=1e-8)
 
 
-def test_whitened_means_have_the_vectors_products(case, model):
+def test_whitened_means_have_the_scalar_products_of_the_vectors(case, model):
     """Between any two positions: t1^H t2 is the sum of mu1^H Lambda^-1 mu2 over the bands."""
     t = model.mean(case.vectors['positions'])
     products = np.einsum('air,bir->ab', t.conj(), t)
@@ -36,7 +36,7 @@ def test_whitened_means_have_the_vectors_products(case, model):
 
 
 def test_log_likelihood_of_whitened_signals_is_the_gaussian_one(case, model):
-    """The density of the unwhitened signals, up to what no position changes."""
+    """Up to a constant, it is the log density of the signals before whitening."""
     rng = np.random.default_rng(0)
     n_bands, n_rows = case.vectors['cov'].shape[:2]
     noise = 1e-7 * rng.normal(size=(n_bands, n_rows, 2)) @ [1, 1j]
@@ -53,16 +53,16 @@ def test_log_likelihood_of_whitened_signals_is_the_gaussian_one(case, model):
         likelihood - likelihood[0], exact - exact[0], rtol=1e-6, atol=1e-6 * np.abs(exact).max())
 
 
-def test_derivative_is_the_limit_of_differences(case, model):
+def test_jacobian_is_the_limit_of_differences_of_the_mean(case, model):
     positions, step = case.vectors['positions'], 1e-5
-    mean, derivative = model.mean_and_derivative(positions)
+    mean, jacobian = model.mean_and_jacobian(positions)
     np.testing.assert_allclose(mean, model.mean(positions), rtol=1e-9, atol=1e-9)
-    assert derivative.shape == (len(positions), 3, *mean.shape[1:])
+    assert jacobian.shape == (len(positions), 3, *mean.shape[1:])
     for u in range(3):
         shift = step * np.eye(3)[u]
         difference = (model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
         np.testing.assert_allclose(
-            derivative[:, u], difference, rtol=0, atol=1e-7 * np.abs(derivative).max())
+            jacobian[:, u], difference, rtol=0, atol=1e-7 * np.abs(jacobian).max())
 
 
 def test_a_codebook_that_does_not_fit_is_an_error(small):

@@ -4,10 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import measurement_correlation
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_derivative
-from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
 
 

@@ -1,0 +1,133 @@
+"""Products of the radiation matrices with the rows of quadratic forms.
+
+A row is a linear function of one band's line-of-sight gains, such as their derivative with respect
+to one coordinate, or their difference between two positions. Its mean is the same function of the
+mean signals, by the kernel of Eq. (13). All objectives are made of whitened means, and most of
+their time is spent here.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.measurement import mean_derivative
+
+# Callable that takes (block of n items, band) and returns the items' rows, complex128
+# [n, G, N_SB, N_E].
+RowSource = Callable[[slice, int], np.ndarray]
+# Items per block, such that the arrays of a block fit the cache.
+_BLOCK = 128
+# Memory for exact rows that are kept between evaluations.
+_CACHE_BYTES = 1 << 30
+
+
+class GradientSums(NamedTuple):
+    """Sums over all items from which the gradients of one band are computed.
+
+    With zeta = Lambda^-1 times the means, and w = Lambda^-1 times the weighted means:
+
+    Attributes
+    ----------
+    mean_term
+        Sum of w conj(row), complex128 [N_SB F, N_E].
+    covariance_term
+        Sum of w zeta^H, complex128 [N_SB F, N_SB F].
+    """
+
+    mean_term: np.ndarray
+    covariance_term: np.ndarray
+
+
+class Evaluation(Protocol):
+    """One evaluation for one measurement model, block by block."""
+
+    def whitened(self, block: slice, band: int) -> np.ndarray:
+        """Compute the whitened means of a block of n items, complex128 [n, G, N_SB F]."""
+        ...
+
+    def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
+        """Add a block's weighted whitened means, complex128 [n, G, N_SB F], to the sums.
+
+        The last call of `whitened` for this band must have been for the same block.
+        """
+        ...
+
+    def sums(self, band: int) -> GradientSums:
+        """Return the sums over the blocks that were accumulated."""
+        ...
+
+
+class MeasurementRows(Protocol):
+    """Rows of all items and bands."""
+
+    n_items: int
+
+    def begin(self, model: MeasurementModel) -> Evaluation:
+        """Begin an evaluation with the radiation and whitening matrices of a model."""
+        ...
+
+
+class ExactRows:
+    """Rows without approximation, kept between evaluations if they fit the memory limit."""
+
+    def __init__(
+            self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int) -> None:
+        self.n_items, self._source = n_items, source
+        size = 16 * n_items * n_rows * scenario.n_bands * scenario.n_subbands * scenario.n_elements
+        self._keeps_all = size <= _CACHE_BYTES
+        # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
+        self._kept: dict[tuple[int, int], np.ndarray] = {}
+
+    def begin(self, model: MeasurementModel) -> Evaluation:
+        """Begin an evaluation with the radiation and whitening matrices of a model."""
+        return _ExactEvaluation(self, model)
+
+    def of(self, block: slice, band: int) -> np.ndarray:
+        """Return the rows of a block, complex128 [n, G, N_SB, N_E], sub-bands first in memory."""
+        key = block.start, band
+        if key not in self._kept:
+            if not self._keeps_all and any(start != block.start for start, _ in self._kept):
+                self._kept.clear()
+            rows = self._source(block, band)
+            # With sub-bands first, every matrix product reads contiguous memory.
+            rows = np.moveaxis(np.ascontiguousarray(np.moveaxis(rows, 2, 0)), 0, 2)
+            self._kept[key] = rows
+        return self._kept[key]
+
+
+class _ExactEvaluation:
+    """Evaluation with exact rows."""
+
+    def __init__(self, rows: ExactRows, model: MeasurementModel) -> None:
+        self._rows, self._radiation, self._whitener = rows, model.radiation, model.whitener
+        self._mean_term = np.zeros_like(self._radiation)
+        self._covariance_term = np.zeros_like(self._whitener)
+        self._last: list[np.ndarray] = [np.empty(0)] * len(self._radiation)
+
+    def whitened(self, block: slice, band: int) -> np.ndarray:
+        means = mean_derivative(self._rows.of(block, band), self._radiation[band])
+        self._last[band] = means @ self._whitener[band].T
+        return self._last[band]
+
+    def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
+        whitener = self._whitener[band]
+        n_measurements = len(whitener)
+        zeta = self._last[band].reshape(-1, n_measurements) @ np.conj(whitener)
+        weights = weighted.reshape(-1, n_measurements) @ np.conj(whitener)
+        self._covariance_term[band] += weights.T @ np.conj(zeta)
+        rows = self._rows.of(block, band)
+        n, n_rows, n_subbands, n_elements = rows.shape
+        stacked = np.moveaxis(rows, 2, 0).reshape(n_subbands, n * n_rows, n_elements)
+        weights = np.conj(weights).reshape(n * n_rows, n_subbands, -1).transpose(1, 2, 0)
+        self._mean_term[band] += np.conj(np.matmul(weights, stacked)).reshape(-1, n_elements)
+
+    def sums(self, band: int) -> GradientSums:
+        return GradientSums(self._mean_term[band], self._covariance_term[band])
+
+
+def blocks(n_items: int) -> Iterator[slice]:
+    """Split the items, in order, into blocks that fit the cache."""
+    for start in range(0, n_items, _BLOCK):
+        yield slice(start, min(start + _BLOCK, n_items))

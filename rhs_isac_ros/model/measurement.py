@@ -1,0 +1,230 @@
+"""Gaussian model of the signals received in a positioning phase.
+
+The signals of band i are complex Gaussian with a mean that depends on the user's position and a
+covariance Lambda_i that does not. Bands are independent of each other.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.model.los import (
+    checked_positions,
+    los_derivative,
+    los_derivative_terms,
+    los_gain,
+)
+from rhs_isac_ros.model.multipath import (
+    complex_normal,
+    measurement_correlation,
+    multipath_covariance,
+)
+from rhs_isac_ros.model.receive import received_signal
+from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
+
+# Positions evaluated at a time.
+_BLOCK = 256
+
+
+def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
+    """Implements Eq. (13). Derivative of one band's mean signal with respect to the position.
+
+    Returns complex128 [N, G, N_SB F] [1/m], sub-band-major.
+
+    Parameters
+    ----------
+    slopes
+        Derivative of the line-of-sight gains, complex128 [N, G, N_SB, N_E] [1/m]; G is 3. Any
+        other linear functions of the gains may take its place.
+    radiation
+        T_i of the band, complex128 [N_SB F, N_E].
+    """
+    n, n_rows, n_subbands, n_elements = slopes.shape
+    frames = radiation.reshape(n_subbands, -1, n_elements)
+    # One matrix product per sub-band: [G N, N_E] with [N_E, F].
+    stacked = np.moveaxis(slopes, 2, 0).reshape(n_subbands, n_rows * n, n_elements)
+    products = np.matmul(stacked, np.swapaxes(frames, 1, 2))
+    derivative: np.ndarray = np.moveaxis(products, 0, 1).reshape(n, n_rows, -1)
+    return derivative
+
+
+def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
+    """Implements Eq. (14). Covariance of the received signals, independent of the position.
+
+    Returns Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W], for the radiation matrices T_i of all
+    bands, complex128 [N_B, N_SB F, N_E].
+    """
+    spatial = multipath_covariance(scenario)
+    scattered = np.matmul(np.matmul(radiation, spatial), np.conj(np.swapaxes(radiation, 1, 2)))
+    noise = scenario.noise_power_w * np.eye(radiation.shape[1])
+    covariance: np.ndarray = measurement_correlation(scenario) * scattered + noise
+    return covariance
+
+
+class MeasurementModel:
+    """Distribution of the received signals for one scenario and beamforming.
+
+    Immutable. Construction computes the radiation matrices only; the factors of the covariance
+    and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
+
+    Positions are those of the user, float64 [N, 3] [m]. Methods that take them raise ValueError
+    if their shape is another one or a value is not finite. Measurements are sub-band-major.
+
+    Attributes
+    ----------
+    radiation
+        T_i of Eq. (9), complex128 [N_B, N_SB F, N_E], read-only.
+
+    Raises
+    ------
+    ValueError
+        If the beamforming does not have the sizes of the scenario.
+    """
+
+    def __init__(self, scenario: Scenario, beamforming: Beamforming) -> None:
+        self.scenario = scenario
+        self.radiation = _read_only(radiation_matrix(scenario, beamforming))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes (N_B, N_SB F) of the signals of a positioning phase."""
+        n_bands, n_measurements, _ = self.radiation.shape
+        return n_bands, n_measurements
+
+    def covariance(self) -> np.ndarray:
+        """Compute Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W]; the result is not kept."""
+        return signal_covariance(self.scenario, self.radiation)
+
+    @functools.cached_property
+    def root(self) -> np.ndarray:
+        """Cholesky factor L_i of Lambda_i, complex128 [N_B, N_SB F, N_SB F], read-only."""
+        return _read_only(np.linalg.cholesky(self.covariance()))
+
+    @functools.cached_property
+    def whitener(self) -> np.ndarray:
+        """L_i^-1, lower triangular, complex128 [N_B, N_SB F, N_SB F], read-only."""
+        return _read_only(np.linalg.inv(self.root))
+
+    def prepare(self, jacobian: bool = False) -> 'MeasurementModel':
+        """Compute the whitener, and on request the weights of `mean_and_jacobian`, in advance."""
+        _ = self.whitener
+        if jacobian:
+            _ = self._weights
+        return self
+
+    def whiten(self, signals: np.ndarray) -> np.ndarray:
+        """Transform signals [..., N_B, N_SB F] to unit covariance; the shape stays the same."""
+        # Unlike a matrix product, this rounds a signal the same in a batch of any size.
+        whitened: np.ndarray = np.einsum('irs,...is->...ir', self.whitener, signals)
+        return whitened
+
+    def mean(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
+        positions = checked_positions(positions)
+        mean = np.empty((len(positions), *self.shape), complex)
+        # Simulated signals of a seed keep their bytes only if this kernel and its blocks do.
+        for band, radiation in enumerate(self.radiation):
+            for start in range(0, len(positions), _BLOCK):
+                block = slice(start, start + _BLOCK)
+                los = los_gain(self.scenario, positions[block], band)
+                mean[block, band] = received_signal(los, 0.0, radiation, 0.0)
+        return mean
+
+    def band_jacobian(self, positions: np.ndarray, band: int) -> np.ndarray:
+        """Compute the derivative of one band's mean signals, complex128 [N, 3, N_SB F] [1/m].
+
+        All positions are evaluated at once, with memory for [N, 3, N_SB, N_E] numbers.
+        """
+        slopes = los_derivative(self.scenario, positions, band)
+        return mean_derivative(slopes, self.radiation[band])
+
+    def jacobian(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the derivative of the mean signals, complex128 [N, 3, N_B, N_SB F] [1/m]."""
+        positions = checked_positions(positions)
+        jacobian = np.empty((len(positions), 3, *self.shape), complex)
+        for start in range(0, len(positions), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            for band in range(len(self.radiation)):
+                jacobian[block, :, band] = self.band_jacobian(positions[block], band)
+        return jacobian
+
+    def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute `mean` and `jacobian` together, much faster and with other rounding."""
+        positions = checked_positions(positions)
+        mean = np.empty((len(positions), *self.shape), complex)
+        jacobian = np.empty((len(positions), 3, *self.shape), complex)
+        for start in range(0, len(positions), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            for band in range(len(self.radiation)):
+                mean[block, band], by_position = self._band_mean_and_jacobian(
+                    positions[block], band)
+                jacobian[block, :, band] = np.swapaxes(by_position, 0, 1)
+        return mean, jacobian
+
+    def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
+
+        Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
+        draws the gain of every element, for the same distribution in a hundred times the time.
+        """
+        signals = self.mean(positions)
+        white = complex_normal(signals.shape, rng)
+        for band, root in enumerate(self.root):
+            signals[:, band] += white[:, band] @ root.T
+        return signals
+
+    @functools.cached_property
+    def _weights(self) -> '_Weights':
+        scenario = self.scenario
+        shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
+        frames = np.ascontiguousarray(np.swapaxes(self.radiation.reshape(shape), 2, 3))
+        coordinates = np.hstack([np.ones((shape[3], 1)), element_positions(scenario)])
+        moments = coordinates[:, :, None] * frames[..., None, :]
+        return _Weights(frames, moments.reshape(*frames.shape[:3], -1))
+
+    def _band_mean_and_jacobian(
+            self, positions: np.ndarray, band: int) -> tuple[np.ndarray, np.ndarray]:
+        """Mean [N, N_SB F] and its derivative [3, N, N_SB F] with p - p_m factored out.
+
+        Each sum over elements of a T_i (p - p_m) is p times the sum of a T_i, minus the sum of
+        a T_i p_m: four sums of N_E terms that need no array of N_E by 3.
+        """
+        n, n_measurements = len(positions), self.shape[1]
+        gain, radial, boresight_term = los_derivative_terms(self.scenario, positions, band)
+        frames, moments = self._weights.frames[band], self._weights.moments[band]
+
+        def combine(elements: np.ndarray) -> np.ndarray:
+            products = np.matmul(elements.transpose(1, 0, 2), frames)
+            combined: np.ndarray = products.transpose(1, 0, 2).reshape(n, n_measurements)
+            return combined
+
+        sums = np.matmul(radial.transpose(1, 0, 2), moments)
+        sums = sums.reshape(-1, n, 4, frames.shape[2]).transpose(2, 1, 0, 3)
+        sums = sums.reshape(4, n, n_measurements)
+        by_position = positions.T[:, :, None] * sums[0] - sums[1:]
+        if boresight_term is not None:
+            by_position[0] += combine(boresight_term)
+        return combine(gain), by_position
+
+
+class _Weights(NamedTuple):
+    """Weights of the elements for `mean_and_jacobian`.
+
+    Attributes
+    ----------
+    frames
+        T_i, complex128 [N_B, N_SB, N_E, F].
+    moments
+        T_i times (1, x, y, z) of the element [m], complex128 [N_B, N_SB, N_E, 4 F].
+    """
+
+    frames: np.ndarray
+    moments: np.ndarray
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,248 @@
+"""The Gaussian model of the received signals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import GainPattern, MeasurementModel, Scenario, measurement
+from rhs_isac_ros.model.los import los_derivative
+from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.model.surface import radiation_matrix
+
+POSITION_METHODS = ('mean', 'jacobian', 'mean_and_jacobian')
+N_PHASES = 20_000
+
+
+@pytest.fixture(scope='module')
+def model(case) -> MeasurementModel:
+    return MeasurementModel(case.scenario, case.codebook)
+
+
+@pytest.fixture(scope='module')
+def faded(random_beams):
+    """Three bands whose sub-bands and frames are far from fully correlated."""
+    scenario = Scenario(
+        center_frequencies_hz=(1.2e9, 2e9, 3.1e9), n_subbands=2, n_frames=3, n_feeds=2,
+        elements_per_side=3, subband_width_hz=4e5, frame_duration_s=3e-3, noise_psd_dbm_hz=-150,
+        roi_center_m=(3, 0, 0), roi_size_m=(2, 4, 2))
+    return scenario, random_beams(scenario, np.random.default_rng(0))
+
+
+def test_covariance_matches_the_vectors(case, model):
+    scale = np.abs(case.vectors['cov']).max()
+    np.testing.assert_allclose(
+        model.covariance(), case.vectors['cov'], rtol=1e-8, atol=1e-8 * scale)
+
+
+def test_covariance_matches_the_definition_for_low_correlation(faded, plain):
+    scenario, codebook = faded
+    p = plain(scenario, codebook.analog, codebook.digital)
+    spatial = multipath_covariance(scenario)
+    covariance = MeasurementModel(scenario, codebook).covariance()
+    for band in range(3):
+        expected = p.covariance(band, spatial[band])
+        np.testing.assert_allclose(
+            covariance[band], expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+def test_root_is_the_cholesky_factor_of_the_covariance(model):
+    product = model.root @ np.conj(np.swapaxes(model.root, 1, 2))
+    covariance = model.covariance()
+    np.testing.assert_allclose(product, covariance, rtol=0, atol=1e-12 * np.abs(covariance).max())
+    np.testing.assert_array_equal(np.triu(model.root, 1), 0)
+
+
+def test_whitener_whitens_the_covariance_of_the_vectors(case, model):
+    for whitener, covariance in zip(model.whitener, case.vectors['cov'], strict=True):
+        white = whitener @ covariance @ whitener.conj().T
+        np.testing.assert_allclose(white, np.eye(len(white)), atol=1e-8)
+        assert np.abs(np.triu(whitener, 1)).max() < 1e-12 * np.abs(whitener).max()
+
+
+@pytest.mark.parametrize('leading', [(), (5,), (2, 3)], ids=str)
+def test_whiten_applies_the_whitener_of_each_band(model, leading):
+    signals = np.random.default_rng(0).normal(size=(*leading, *model.shape, 2)) @ [1, 1j]
+    whitened = model.whiten(signals)
+    assert whitened.shape == signals.shape
+    for band, whitener in enumerate(model.whitener):
+        expected = signals[..., band, :] @ whitener.T
+        np.testing.assert_allclose(
+            whitened[..., band, :], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_mean_matches_the_vectors(case, model):
+    mean = model.mean(case.vectors['positions'])
+    np.testing.assert_allclose(mean, np.moveaxis(case.vectors['mean'], 0, 1), rtol=1e-8)
+
+
+def test_mean_matches_the_definition(small, plain):
+    p = plain(small.scenario, small.codebook.analog, small.codebook.digital)
+    positions = small.scenario.sample_positions(3, np.random.default_rng(0))
+    mean = MeasurementModel(small.scenario, small.codebook).mean(positions)
+    np.testing.assert_allclose(mean[:, 0], p.mean(positions, 0), rtol=1e-9)
+
+
+@pytest.mark.parametrize('method', POSITION_METHODS)
+def test_result_does_not_depend_on_the_blocks(case, model, monkeypatch, method):
+    expected = getattr(model, method)(case.vectors['positions'])
+    monkeypatch.setattr(measurement, '_BLOCK', 4)
+    actual = getattr(model, method)(case.vectors['positions'])
+    for one, other in zip(actual, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
+
+
+def test_jacobian_is_the_limit_of_differences_of_the_mean(faded, plain):
+    scenario, codebook = faded
+    p = plain(scenario, codebook.analog, codebook.digital)
+    model, step = MeasurementModel(scenario, codebook), 1e-5
+    positions = scenario.sample_positions(2, np.random.default_rng(2))
+    jacobian = model.jacobian(positions)
+    assert jacobian.shape == (2, 3, 3, 6)
+    for band in range(3):
+        np.testing.assert_array_equal(jacobian[:, :, band], model.band_jacobian(positions, band))
+        for u in range(3):
+            shift = step * np.eye(3)[u]
+            difference = (p.mean(positions + shift, band)
+                          - p.mean(positions - shift, band)) / (2 * step)
+            np.testing.assert_allclose(
+                jacobian[:, u, band], difference, rtol=0,
+                atol=1e-7 * np.abs(jacobian[:, :, band]).max())
+
+
+PATTERNS = {
+    'constant gains': {},
+    'element pattern': {'element_gain': GainPattern(lambda angles: np.exp(-angles**2))},
+    'user pattern': {'user_gain': GainPattern(lambda angles: 1 + np.cos(angles))},
+    'both patterns': {'element_gain': GainPattern(lambda angles: np.exp(-angles**2)),
+                      'user_gain': GainPattern(lambda angles: 1 + np.cos(angles))}}
+
+
+@pytest.mark.parametrize('gains', PATTERNS.values(), ids=PATTERNS.keys())
+@pytest.mark.parametrize('n', [1, 300])
+def test_fast_mean_and_jacobian_equal_the_exact_ones(faded, gains, n):
+    scenario = dataclasses.replace(faded[0], **gains)
+    model = MeasurementModel(scenario, faded[1])
+    positions = scenario.sample_positions(n, np.random.default_rng(3))
+    mean, jacobian = model.mean_and_jacobian(positions)
+    for actual, expected in ((mean, model.mean(positions)), (jacobian, model.jacobian(positions))):
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('n_rows', [1, 2, 3])
+def test_mean_derivative_accepts_any_number_of_rows(faded, n_rows):
+    scenario, codebook = faded
+    rng, radiation = np.random.default_rng(7), radiation_matrix(scenario, codebook)[1]
+    rows = rng.normal(size=(4, n_rows, 2, 9, 2)) @ [1, 1j]
+    means = measurement.mean_derivative(rows, radiation)
+    assert means.shape == (4, n_rows, 6)
+    expected = np.einsum('jqm,ngjm->ngjq', radiation.reshape(2, 3, 9), rows)
+    np.testing.assert_allclose(means, expected.reshape(4, n_rows, 6), rtol=1e-10)
+
+
+def test_band_jacobian_is_the_derivative_of_the_gains_times_the_radiation(case, model):
+    positions = case.vectors['positions']
+    for band in range(len(model.radiation)):
+        slopes = los_derivative(case.scenario, positions, band)
+        np.testing.assert_array_equal(
+            model.band_jacobian(positions, band),
+            measurement.mean_derivative(slopes, model.radiation[band]))
+
+
+def test_samples_have_the_mean_and_covariance_of_the_vectors(case, model):
+    """Deviations whitened by the vectors' covariance are white to the accuracy of the sample."""
+    position = case.vectors['positions'][2]
+    signals = model.sample(np.tile(position, (N_PHASES, 1)), np.random.default_rng(4))
+    assert signals.shape == (N_PHASES, *model.shape)
+    whitened = []
+    for band, covariance in enumerate(case.vectors['cov']):
+        deviation = signals[:, band] - case.vectors['mean'][band, 2]
+        whitened.append(np.linalg.solve(np.linalg.cholesky(covariance), deviation.T))
+    # Stacking the bands also checks that they are independent.
+    white = np.concatenate(whitened)
+    limit = 5.0 / np.sqrt(N_PHASES)
+    assert np.abs(white @ white.conj().T / N_PHASES - np.eye(len(white))).max() < limit
+    assert np.abs(white @ white.T / N_PHASES).max() < limit * np.sqrt(2)
+    assert np.abs(white.mean(axis=1)).max() < limit
+
+
+def test_each_sample_belongs_to_its_position(case, model):
+    positions = case.scenario.sample_positions(300, np.random.default_rng(5))
+    signals = model.sample(positions, np.random.default_rng(6))
+    np.testing.assert_array_equal(signals, model.sample(positions, np.random.default_rng(6)))
+    white = model.whiten(signals - model.mean(positions))
+    n = np.prod(model.shape)
+    energy = np.sum(np.abs(white)**2, axis=(1, 2))
+    assert energy.mean() == pytest.approx(n, abs=5 * np.sqrt(n / 300))
+
+
+@pytest.fixture
+def factorizations(monkeypatch):
+    """Names of the NumPy functions that factor or invert, as they are called."""
+    calls = []
+
+    def record(name):
+        original = getattr(np.linalg, name)
+
+        def call(*arguments):
+            calls.append(name)
+            return original(*arguments)
+        monkeypatch.setattr(np.linalg, name, call)
+    for name in ('cholesky', 'inv'):
+        record(name)
+    return calls
+
+
+def test_construction_computes_only_the_radiation(case, factorizations):
+    model = MeasurementModel(case.scenario, case.codebook)
+    model.mean(case.vectors['positions'])
+    model.jacobian(case.vectors['positions'])
+    assert factorizations == []
+    assert not {'root', 'whitener', '_weights'} & set(vars(model))
+    model.mean_and_jacobian(case.vectors['positions'])
+    assert factorizations == []
+
+
+def test_factors_are_computed_once_and_shared(case, factorizations):
+    model = MeasurementModel(case.scenario, case.codebook)
+    for _ in range(2):
+        assert model.whitener is model.whitener
+        model.sample(case.vectors['positions'], np.random.default_rng(7))
+    assert factorizations == ['cholesky', 'inv']
+
+
+def test_prepare_leaves_nothing_to_compute(case, factorizations):
+    model = MeasurementModel(case.scenario, case.codebook)
+    assert model.prepare() is model
+    assert factorizations == ['cholesky', 'inv']
+    assert '_weights' not in vars(model)
+    model.prepare(jacobian=True)
+    assert '_weights' in vars(model)
+    assert factorizations == ['cholesky', 'inv']
+
+
+@pytest.mark.parametrize('name', ['radiation', 'root', 'whitener'])
+def test_arrays_are_read_only(model, name):
+    with pytest.raises(ValueError, match='read-only'):
+        getattr(model, name)[0, 0, 0] = 1
+
+
+def test_no_positions_have_no_signals(model):
+    empty = np.zeros((0, 3))
+    assert model.mean(empty).shape == (0, *model.shape)
+    assert model.jacobian(empty).shape == (0, 3, *model.shape)
+    assert [part.shape for part in model.mean_and_jacobian(empty)] == [
+        (0, *model.shape), (0, 3, *model.shape)]
+
+
+@pytest.mark.parametrize('method', POSITION_METHODS)
+@pytest.mark.parametrize('positions', [[10.0, 0.0, 0.0], [[10.0, 0.0]], [[10.0, 0.0, np.nan]]])
+def test_malformed_positions_are_errors(model, method, positions):
+    with pytest.raises(ValueError, match='^positions: .*, expected '):
+        getattr(model, method)(np.array(positions))
+
+
+def test_beamforming_of_another_size_is_an_error(small):
+    scenario = dataclasses.replace(small.scenario, elements_per_side=3)
+    with pytest.raises(ValueError, match='^analog: shape '):
+        MeasurementModel(scenario, small.codebook)
