@@ -25,8 +25,8 @@ def published():
     from visualization_msgs.msg import MarkerArray
 
     from rhs_isac_ros.ros import qos, topics
-    from rhs_isac_ros.ros.recording import outlets, type_name
-    known = outlets() | {topics.MARKERS: (MarkerArray, qos.EXCHANGE)}
+    from rhs_isac_ros.ros.recording import recorded_topics, type_name
+    known = recorded_topics() | {topics.MARKERS: (MarkerArray, qos.EXCHANGE)}
     for name in (topics.PATH, topics.TRUE_PATH):
         known |= {name.format(user=user): (Way, qos.EXCHANGE) for user in range(1, 5)}
     return lambda name: (known[name][0], type_name(known[name][0]), known[name][1])

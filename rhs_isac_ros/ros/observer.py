@@ -1,4 +1,4 @@
-"""A node that watches the cycles of a network from outside."""
+"""A node that logs the cycles of a network, and may record it."""
 
 import time
 from typing import Any
@@ -13,12 +13,12 @@ from rhs_isac_ros.ros.subscriptions import listen
 
 
 class CycleObserver(Node):
-    """Collects the cycles that it sees on the topics.
+    """Subscribes to the messages of a network and logs its cycles.
 
     Parameters
     ----------
     recorder
-        Also takes down what is seen, and everything else; whoever made it closes it.
+        Recorder of all topics, if any; the caller closes it.
 
     Attributes
     ----------
@@ -30,7 +30,8 @@ class CycleObserver(Node):
         super().__init__('cycle_observer', **node_options)
         self.log = cycle_log.CycleLog()
         if recorder is not None:
-            # One subscription for both, so that a replay sees the same cycles in the same order.
+            # The log and the recorder share subscriptions, so that a replay yields the same
+            # cycles in the same order.
             kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
             recorder.listen(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))

@@ -26,11 +26,11 @@ from rhs_isac_ros.positioning import (
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.recording import RecordingError, outlets, read, read_scenario
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.tools.republish import RepublishError, republish, root_of
 
 # What can be published again: the codebook is a parameter first, and diagnostics are of nodes.
-_TOPICS = sorted(set(outlets()) - {topics.CODEBOOK, topics.DIAGNOSTICS})
+_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.recording import RecordingError, outlets, read, read_scenario
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.timers import steady_timer
 
@@ -71,7 +71,7 @@ class RepublisherNode(Node):
         # What the steady clock shows when that of the recording shows 0 [s]; None before the
         # first message.
         self._origin_s: float | None = None
-        kinds = outlets()
+        kinds = recorded_topics()
         self._outlets = {name: self.create_publisher(kinds[name][0], name, kinds[name][1])
                          for name in names}
         self._timer = steady_timer(self, _LOOK_S, self._look)

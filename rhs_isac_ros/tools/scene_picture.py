@@ -13,7 +13,7 @@ from rhs_isac_ros.model.geometry import element_interval_m, element_positions, f
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
 from rhs_isac_ros.protocol.messages import Mode
-from rhs_isac_ros.ros.markers import WEAKEST_DB, lobe_m
+from rhs_isac_ros.ros.markers import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.tools.ellipses import ellipse_95
 
 _INCHES = (14.0, 9.6)
@@ -182,13 +182,13 @@ def _board(axes: Any, sightings: SceneState, scenario: Scenario) -> None:
 def _polar(axes: Any, beam: BeamMessage | None, found: BeamPattern | None) -> None:
     """Draw the cuts through the strongest direction, in decibels."""
     axes.set_theta_zero_location('N')
-    axes.set(thetamin=-90, thetamax=90, rlim=(WEAKEST_DB, 0),
-             rticks=np.linspace(WEAKEST_DB, 0, 5))
+    axes.set(thetamin=-90, thetamax=90, rlim=(MIN_LEVEL_DB, 0),
+             rticks=np.linspace(MIN_LEVEL_DB, 0, 5))
     axes.tick_params(labelsize='small')
     if found is None:
         axes.set_title('no data beam yet', fontsize='medium')
         return
-    floor = 10**(WEAKEST_DB / 10)
+    floor = 10**(MIN_LEVEL_DB / 10)
     for name, (angles, power), style in (
             ('over azimuth', found.azimuth_cut(), '-'),
             ('over elevation', found.elevation_cut(), ':')):
@@ -214,7 +214,7 @@ def _legend(sightings: SceneState) -> list[Any]:
         Patch(facecolor='0.8', edgecolor='0.4', label='95 % of the posterior'),
         mark('D', 'feed', markerfacecolor='white', markeredgecolor='black')]
     if sightings.beam:
-        handles.append(Patch(facecolor='0.92', label=f'data beam, {WEAKEST_DB:g} to 0 dB'))
+        handles.append(Patch(facecolor='0.92', label=f'data beam, {MIN_LEVEL_DB:g} to 0 dB'))
     users = sorted(sightings.users)
     handles += [Patch(color=_colour(user), label=f'user {user}') for user in users[:_MOST_NAMED]]
     if len(users) > _MOST_NAMED:

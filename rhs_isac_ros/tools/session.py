@@ -14,7 +14,7 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 
 # How often to look at the graph, which wakes nobody up [s].
 _POLL_S = 0.02
@@ -36,7 +36,7 @@ class Session:
     """
 
     def __init__(self) -> None:
-        find_each_other_quickly()
+        use_discovery_profile()
         rclpy.init(args=[])
         self.node = Node(f'_rhs_isac_cli_{os.getpid()}', start_parameter_services=False)
         self._executor = SingleThreadedExecutor()

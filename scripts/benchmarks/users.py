@@ -21,7 +21,7 @@ from system.chaos.watcher import Watcher
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import start_network
 
 PATIENCE_S = 600.0
@@ -39,7 +39,7 @@ def main() -> int:
     parser.add_argument('--json', type=Path, help='file for the figures')
     options = parser.parse_args()
     os.environ.update(private_domain())
-    find_each_other_quickly()
+    use_discovery_profile()
     rclpy.init(args=[])
     scenario = Scenario()
     cycles = options.rounds * options.users

@@ -14,7 +14,7 @@ from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fields import check
 from rhs_isac_ros.ros import convert
-from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.resources import default_codebook_file
 
 SCENARIO = Scenario()
@@ -302,7 +302,7 @@ def test_a_restarted_optimizer_with_another_codebook_is_followed(
     codebooks = {name: Codebook.load(small_files / f'{name}.yaml')
                  for name in ('first', 'second')}
     got = []
-    CodebookSource(watch.node, Scenario.from_yaml(small_files / 'scenario.yaml'), got.append)
+    CodebookClient(watch.node, Scenario.from_yaml(small_files / 'scenario.yaml'), got.append)
     for name, codebook in codebooks.items():
         process = processes.start(
             'optimizer', namespace='/restart', scenario_file=small_files / 'scenario.yaml',

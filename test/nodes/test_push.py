@@ -86,7 +86,7 @@ def test_without_an_optimizer_the_error_says_so(small_files):
     node = Node('pusher', namespace='/nobody', context=context)
     try:
         with pytest.raises(PushError, match='^/nobody/optimizer: not there within 0.2 s'):
-            push(node, Codebook.load(small_files / 'first.yaml'), patience_s=0.2)
+            push(node, Codebook.load(small_files / 'first.yaml'), timeout_s=0.2)
     finally:
         node.destroy_node()
         rclpy.shutdown(context=context)

@@ -19,7 +19,7 @@ from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.monitoring.invariants import SETTLE_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import check_directory, load_files, start_network
 from system.chaos import crashes, fuzzing, report, soaking
 from system.chaos.watcher import Watcher
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'error: {error}', file=sys.stderr)
         return 2
     os.environ.update(private_domain())
-    find_each_other_quickly()
+    use_discovery_profile()
     rclpy.init(args=[])
     watcher = Watcher(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
