@@ -16,24 +16,15 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options
 from rhs_isac_ros.codebook.command import run as run_command
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.parameters import CODEBOOK
 from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import run
 
 PUSHER_NODE = 'codebook_pusher'
-DESCRIPTIONS = {
-    'codebook.id': 'Hash of the content, which must match.',
-    'codebook.shape': 'Sizes N_B, N_SB, F, K, N_E.',
-    'codebook.average_crlb': 'Average Cramer-Rao bound [m^2].',
-    'codebook.provenance': 'Provenance of the codebook.',
-    'codebook.analog': 'Configurations [N_B, F, N_E], from 0 to 1.',
-    'codebook.digital_re': 'Combining vectors [N_B, N_SB, F, K], real parts [sqrt(W)].',
-    'codebook.digital_im': 'Combining vectors [N_B, N_SB, F, K], imaginary parts [sqrt(W)].',
-}
 
 
 class OptimizerNode(Node):
@@ -45,13 +36,11 @@ class OptimizerNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(topics.OPTIMIZER_NODE, **node_options)
         values = parameters.declare(self, 'optimizer')
-        self._scenario = (
-            Scenario.from_yaml(values.scenario_file) if values.scenario_file else Scenario())
+        self._scenario = parameters.scenario_of(values)
         self._publisher = self.create_publisher(ros.Codebook, topics.CODEBOOK, qos.HELD)
-        defaults = Codebook.load(values.codebook_file or default_codebook_file())
-        for name, value in defaults.to_parameters().items():
-            self.declare_parameter(
-                name, value, ParameterDescriptor(description=DESCRIPTIONS[name]))
+        defaults = Codebook.load(values.codebook_file or default_codebook_file()).to_parameters()
+        for name, text in CODEBOOK.items():
+            self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
         self._codebook_id, self._refused = '', 0
         self._publish(self._assemble({}))
         self._diagnostics = Diagnostics(self, self._report)
@@ -59,21 +48,21 @@ class OptimizerNode(Node):
         self.add_post_set_parameters_callback(self._on_set)
 
     def _assemble(self, changes: dict[str, Any]) -> Codebook:
-        present = {name: self.get_parameter(name).value for name in DESCRIPTIONS}
+        present = {name: self.get_parameter(name).value for name in CODEBOOK}
         codebook = Codebook.from_parameters(present | changes)
         codebook.check(self._scenario)
         return codebook
 
     def _check(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            self._assemble({p.name: p.value for p in changes if p.name in DESCRIPTIONS})
+            self._assemble({p.name: p.value for p in changes if p.name in CODEBOOK})
         except CodebookError as error:
             self._refused += 1
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _on_set(self, changes: list[Parameter]) -> None:
-        if any(p.name in DESCRIPTIONS for p in changes):
+        if any(p.name in CODEBOOK for p in changes):
             self._publish(self._assemble({}))
 
     def _report(self) -> Report:

@@ -12,7 +12,6 @@ from rclpy.publisher import Publisher
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rhs_isac_ros.link import Beam, beam_pattern
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import markers, parameters, qos, topics
@@ -30,8 +29,7 @@ class VisualizerNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('visualizer', **node_options)
         values = parameters.declare(self, 'visualizer')
-        self._scenario = (
-            Scenario.from_yaml(values.scenario_file) if values.scenario_file else Scenario())
+        self._scenario = parameters.scenario_of(values)
         self._forget_s = values.forget_s
         self._scene = SceneState()
         # The latest beam and its marker: a beam pattern takes long to compute.

@@ -9,7 +9,7 @@ from rclpy.node import Node
 
 from rhs_isac_ros.ros.timers import steady_timer
 
-Result = TypeVar('Result')
+_Result = TypeVar('_Result')
 _IMMEDIATE_S = 1e-6
 
 
@@ -28,7 +28,7 @@ class BackgroundWorker:
         self._timer.cancel()
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
 
-    def run(self, job: Callable[[], Result], on_result: Callable[[Result], None]) -> None:
+    def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
         """Queue a job.
 
         Parameters
@@ -37,7 +37,7 @@ class BackgroundWorker:
             Called with the result in the thread that spins the node. An exception of the job is
             raised there instead.
         """
-        def hand_over(future: Future[Result]) -> None:
+        def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))
             executor = self._node.executor
             if self._is_open and executor is not None:

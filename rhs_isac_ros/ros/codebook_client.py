@@ -16,10 +16,10 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import qos, topics
 from rhs_isac_ros.ros.log_once import LogOnce
+from rhs_isac_ros.ros.parameters import CODEBOOK
 from rhs_isac_ros.ros.timers import steady_timer
 
-_NAMES = ['codebook.id', 'codebook.shape', 'codebook.average_crlb', 'codebook.provenance',
-          'codebook.analog', 'codebook.digital_re', 'codebook.digital_im']
+_NAMES = list(CODEBOOK)
 _RETRY_S = 0.1
 _RESPONSE_TIMEOUT_S = 2.0
 

@@ -11,7 +11,7 @@ import types
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
-from rhs_isac_ros.model import mobility, plugins
+from rhs_isac_ros.model import Scenario, mobility, plugins
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
@@ -30,7 +30,7 @@ class _Dataclass(Protocol):
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
 
-Settings = TypeVar('Settings', bound=_Dataclass)
+_Settings = TypeVar('_Settings', bound=_Dataclass)
 
 
 def _declared_by(settings: type[_Dataclass]) -> dict[str, Parameter]:
@@ -95,6 +95,17 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     ),
 }
 
+# The parameters that hold the codebook, with their descriptions; only the optimizer has them.
+CODEBOOK: Mapping[str, str] = {
+    'codebook.id': 'Hash of the content, which must match.',
+    'codebook.shape': 'Sizes N_B, N_SB, F, K, N_E.',
+    'codebook.average_crlb': 'Average Cramer-Rao bound [m^2].',
+    'codebook.provenance': 'Provenance of the codebook.',
+    'codebook.analog': 'Configurations [N_B, F, N_E], from 0 to 1.',
+    'codebook.digital_re': 'Combining vectors [N_B, N_SB, F, K], real parts [sqrt(W)].',
+    'codebook.digital_im': 'Combining vectors [N_B, N_SB, F, K], imaginary parts [sqrt(W)].',
+}
+
 
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
     """Declare the parameters of an executable, a key of `NODES`, and return values by name.
@@ -139,7 +150,7 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
     return value
 
 
-def settings_of(kind: type[Settings], values: types.SimpleNamespace) -> Settings:
+def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settings:
     """Return the settings of a role, a dataclass, from the parameters named as its fields.
 
     Raises
@@ -152,6 +163,18 @@ def settings_of(kind: type[Settings], values: types.SimpleNamespace) -> Settings
                        for field in dataclasses.fields(kind)})
     except ValueError as error:
         raise ParameterError(str(error)) from None
+
+
+def scenario_of(values: types.SimpleNamespace) -> Scenario:
+    """Return the scenario of the parameter ``scenario_file``.
+
+    Raises
+    ------
+    ScenarioError
+        If the file is wrong.
+    """
+    file = values.scenario_file
+    return Scenario.from_yaml(file) if file else Scenario()
 
 
 def table() -> str:

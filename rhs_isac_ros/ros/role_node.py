@@ -7,7 +7,6 @@ from typing import Any, Generic, TypeVar
 from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
@@ -26,13 +25,14 @@ from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.log_once import LogOnce
 from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
+from rhs_isac_ros.ros.parameters import scenario_of
 from rhs_isac_ros.ros.subscriptions import subscribe
 from rhs_isac_ros.ros.timers import steady_timer
 
-RoleT = TypeVar('RoleT', bound=Role)
+_RoleT = TypeVar('_RoleT', bound=Role)
 
 
-class RoleNode(ParameterizedNode, Generic[RoleT]):
+class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """A node that passes messages to a role and performs the actions that it returns.
 
     A subclass makes its role from the parameters and passes it to `start`.
@@ -59,12 +59,11 @@ class RoleNode(ParameterizedNode, Generic[RoleT]):
         If the scenario file is wrong.
     """
 
-    role: RoleT
+    role: _RoleT
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(executable, name, **node_options)
-        file = self.values.scenario_file
-        self.scenario = Scenario.from_yaml(file) if file else Scenario()
+        self.scenario = scenario_of(self.values)
         if self.scenario.n_frames > qos.EXCHANGE.depth:
             raise ParameterError(
                 f'scenario_file: n_frames {self.scenario.n_frames}, expected at most '
@@ -80,7 +79,7 @@ class RoleNode(ParameterizedNode, Generic[RoleT]):
         self._timer.cancel()
         self._timer_due_s: float | None = None
 
-    def start(self, role: RoleT, *, advertise: bool = True, subscribe: bool = True) -> None:
+    def start(self, role: _RoleT, *, advertise: bool = True, subscribe: bool = True) -> None:
         """Connect the role to its topics and publish its diagnostics.
 
         Parameters

@@ -98,12 +98,12 @@ def test_with_options_the_command_optimises_writes_and_holds(
     process = processes.start('optimizer', namespace='/hold', options=(
         '--method', 'directional', '--positions', '8', '--quiet', '--output', output,
         '--scenario', small_files / 'scenario.yaml'))
-    watch, heard = make_watch('/hold'), []
-    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, heard.append, qos.LATCHED)
-    watch.until(lambda: heard, 'the codebook', [process])
+    watch, received = make_watch('/hold'), []
+    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, received.append, qos.LATCHED)
+    watch.until(lambda: received, 'the codebook', [process])
     written = Codebook.load(output)
-    assert heard[0].codebook_id == written.id
-    assert convert.codebook_from_ros(heard[0]).id == written.id
+    assert received[0].codebook_id == written.id
+    assert convert.codebook_from_ros(received[0]).id == written.id
     process.signal(signal.SIGINT)
     assert process.wait() == 0
     assert not crashed(process.log), process.log
