@@ -1,6 +1,6 @@
-"""The whole network, every node a process: ``ros2 launch rhs_isac_ros network.launch.py``.
+"""Starts a network with one process for each node: ``ros2 launch rhs_isac_ros network.launch.py``.
 
-``--show-args`` lists the arguments. ``network.launch.xml`` starts the same in one process.
+``--show-args`` lists the arguments. ``network.launch.xml`` starts the network in one process.
 """
 
 from ament_index_python.packages import (
@@ -17,29 +17,23 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 
 PACKAGE = 'rhs_isac_ros'
-# A launch that gets SIGTERM leaves its processes to themselves: so the kernel ends them with it.
+# A launch that receives SIGTERM does not end its processes, so the kernel does.
 END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 ARGUMENTS = {
     'users': ('2', 'Number of users.'),
-    'config': ('', "Scenario file; empty: the paper's Table I."),
-    'codebook': ('', 'Codebook file, of the sizes of the scenario; empty: that of the package.'),
+    'config': ('', 'Scenario file; empty: Table I of the paper.'),
+    'codebook': ('', 'Codebook file that fits the scenario; empty: the default codebook.'),
     'seed': ('0', 'Seed of all random numbers.'),
-    'estimator': ('bayes', 'Estimator of the position.'),
+    'estimator': ('bayes', 'Position estimator.'),
     'visualizer': ('false', 'Whether to publish markers for RViz and Foxglove.'),
     'rviz': ('false', 'Whether to start the visualizer and RViz.'),
-    'record': ('', 'Recording to write (MCAP); empty: none.'),
-    'namespace': ('', 'Namespace of all nodes and topics: one for each of many networks.'),
+    'record': ('', 'Recording to write (MCAP file); empty: none.'),
+    'namespace': ('', 'Namespace of all nodes and topics, which separates several networks.'),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Describe the launch: its arguments, and the nodes that depend on them.
-
-    Returns
-    -------
-    launch.LaunchDescription
-        The description.
-    """
+    """Return the arguments of the launch and the function that starts the nodes."""
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=default, description=text)
           for name, (default, text) in ARGUMENTS.items()),
@@ -48,22 +42,12 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
-    """Make the nodes, once the number of users is known.
-
-    Parameters
-    ----------
-    context
-        Holds the values of the arguments.
-
-    Returns
-    -------
-    list of launch.LaunchDescriptionEntity
-        The nodes.
+    """Return the nodes, for the values of the arguments in `context`.
 
     Raises
     ------
     ValueError
-        If the number of users is no positive integer.
+        If the number of users is not a positive integer.
     """
     text = LaunchConfiguration('users').perform(context)
     if not text.isdecimal() or not int(text):
@@ -87,7 +71,7 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
 
 
 def _recorder(context: LaunchContext) -> list[Node]:
-    """Start the recorder first, so that it misses nothing of what is not latched."""
+    """Return the recorder, which starts first: it misses earlier messages that are not latched."""
     file = LaunchConfiguration('record').perform(context)
     if not file:
         return []
@@ -102,18 +86,18 @@ def _rviz() -> list[LaunchDescriptionEntity]:
     try:
         get_package_prefix('rviz2')
     except PackageNotFoundError:
-        return [LogInfo(msg='there is no rviz2 here: apt install ros-jazzy-rviz2',
+        return [LogInfo(msg='rviz2 is not installed: apt install ros-jazzy-rviz2',
                         condition=wanted)]
     file = f'{get_package_share_directory(PACKAGE)}/config/rviz/network.rviz'
     return [Node(
         package='rviz2', executable='rviz2', name='rviz', exec_name='rviz', output='screen',
-        # The names of topics in the file are relative.
+        # The topic names in the file are relative.
         namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
         arguments=['-d', file], condition=wanted)]
 
 
 def _typed(argument: str, kind: type) -> ParameterValue:
-    """Return an argument as a parameter; without a type, YAML would guess one."""
+    """Return an argument as a parameter with a type, which YAML would infer otherwise."""
     return ParameterValue(LaunchConfiguration(argument), value_type=kind)
 
 

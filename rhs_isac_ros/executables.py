@@ -1,7 +1,7 @@
-"""What the executables begin with: before anything slow is imported, Ctrl-C gets an end.
+"""The entry points of the executables, which handle signals before anything slow is imported.
 
-Python takes a moment to import ROS, NumPy and the nodes. A signal that comes meanwhile would end
-in a traceback; here it ends the process as it does later on, with exit code 0.
+Importing ROS, NumPy and the nodes takes a moment. A signal during that time would end in a
+traceback; here it ends the process with exit code 0, as a signal does later on.
 """
 
 import importlib
@@ -10,37 +10,46 @@ import signal
 import sys
 from collections.abc import Callable
 
-# Executables whose module is in `tools`; those of all others are in `nodes`.
-_TOOLS = ('demo', 'record', 'replay', 'snapshot', 'watch')
+# Subpackage of each executable.
+EXECUTABLES = {
+    'bs': 'nodes',
+    'channel': 'nodes',
+    'demo': 'tools',
+    'network': 'nodes',
+    'optimizer': 'nodes',
+    'positioner': 'nodes',
+    'record': 'tools',
+    'replay': 'tools',
+    'rhs_controller': 'nodes',
+    'snapshot': 'tools',
+    'transmission': 'nodes',
+    'user': 'nodes',
+    'visualizer': 'nodes',
+    'watch': 'tools',
+}
 
 
 def __getattr__(name: str) -> Callable[[], int]:
     """Return the main function of an executable.
 
-    Parameters
-    ----------
-    name
-        Its name.
-
     Returns
     -------
     Callable
-        Imports its module, runs it and returns its exit code.
+        Imports the module of the executable, runs it and returns its exit code.
 
     Raises
     ------
     AttributeError
-        If it has the name of no executable.
+        If there is no such executable.
     """
-    if name.startswith('_'):
-        raise AttributeError(f'{__name__} has no {name}')
+    if name not in EXECUTABLES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
     def main() -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: os._exit(0))
         try:
-            module = importlib.import_module(
-                f'rhs_isac_ros.{"tools" if name in _TOOLS else "nodes"}.{name}')
+            module = importlib.import_module(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
         except ModuleNotFoundError as error:
             # pip also installs the executables on systems without ROS.
             print(f'error: {name} needs ROS 2 Jazzy and rhs_isac_msgs: {error}', file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Executables in processes of their own, and a node in this process that watches them."""
+"""Executables in child processes, and a node in this process that observes them."""
 
 import collections
 import contextlib
@@ -28,29 +28,29 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 
-# Before rclpy reads them; the processes inherit them.
+# Set before rclpy reads them; the child processes inherit them.
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-# Type supports load a parser that is older than this Python.
+# Type supports load a parser that uses deprecated modules.
 with warnings.catch_warnings():
     warnings.simplefilter('ignore', DeprecationWarning)
     check_for_type_support(ros.Beacon)
 
-# Generous: a machine under load takes its time to start ten processes.
-PATIENCE_S = 60.0
-# Marks of an exception that nobody caught.
-CRASH = ('Traceback', 'Exception in', 'Error occurred at', '[FATAL]', 'Segmentation')
+# Generous: starting ten processes takes long on a loaded machine.
+TIMEOUT_S = 60.0
+# Texts that show an uncaught exception.
+CRASH_TEXTS = ('Traceback', 'Exception in', 'Error occurred at', '[FATAL]', 'Segmentation')
 EXECUTABLES = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros'
 
 
 class Process:
-    """One executable; what it prints goes to a file."""
+    """A process of an executable, whose output goes to a file."""
 
-    def __init__(self, executable, own, arguments, log):
+    def __init__(self, executable, options, arguments, log):
         self._log = log
         with open(log, 'wb') as stream:
             self._popen = subprocess.Popen(
-                [EXECUTABLES / executable, *own, '--ros-args', *arguments],
+                [EXECUTABLES / executable, *options, '--ros-args', *arguments],
                 stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
                 env={**os.environ, 'ROS_LOG_DIR': str(log.parent)})
 
@@ -66,17 +66,17 @@ class Process:
         self._popen.send_signal(number)
 
     def wait(self):
-        """Exit code, once it has ended."""
+        """Return the exit code once the process has ended."""
         try:
-            return self._popen.wait(PATIENCE_S)
+            return self._popen.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            # The executor has Python write where every thread stands.
+            # On SIGABRT, Python prints the stacks of all threads.
             self._popen.send_signal(signal.SIGABRT)
             self._popen.wait()
-            raise AssertionError(f'it does not end\n{self.log}') from None
+            raise AssertionError(f'the process does not end\n{self.log}') from None
 
     def end(self):
-        """Wait for its end, and force it if it does not come."""
+        """Wait for the end of the process, and kill it after a timeout."""
         try:
             self._popen.wait(10.0)
         except subprocess.TimeoutExpired:
@@ -85,14 +85,14 @@ class Process:
 
 
 class Processes:
-    """Starts executables; as a context, it leaves none of them behind."""
+    """A context manager that starts executables and ends them on exit."""
 
     def __init__(self, folder):
         self._folder = folder
         self._all = []
 
-    def start(self, executable, *arguments, name='', namespace='/', own=(), **parameters):
-        """Start an executable with options of its own, a node name, a namespace, parameters."""
+    def start(self, executable, *arguments, name='', namespace='/', options=(), **parameters):
+        """Start an executable with command line options and ROS parameters."""
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             arguments += ('-p', f'{key}:={text}')
@@ -101,7 +101,7 @@ class Processes:
         if namespace != '/':
             arguments += ('-r', f'__ns:={namespace}')
         log = self._folder / f'{len(self._all)}_{name or executable}.log'
-        process = Process(executable, own, arguments, log)
+        process = Process(executable, options, arguments, log)
         self._all.append(process)
         return process
 
@@ -116,7 +116,7 @@ class Processes:
 
 
 class Watch:
-    """Hears everything of one namespace, in this process."""
+    """An observer in this process that receives all messages of a namespace."""
 
     def __init__(self, namespace='/'):
         self._context = Context()
@@ -124,23 +124,23 @@ class Watch:
         self.node = Node('watch', namespace=namespace, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self.heard = {kind: [] for kind in topics.NAMES}
+        self.received = {kind: [] for kind in topics.NAMES}
         self._of_cycle = collections.defaultdict(list)
-        # Cycles that were served, in their order.
+        # Final states of the served cycles, in order.
         self.served = []
         self.poses = []
-        # Functions to call with each message of a kind.
+        # Functions by message class, called with each message.
         self.hooks = {}
         for kind, name in topics.NAMES.items():
             self.node.create_subscription(
                 convert.ros_type(kind), name,
-                lambda message, kind=kind: self._hear(kind, message), qos.EXCHANGE)
+                lambda message, kind=kind: self._receive(kind, message), qos.EXCHANGE)
         self.node.create_subscription(
             PoseWithCovarianceStamped, topics.POSITION, self.poses.append, qos.EXCHANGE)
 
-    def _hear(self, kind, message):
+    def _receive(self, kind, message):
         plain = convert.from_ros(kind, message)
-        self.heard[kind].append(plain)
+        self.received[kind].append(plain)
         self._of_cycle[kind, getattr(plain, 'cycle_id', None)].append(plain)
         if kind is m.ProtocolState and plain.outcome == 'served':
             self.served.append(plain)
@@ -148,47 +148,46 @@ class Watch:
             self.hooks[kind](plain)
 
     def _spin(self):
-        """Hear for a moment: a condition that is asked after each message would fall behind."""
+        """Spin briefly: checking a condition after each message would take too long."""
         end_s = time.monotonic() + 0.02
         while (left_s := end_s - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left_s)
 
     def until(self, condition, what, processes=()):
-        """Spin until a condition holds, and return its value."""
-        end_s = time.monotonic() + PATIENCE_S
+        """Spin until a condition holds and return its value."""
+        end_s = time.monotonic() + TIMEOUT_S
         while not (value := condition()):
             for process in processes:
                 assert process.running, f'ended with {process.wait()}\n{process.log}'
             assert time.monotonic() < end_s, '\n'.join(
-                [f'{what} does not come about', *(process.log for process in processes)])
+                [f'{what}: not within {TIMEOUT_S:g} s', *(process.log for process in processes)])
             self._spin()
         return value
 
-    def answer(self, client, request, processes=()):
-        """Answer to what a function asks a client for; a lost answer is asked for again."""
+    def call(self, client, request, processes=()):
+        """Return the response to a request of a client; lost requests are repeated."""
         self.until(client.services_are_ready, 'the services', processes)
-        futures, asked_s = [], -math.inf
+        futures, requested_s = [], -math.inf
 
-        def answered():
-            nonlocal asked_s
-            if time.monotonic() > asked_s + 2.0:
-                asked_s = time.monotonic()
+        def response():
+            nonlocal requested_s
+            if time.monotonic() > requested_s + 2.0:
+                requested_s = time.monotonic()
                 futures.append(request(client))
             return next((future for future in futures if future.done()), None)
-        return self.until(answered, 'the answer', processes).result()
+        return self.until(response, 'the response', processes).result()
 
-    def answering(self, *names):
-        """Wait until nodes answer, so that they are past their start."""
+    def wait_for_nodes(self, *names):
+        """Wait until the parameter services of nodes respond, so that they have started."""
         for name in names:
             client = AsyncParameterClient(self.node, name)
-            self.answer(client, lambda client: client.list_parameters([], 1))
+            self.call(client, lambda client: client.list_parameters([], 1))
 
-    def outlet(self, kind, listeners=1):
-        """Publisher of a message, once it is connected."""
+    def publisher(self, kind, n_others=1):
+        """Return a publisher of a message once it has other subscribers than this observer."""
         publisher = self.node.create_publisher(
             convert.ros_type(kind), topics.NAMES[kind], qos.EXCHANGE)
-        # This watch listens as well.
-        self.until(lambda: publisher.get_subscription_count() > listeners, 'the listeners')
+        self.until(lambda: publisher.get_subscription_count() > n_others, 'the subscribers')
         return publisher
 
     def of_cycle(self, kind, cycle_id):
@@ -196,17 +195,17 @@ class Watch:
 
     @property
     def given_up(self):
-        return [message for message in self.heard[m.ProtocolState]
+        return [message for message in self.received[m.ProtocolState]
                 if message.outcome not in ('', 'served')]
 
     def until_served(self, n=1, user=None, processes=()):
-        """Wait for the ends of n more cycles, of one user or of any, and return them."""
+        """Wait for n more served cycles, of one user or of any, and return their final states."""
         before = len(self.served)
 
-        def new():
+        def new_ends():
             ends = [end for end in self.served[before:] if user in (None, end.user)]
             return ends if len(ends) >= n else None
-        return self.until(new, f'{n} more cycles of user {user}', processes)
+        return self.until(new_ends, f'{n} more cycles of user {user}', processes)
 
     def close(self):
         self._executor.shutdown()
@@ -216,7 +215,7 @@ class Watch:
 
 @pytest.fixture(scope='session')
 def make_processes(tmp_path_factory):
-    """Function that makes a context for processes, which end with it."""
+    """Return a function that creates a context manager of processes."""
     return lambda: Processes(tmp_path_factory.mktemp('logs'))
 
 
@@ -234,7 +233,7 @@ def module_processes(make_processes):
 
 @pytest.fixture(scope='module')
 def make_watch():
-    """Function that makes a watch for a namespace."""
+    """Return a function that creates an observer of a namespace."""
     with contextlib.ExitStack() as stack:
         def make(namespace='/'):
             watch = Watch(namespace)
@@ -245,7 +244,7 @@ def make_watch():
 
 @pytest.fixture(scope='session')
 def small_files(random_beams, tmp_path_factory):
-    """Files of a scenario that is quick to compute and of two codebooks for it."""
+    """Folder with the files of a small scenario and of two codebooks for it."""
     folder = tmp_path_factory.mktemp('small')
     fields = {'n_subbands': 2, 'n_frames': 3, 'n_feeds': 2, 'elements_per_side': 4}
     scenario = Scenario(**fields)
@@ -257,5 +256,5 @@ def small_files(random_beams, tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def crashed():
-    """Function that returns the marks of a crash in a log."""
-    return lambda log: [mark for mark in CRASH if mark in log]
+    """Return a function that returns the texts in a log that show a crash."""
+    return lambda log: [text for text in CRASH_TEXTS if text in log]

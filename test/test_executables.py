@@ -1,10 +1,12 @@
-"""Executables end well on Ctrl-C even while Python still imports."""
+"""The entry points of the executables, and signals while they are imported."""
 
 import ast
+import importlib
 import os
 import signal
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -14,23 +16,59 @@ from rhs_isac_ros import executables
 ROOT = Path(__file__).parents[1]
 
 
-def names():
-    """The executables that the set-up installs."""
+def installed():
+    """Names of the executables that setup.py installs."""
     tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
     values = {node.targets[0].id: node.value for node in tree.body if isinstance(node, ast.Assign)}
     return [*ast.literal_eval(values['NODES']), *ast.literal_eval(values['TOOLS'])]
 
 
-@pytest.mark.parametrize('name', names())
-def test_every_executable_has_a_main(name):
-    main = getattr(executables, name)
-    assert callable(main)
-    folder = ROOT / 'rhs_isac_ros'
-    assert (folder / 'nodes' / f'{name}.py').exists() != (folder / 'tools' / f'{name}.py').exists()
+def test_the_table_lists_the_installed_executables():
+    assert sorted(executables.EXECUTABLES) == sorted(installed())
+
+
+@pytest.mark.parametrize(('name', 'folder'), executables.EXECUTABLES.items())
+def test_each_executable_has_a_module_with_a_main_function(name, folder):
+    source = (ROOT / 'rhs_isac_ros' / folder / f'{name}.py').read_text(encoding='utf-8')
+    defined = {target.id for node in ast.parse(source).body if isinstance(node, ast.Assign)
+               for target in node.targets} | {
+        node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
+    assert 'main' in defined
+
+
+@pytest.fixture
+def signal_handlers():
+    """Restore the signal handlers after the test."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(('name', 'folder'), executables.EXECUTABLES.items())
+def test_an_entry_point_runs_its_module_and_returns_the_exit_code(
+        name, folder, monkeypatch, signal_handlers):
+    imported = []
+
+    def import_module(module):
+        imported.append(module)
+        return types.SimpleNamespace(main=lambda: 7)
+    monkeypatch.setattr(importlib, 'import_module', import_module)
+    assert getattr(executables, name)() == 7
+    assert imported == [f'rhs_isac_ros.{folder}.{name}']
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize('name', ['nonsense', '_private', 'topic', 'BS', 'bs_', '__path__'])
+def test_any_other_name_is_an_attribute_error(name):
+    with pytest.raises(AttributeError, match=f'no attribute {name!r}'):
+        getattr(executables, name)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_during_the_imports_ends_without_a_trace(number):
+def test_a_signal_during_the_imports_ends_the_process_without_a_traceback(number):
     code = """
 import importlib, signal, sys
 from rhs_isac_ros import executables
@@ -47,8 +85,3 @@ executables.bs()
     process.send_signal(number)
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (0, '')
-
-
-def test_nothing_else_is_an_executable():
-    with pytest.raises(AttributeError):
-        executables._private  # noqa: B018

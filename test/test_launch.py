@@ -1,4 +1,4 @@
-"""The launch files: what they declare, and whether they serve all users and end cleanly."""
+"""The launch files: their arguments, the service of all users, and a clean end."""
 
 import importlib.util
 import os
@@ -16,8 +16,8 @@ from rhs_isac_ros.model import Scenario
 
 ROOT = Path(__file__).parents[1]
 FILES = ('network.launch.py', 'network.launch.xml')
-PATIENCE_S = 60.0
-# `ros2 launch` in short.
+TIMEOUT_S = 60.0
+# A short form of `ros2 launch`.
 LAUNCH = '''
 import sys
 from launch import LaunchDescription, LaunchService
@@ -31,11 +31,11 @@ service.include_launch_description(LaunchDescription([
                              launch_arguments=arguments)]))
 sys.exit(service.run())
 '''
-# Its parser, and that of type supports, is older than this Python.
+# The parsers of launch and of type supports use deprecated modules.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 needs_launch = pytest.mark.skipif(
     not all(map(importlib.util.find_spec, ('launch', 'launch_ros', 'launch_xml'))),
-    reason='there is no launch_ros here: it comes with a full ROS 2, not as a wheel')
+    reason='launch_ros is not installed: it is part of a full ROS 2, not a wheel')
 
 
 def arguments_of_xml():
@@ -44,7 +44,7 @@ def arguments_of_xml():
             for arg in root.iter('arg')}
 
 
-def test_they_are_installed_and_declared():
+def test_the_files_are_installed_and_their_dependencies_declared():
     packages = pytest.importorskip('ament_index_python.packages')
     share = Path(packages.get_package_share_directory('rhs_isac_ros'))
     assert {path.name for path in (share / 'launch').iterdir()} >= set(FILES)
@@ -53,7 +53,7 @@ def test_they_are_installed_and_declared():
     assert {'launch', 'launch_ros', 'launch_xml'} <= depends
 
 
-def test_parameters_of_the_xml_variant_are_declared():
+def test_the_xml_file_sets_declared_parameters_and_uses_all_arguments():
     parameters = pytest.importorskip('rhs_isac_ros.ros.parameters')
     declared = {parameter.name for own in parameters.NODES.values() for parameter in own}
     root = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
@@ -66,7 +66,7 @@ def test_parameters_of_the_xml_variant_are_declared():
 
 
 @needs_launch
-def test_both_take_the_same_arguments():
+def test_both_files_have_the_same_arguments():
     from launch.launch_description_sources import (
         get_launch_description_from_python_launch_file as load,
     )
@@ -77,7 +77,7 @@ def test_both_take_the_same_arguments():
         for argument in description.get_launch_arguments()}
 
 
-def is_there(group):
+def exists(group):
     try:
         os.killpg(group, 0)
     except ProcessLookupError:
@@ -87,7 +87,7 @@ def is_there(group):
 
 @pytest.fixture
 def observer(monkeypatch):
-    """A node that watches the cycles of the namespace /launched, and how to spin it."""
+    """Return an observer of the cycles in the namespace /launched, and its executor."""
     monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     import rclpy
@@ -109,7 +109,7 @@ def observer(monkeypatch):
 
 @needs_launch
 @pytest.mark.parametrize('file, number', zip(FILES, (signal.SIGINT, signal.SIGTERM), strict=True))
-def test_all_users_are_served_and_nothing_is_left_behind(file, number, observer, tmp_path):
+def test_all_users_are_served_and_no_process_remains(file, number, observer, tmp_path):
     node, executor = observer
     with open(tmp_path / 'log', 'w+', encoding='utf-8') as log, subprocess.Popen(
             [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, 'users:=3', 'seed:=4',
@@ -118,28 +118,28 @@ def test_all_users_are_served_and_nothing_is_left_behind(file, number, observer,
             stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, 'ROS_LOG_DIR': str(tmp_path)}) as process:
         try:
-            end_s = time.monotonic() + PATIENCE_S
+            end_s = time.monotonic() + TIMEOUT_S
             while ({record.user for record in node.log.complete} != {1, 2, 3}
                    or not node.count_publishers('/launched/markers')):
                 executor.spin_once(timeout_sec=0.1)
                 assert process.poll() is None and time.monotonic() < end_s, (
                     tmp_path / 'log').read_text(encoding='utf-8')
             process.send_signal(number)
-            assert process.wait(PATIENCE_S) in (0, 1, -number)
-            end_s = time.monotonic() + PATIENCE_S
-            while is_there(process.pid):
-                assert time.monotonic() < end_s, 'processes are left behind'
+            assert process.wait(TIMEOUT_S) in (0, 1, -number)
+            end_s = time.monotonic() + TIMEOUT_S
+            while exists(process.pid):
+                assert time.monotonic() < end_s, 'processes remain'
         finally:
-            if is_there(process.pid):
+            if exists(process.pid):
                 os.killpg(process.pid, signal.SIGKILL)
     text = (tmp_path / 'log').read_text(encoding='utf-8')
     assert 'Traceback' not in text, text
     assert 'process has died' not in text, text
-    assert_whole(tmp_path / 'run.mcap', node.log.complete)
+    assert_complete(tmp_path / 'run.mcap', node.log.complete)
 
 
-def assert_whole(path, cycles):
-    """The recording has its name, and every cycle that was seen since it began is in it."""
+def assert_complete(path, cycles):
+    """Assert that a recording is closed and contains the cycles that the observer logged."""
     from rhs_isac_ros.ros.recording import read, read_scenario
     assert read_scenario(path) == Scenario.from_yaml(ROOT / 'config' / 'quick.yaml')
     topics = [topic for topic, _, _ in read(path)]
@@ -149,7 +149,7 @@ def assert_whole(path, cycles):
 
 
 @needs_launch
-def test_without_rviz_the_launch_says_so_and_goes_on(monkeypatch):
+def test_without_rviz_the_launch_logs_that_and_starts_the_nodes(monkeypatch):
     from launch.actions import LogInfo
     from launch_ros.actions import Node
 
@@ -164,9 +164,9 @@ def test_without_rviz_the_launch_says_so_and_goes_on(monkeypatch):
     context = LaunchContext()
     context.launch_configurations.update(
         {name: default for name, (default, _) in module.ARGUMENTS.items()} | {'rviz': 'true'})
-    *nodes, word = module.start_nodes(context)
+    *nodes, log = module.start_nodes(context)
     assert all(isinstance(node, Node) for node in nodes)
-    assert isinstance(word, LogInfo) and word.condition.evaluate(context)
+    assert isinstance(log, LogInfo) and log.condition.evaluate(context)
     assert nodes[-1].condition.evaluate(context)
     context.launch_configurations['rviz'] = 'false'
-    assert not word.condition.evaluate(context) and not nodes[-1].condition.evaluate(context)
+    assert not log.condition.evaluate(context) and not nodes[-1].condition.evaluate(context)

@@ -19,6 +19,9 @@ class Radio(PlainRole):
     `carry` takes data and returns the number of bits that were received.
     """
 
+    SENDS = (m.FeedSignals, m.Data)
+    RECEIVES = (m.RhsConfiguration, m.Pilot, m.Data)
+
     def __init__(self, measure, carry):
         super().__init__()
         self._measure, self._carry = measure, carry
@@ -60,8 +63,8 @@ class RadioNode(RoleNode):
     """The node; of the parameters of ``channel`` it uses only ``scenario_file``."""
 
     def __init__(self, measure, carry, **node_options):
-        super().__init__('channel', (m.FeedSignals, m.Data), 'radio', **node_options)
-        self.start(Radio(measure, carry), (m.RhsConfiguration, m.Pilot, m.Data))
+        super().__init__('channel', 'radio', **node_options)
+        self.start(Radio(measure, carry))
 
 
 def measure(band, configuration, pilot):

@@ -59,7 +59,7 @@ def parameter_table():
 def topic_table():
     """Every topic with type and quality of service."""
     # Markers are for the eye, and not recorded.
-    outlets = {topics.MARKERS: (MarkerArray, qos.EXCHANGE), **recording.outlets()}
+    outlets = {topics.MARKERS: (MarkerArray, qos.EXCHANGE), **recording.recorded_topics()}
     rows = []
     for name, (kind, profile) in sorted(outlets.items()):
         kept = 'latched' if profile is qos.LATCHED else f'last {profile.depth}'

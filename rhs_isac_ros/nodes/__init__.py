@@ -1,8 +1,8 @@
-"""The executables: each a thin adapter between a role and ROS 2."""
+"""The executables of the roles: thin adapters between a role and ROS 2."""
 
 import os
 
-# Many small products in many processes: threads of the linear algebra only fight for the cores.
-# This takes effect because it comes before NumPy is loaded.
+# The matrix products are small and the processes many: further threads would only compete for the
+# cores. The libraries read the variables when NumPy is first imported, which is after this module.
 for _name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS'):
     os.environ.setdefault(_name, '1')

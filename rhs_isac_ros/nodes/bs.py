@@ -13,44 +13,34 @@ from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged
 from rhs_isac_ros.protocol.settings import BaseStationSettings
-from rhs_isac_ros.ros import peer_monitor
 from rhs_isac_ros.ros.parameters import settings_of
+from rhs_isac_ros.ros.peer_monitor import REQUIRED_BY_BASE_STATION, PeerMonitor
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
 
-class BsNode(RoleNode):
+class BsNode(RoleNode[BaseStation]):
     """The base station."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('bs', BaseStation.SENDS, **node_options)
+        super().__init__('bs', **node_options)
         values = self.values
         rng = streams.generator(values.seed, streams.BASE_STATION)
         self.start(BaseStation(
-            self.scenario, self.settings(values), rng, self._receive,
-            values.first_cycle or _number_from_the_clock()), BaseStation.RECEIVES)
+            self.scenario, self.make_settings(values), rng, self._receive,
+            values.first_cycle or _cycle_from_clock()))
         self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
-        self._peers = peer_monitor.PeerMonitor(
-            self, peer_monitor.OF_BASE_STATION,
+        self._peers = PeerMonitor(
+            self, REQUIRED_BY_BASE_STATION,
             lambda missing: self.dispatch(PeersChanged(missing)))
 
-    def settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
-        """Return how the base station is to work.
-
-        Parameters
-        ----------
-        values
-            The parameters, by name.
-
-        Returns
-        -------
-        BaseStationSettings
-            The settings.
+    def make_settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
+        """Return the settings for parameter values.
 
         Raises
         ------
         ParameterError
-            If ``allowed_users`` is no list of users.
+            If ``allowed_users`` is not a list of users.
         """
         return settings_of(BaseStationSettings, values)
 
@@ -63,8 +53,8 @@ class BsNode(RoleNode):
         return receive_feeds(self.scenario, codebook, feeds, rng)
 
 
-def _number_from_the_clock() -> int:
-    """Milliseconds since 1970: cycles take longer, so no later life repeats a number."""
+def _cycle_from_clock() -> int:
+    """Return the milliseconds since 1970: a cycle takes longer, so no restart repeats a number."""
     return time.time_ns() // 1_000_000
 
 

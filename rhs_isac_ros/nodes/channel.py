@@ -1,4 +1,4 @@
-"""The executable ``channel``: the emulated world."""
+"""The executable ``channel``: the emulated radio channel and surface."""
 
 import sys
 import types
@@ -12,29 +12,18 @@ from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
 
-class ChannelNode(RoleNode):
-    """Air, multipath, surface and on-board propagation."""
+class ChannelNode(RoleNode[ImpairedChannel]):
+    """Line of sight, multipath, surface and propagation behind it."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('channel', Channel.SENDS, **node_options)
+        super().__init__('channel', **node_options)
         values = self.values
         rng = streams.generator(values.seed, streams.AIR)
         self.start(ImpairedChannel(
-            Channel(self.scenario, values.seed), self.settings(values), rng), Channel.RECEIVES)
+            Channel(self.scenario, values.seed), self.make_settings(values), rng))
 
-    def settings(self, values: types.SimpleNamespace) -> Impairments:
-        """Return what the air is to do to messages.
-
-        Parameters
-        ----------
-        values
-            The parameters, by name.
-
-        Returns
-        -------
-        Impairments
-            The settings.
-        """
+    def make_settings(self, values: types.SimpleNamespace) -> Impairments:
+        """Return the impairments for parameter values."""
         return settings_of(Impairments, values)
 
 

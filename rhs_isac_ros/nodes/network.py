@@ -15,17 +15,12 @@ from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.run import entry
 
-# The node ``network`` itself only has the parameter that says how many users there are.
+# Nodes besides the users, and besides ``network``, which only holds the parameter ``users``.
 KINDS = (OptimizerNode, RhsControllerNode, ChannelNode, PositionerNode, TransmissionNode, BsNode)
 
 
 def make_network() -> list[Node]:
-    """Make all nodes, with users numbered from 1.
-
-    Returns
-    -------
-    list of rclpy.node.Node
-        The nodes.
+    """Create all nodes, with users numbered from 1.
 
     Raises
     ------

@@ -10,49 +10,37 @@ import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.utilities import remove_ros_args
+from rclpy.utilities import remove_ros_args, try_shutdown
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options
 from rhs_isac_ros.codebook.command import run as run_command
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.parameters import CODEBOOK
 from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import run
 
 PUSHER_NODE = 'codebook_pusher'
-DESCRIPTIONS = {
-    'codebook.id': 'Hash of the content; must match it.',
-    'codebook.shape': 'Sizes N_B, N_SB, F, K, N_E.',
-    'codebook.average_crlb': 'Average Cramer-Rao bound [m^2].',
-    'codebook.provenance': 'How the codebook was made.',
-    'codebook.analog': 'Configurations [N_B, F, N_E], from 0 to 1.',
-    'codebook.digital_re': 'Combining vectors [N_B, N_SB, F, K], real parts [sqrt(W)].',
-    'codebook.digital_im': 'Combining vectors [N_B, N_SB, F, K], imaginary parts [sqrt(W)].',
-}
 
 
 class OptimizerNode(Node):
-    """Holds the codebook, checks every change as a whole, and publishes it latched.
+    """Holds the codebook as parameters, checks each change as a whole, and publishes it latched.
 
-    A codebook comes from the node's own parameters (a parameter file on the command line) or from
-    ``codebook_file``.
+    The first codebook comes from a parameter file on the command line or from ``codebook_file``.
     """
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__(topics.OPTIMIZER_NODE, **node_options)
         values = parameters.declare(self, 'optimizer')
-        self._scenario = (
-            Scenario.from_yaml(values.scenario_file) if values.scenario_file else Scenario())
+        self._scenario = parameters.scenario_of(values)
         self._publisher = self.create_publisher(ros.Codebook, topics.CODEBOOK, qos.HELD)
-        defaults = Codebook.load(values.codebook_file or default_codebook_file())
-        for name, value in defaults.to_parameters().items():
-            self.declare_parameter(
-                name, value, ParameterDescriptor(description=DESCRIPTIONS[name]))
+        defaults = Codebook.load(values.codebook_file or default_codebook_file()).to_parameters()
+        for name, text in CODEBOOK.items():
+            self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
         self._codebook_id, self._refused = '', 0
         self._publish(self._assemble({}))
         self._diagnostics = Diagnostics(self, self._report)
@@ -60,21 +48,21 @@ class OptimizerNode(Node):
         self.add_post_set_parameters_callback(self._on_set)
 
     def _assemble(self, changes: dict[str, Any]) -> Codebook:
-        present = {name: self.get_parameter(name).value for name in DESCRIPTIONS}
+        present = {name: self.get_parameter(name).value for name in CODEBOOK}
         codebook = Codebook.from_parameters(present | changes)
         codebook.check(self._scenario)
         return codebook
 
     def _check(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            self._assemble({p.name: p.value for p in changes if p.name in DESCRIPTIONS})
+            self._assemble({p.name: p.value for p in changes if p.name in CODEBOOK})
         except CodebookError as error:
             self._refused += 1
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _on_set(self, changes: list[Parameter]) -> None:
-        if any(p.name in DESCRIPTIONS for p in changes):
+        if any(p.name in CODEBOOK for p in changes):
             self._publish(self._assemble({}))
 
     def _report(self) -> Report:
@@ -85,32 +73,32 @@ class OptimizerNode(Node):
         self._codebook_id = codebook.id
         stamp = self.get_clock().now().to_msg()
         self._publisher.publish(convert.codebook_to_ros(codebook, stamp))
-        self.get_logger().info(
+        self.get_logger().info(  # type: ignore[no-untyped-call]
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable.
 
-    Without options of its own it holds a codebook. With some, it optimises one first and writes
-    its file; ``--push`` then hands it to the optimizer of a running network, instead.
+    Without options it holds a codebook. With options it first optimises one and writes it to a
+    file; with ``--push``, it then sets it on the optimizer of a running network instead.
 
     Parameters
     ----------
     args
-        Command line; by default the process's.
+        Command line; by default that of the process.
 
     Returns
     -------
     int
-        Exit code: 0 after a signal; 1 if a network did not take the codebook; 2 if an argument
+        Exit code: 0 after a signal; 1 if a network did not accept the codebook; 2 if an argument
         or a file is wrong.
     """
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
-    own = remove_ros_args(args)[1:]
-    if not own:
+    arguments = remove_ros_args(args)[1:]
+    if not arguments:
         return run(lambda: [OptimizerNode()], args)
-    options = _parser().parse_args(own)
+    options = _parser().parse_args(arguments)
     try:
         if options.push_file:
             return _push(Codebook.load(options.push_file), args)
@@ -130,18 +118,18 @@ def main(args: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='optimizer', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        description='Without options: hold a codebook as parameters. With options: optimise one '
-                    'offline, write it, then hold it.')
+        description='Without options, hold a codebook as parameters. With options, optimise one '
+                    'offline, write it to a file and hold it.')
     add_options(parser)
     parser.add_argument('--push', action='store_true',
-                        help='set it on the optimizer of a running network instead, and end')
+                        help='set it on the optimizer of a running network and exit')
     parser.add_argument('--push-file', type=Path, metavar='FILE',
-                        help='optimise nothing: set this codebook on a running network, and end')
+                        help='do not optimise: set this codebook on a running network and exit')
     return parser
 
 
 def _push(codebook: Codebook, args: Sequence[str]) -> int:
-    rclpy.init(args=args)
+    rclpy.init(args=list(args))
     node = Node(PUSHER_NODE)
     try:
         push(node, codebook)
@@ -152,7 +140,7 @@ def _push(codebook: Codebook, args: Sequence[str]) -> int:
         return 0
     finally:
         node.destroy_node()
-        rclpy.try_shutdown()
+        try_shutdown()
     print(f'codebook {codebook.id} is set')
     return 0
 

@@ -33,48 +33,41 @@ from rhs_isac_ros.protocol.events import (
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.background import Background
-from rhs_isac_ros.ros.parameters import ParameterError, settings_of
+from rhs_isac_ros.ros.background import BackgroundWorker
+from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
 
-class PositionerNode(RoleNode):
-    """The positioner; it listens to received signals once its tables are built."""
+class PositionerNode(RoleNode[Positioner]):
+    """The positioner; it subscribes to received signals once its first estimator is built."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('positioner', Positioner.SENDS, **node_options)
-        settings = self.settings(self.values)
-        self._background = Background(self)
+        super().__init__('positioner', **node_options)
+        settings = self.make_settings(self.values)
+        self._worker = BackgroundWorker(self)
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
-        self.start(Positioner(self.scenario, time.perf_counter, settings), ())
+        self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
         self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
-    def settings(self, values: types.SimpleNamespace) -> PositionerSettings:
-        """Return which estimator to use; whether its model fits a codebook shows later.
+    def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
+        """Return the settings for parameter values.
 
-        Parameters
-        ----------
-        values
-            The parameters, by name.
-
-        Returns
-        -------
-        PositionerSettings
-            The settings.
+        Whether a model fits the codebook is only checked when the estimator is built.
 
         Raises
         ------
         ParameterError
-            If the estimator needs a model and there is none, or it cannot be read.
+            If the estimator cannot be loaded, or needs a model that is missing or unreadable.
         """
         settings = settings_of(PositionerSettings, values)
         if settings.estimator not in ESTIMATORS:
             self._check_plugin(settings.estimator)
             return settings
         if settings.estimator != NeuralEstimator.name:
-            # The file is kept as a parameter, and changes nothing.
+            # Other estimators do not use the file; without it, a change has no effect on them.
             return dataclasses.replace(settings, model_file='')
         if not settings.model_file:
             raise ParameterError(
@@ -87,67 +80,52 @@ class PositionerNode(RoleNode):
 
     @staticmethod
     def _check_plugin(name: str) -> None:
-        """Refuse a plug-in without its code; whether it works shows later."""
+        """Check that a plug-in can be imported; it may still fail when the estimator is built."""
         try:
             plugins.load(plugins.ESTIMATORS, name)
         except plugins.PluginError as error:
             raise ParameterError(f'estimator: {error}') from None
 
-    def _make(self, settings: PositionerSettings, codebook: Codebook) -> Estimator:
+    def _make_estimator(self, settings: PositionerSettings, codebook: Codebook) -> Estimator:
         folder = self.values.table_folder
         options = file_options(
             settings.estimator, Path(folder) if folder else default_folder(),
             settings.model_file)
         return make_estimator(settings.estimator, self.scenario, codebook, **options)
 
-    def perform(self, action: Action) -> None:
-        """Make an estimator, in the background.
-
-        Parameters
-        ----------
-        action
-            What the role asks for.
+    def execute(self, action: Action) -> None:
+        """Build an estimator in the background.
 
         Raises
         ------
         TypeError
-            If it asks for anything else.
+            If the action is another one.
         """
         if not isinstance(action, BuildEstimator):
-            super().perform(action)
-        self._background.run(
+            super().execute(action)
+            return
+        self._worker.run(
             functools.partial(
                 build_estimator, action.codebook,
-                functools.partial(self._make, action.settings), time.perf_counter),
+                functools.partial(self._make_estimator, action.settings), time.perf_counter),
             self._on_estimator)
 
     def _on_estimator(self, event: EstimatorReady | EstimatorFailed) -> None:
         self.dispatch(event)
         if isinstance(event, EstimatorReady):
-            self.listen(Positioner.RECEIVES)
+            self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
-        """Publish an estimate, and the same as a standard pose.
-
-        Parameters
-        ----------
-        message
-            The estimate, or that there is none.
-
-        Returns
-        -------
-        bool
-            Whether it was published.
-        """
-        sent = super().publish(message)
-        if sent and isinstance(message, m.PositionEstimate):
+        """Publish a message, and an estimate also as a pose; return False if it is invalid."""
+        is_published = super().publish(message)
+        if is_published and isinstance(message, m.PositionEstimate):
             self._pose.publish(convert.pose(message, self.get_clock().now().to_msg()))
-        return sent
+        return is_published
 
     def destroy_node(self) -> None:
-        """End the background thread, then the node."""
-        self._background.close()
-        super().destroy_node()
+        """End the background thread, then destroy the node."""
+        self._worker.close()
+        super().destroy_node()  # type: ignore[no-untyped-call]
 
 
 main = entry(lambda: [PositionerNode()])

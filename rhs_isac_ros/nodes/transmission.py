@@ -8,36 +8,28 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.parameters import ParameterError, settings_of
+from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
 
-class TransmissionNode(RoleNode):
-    """The transmission phase; it listens to estimates once it has a codebook."""
+class TransmissionNode(RoleNode[Transmission]):
+    """The transmission; it creates its publishers and subscriptions once it has a codebook."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('transmission', (), **node_options)
-        self.start(Transmission(self.scenario, self.settings(self.values)), ())
+        super().__init__('transmission', **node_options)
+        self.start(Transmission(self.scenario, self.make_settings(self.values)),
+                   advertise=False, subscribe=False)
         self.follow_codebook(self._on_codebook)
 
-    def settings(self, values: types.SimpleNamespace) -> TransmissionSettings:
-        """Return which band to use.
-
-        Parameters
-        ----------
-        values
-            The parameters, by name.
-
-        Returns
-        -------
-        TransmissionSettings
-            The settings.
+    def make_settings(self, values: types.SimpleNamespace) -> TransmissionSettings:
+        """Return the settings for parameter values.
 
         Raises
         ------
         ParameterError
-            If the scenario has no such band.
+            If the scenario does not have the band.
         """
         n_bands = self.scenario.n_bands
         if values.band >= n_bands:
@@ -47,8 +39,8 @@ class TransmissionNode(RoleNode):
 
     def _on_codebook(self, codebook: Codebook) -> None:
         self.dispatch(CodebookOffered(codebook))
-        self.advertise(Transmission.SENDS)
-        self.listen(Transmission.RECEIVES)
+        self.advertise()
+        self.subscribe()
 
 
 main = entry(lambda: [TransmissionNode()])

@@ -8,31 +8,30 @@ import numpy as np
 from rhs_isac_ros.model import mobility, plugins, streams
 from rhs_isac_ros.protocol.events import PeersChanged
 from rhs_isac_ros.protocol.user import User, timeouts
-from rhs_isac_ros.ros import peer_monitor
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.peer_monitor import REQUIRED_BY_USER, PeerMonitor
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.timers import steady_timer
 
 
-class UserNode(RoleNode):
-    """A user."""
+class UserNode(RoleNode[User]):
+    """A user of the network."""
 
     def __init__(self, name: str = '', **node_options: Any) -> None:
-        super().__init__('user', User.SENDS, name, **node_options)
+        super().__init__('user', name, **node_options)
         values = self.values
-        self._user = User(
+        self.start(User(
             values.user_id, self._mobility(),
-            timeouts(values.step_timeout_s, values.beacon_timeout_s))
-        self.start(self._user, User.RECEIVES)
-        self._peers = peer_monitor.PeerMonitor(
-            self, peer_monitor.OF_USER, lambda missing: self.dispatch(PeersChanged(missing)))
-        steady_timer(self, values.ground_truth_period_s, self._show)
+            timeouts(values.step_timeout_s, values.beacon_timeout_s)))
+        self._peers = PeerMonitor(
+            self, REQUIRED_BY_USER, lambda missing: self.dispatch(PeersChanged(missing)))
+        steady_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
 
     def _mobility(self) -> mobility.Mobility:
         values = self.values
-        moves = values.mobility != 'static'
-        if moves and values.speed_mps > self.scenario.max_user_speed_mps:
+        is_moving = values.mobility != 'static'
+        if is_moving and values.speed_mps > self.scenario.max_user_speed_mps:
             raise ParameterError(
                 f'speed_mps: {values.speed_mps}, expected at most max_user_speed_mps = '
                 f'{self.scenario.max_user_speed_mps:g} m/s of the scenario')
@@ -41,26 +40,26 @@ class UserNode(RoleNode):
         if len(start) > 1:
             raise ParameterError(f'position_m: {len(start)} points, expected one or none')
         if values.mobility == 'waypoints':
-            way = self._points('waypoints_m')
-            if not len(way):
+            waypoints = self._points('waypoints_m')
+            if not len(waypoints):
                 raise ParameterError('waypoints_m: empty, expected x, y, z of the first point')
             if len(start):
                 raise ParameterError('position_m: given, expected none with mobility waypoints')
-            return mobility.Waypoints(way, values.speed_mps)
-        place = start[0] if len(start) else None
+            return mobility.Waypoints(waypoints.tolist(), values.speed_mps)
+        position = start[0] if len(start) else None
         if values.mobility == 'random_walk':
-            return mobility.RandomWalk(self.scenario, values.speed_mps, rng, place)
+            return mobility.RandomWalk(self.scenario, values.speed_mps, rng, position)
         if values.mobility == 'static':
             return mobility.Static(
-                self.scenario.sample_positions(1, rng)[0] if place is None else place)
+                self.scenario.sample_positions(1, rng)[0] if position is None else position)
         try:
             return mobility.make_plugin(
-                values.mobility, self.scenario, values.speed_mps, rng, place)
+                values.mobility, self.scenario, values.speed_mps, rng, position)
         except plugins.PluginError as error:
             raise ParameterError(f'mobility: {error}') from None
 
     def _points(self, name: str) -> np.ndarray:
-        """Points of a parameter, [N, 3], all in the region of interest."""
+        """Return the points of a parameter, [N, 3], checked to be in the region of interest."""
         numbers = np.array(getattr(self.values, name))
         if numbers.size % 3:
             raise ParameterError(f'{name}: {numbers.size} numbers, expected three for each point')
@@ -72,8 +71,8 @@ class UserNode(RoleNode):
                 f'{low.tolist()} to {high.tolist()}')
         return points
 
-    def _show(self) -> None:
-        self.publish(self._user.ground_truth(self.now_s()))
+    def _publish_ground_truth(self) -> None:
+        self.publish(self.role.ground_truth(self.now_s()))
 
 
 main = entry(lambda: [UserNode()])

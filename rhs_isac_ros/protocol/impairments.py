@@ -1,82 +1,65 @@
-"""An air that loses, doubles, delays and reorders, for trying out what a network bears."""
+"""A channel that loses, duplicates, delays and reorders messages."""
 
 import dataclasses
+import enum
 import heapq
 import itertools
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Tick
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
+from rhs_isac_ros.protocol.role import Role
+from rhs_isac_ros.protocol.settings import setting
 
 
 @dataclasses.dataclass(frozen=True)
 class Impairments:
-    """What happens to a message on its way.
+    """Impairments of the air interface."""
 
-    Attributes
-    ----------
-    loss_probability
-        That it never arrives.
-    double_probability
-        That it arrives a second time, if it arrives.
-    delay_s
-        How long it takes at least [s].
-    jitter_s
-        How much longer, at random and evenly, each for itself: so they overtake each other [s].
-    """
-
-    loss_probability: float = 0.0
-    double_probability: float = 0.0
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
+    loss_probability: float = setting(
+        0.0, 'Probability that a message is lost.', low=0.0, high=1.0)
+    double_probability: float = setting(
+        0.0, 'Probability that a message that arrives is duplicated.', low=0.0, high=1.0)
+    delay_s: float = setting(
+        0.0, 'Minimum delay of each message.', unit='s', low=0.0, high=10.0)
+    jitter_s: float = setting(
+        0.0, 'Maximum additional random delay; messages may be reordered.', unit='s',
+        low=0.0, high=10.0)
 
 
 class ImpairedChannel:
-    """A channel whose messages go through an air that need not be ideal.
+    """A channel role whose outgoing messages are subject to impairments.
 
-    Other impairments hold from the true position on with which the next cycle begins.
+    New impairments take effect with the true position that begins the next cycle.
 
     Parameters
     ----------
     role
-        The role, one without deadlines of its own.
+        A role without deadlines.
     impairments
-        What happens to its messages, until others are offered.
+        Initial impairments.
     rng
-        Source of randomness.
+        Random source of losses, duplicates and delays.
 
     Attributes
     ----------
     counters
-        Those of the role, with ``emulated_loss`` and ``emulated_double``.
+        The counters of the role, and ``emulated_loss`` and ``emulated_double``.
     """
 
-    def __init__(self, role: Any, impairments: Impairments, rng: np.random.Generator) -> None:
+    def __init__(self, role: Role, impairments: Impairments, rng: np.random.Generator) -> None:
+        self.counters = role.counters
         self._role, self._settings, self._rng = role, PendingSettings(impairments), rng
         self._cycle_id = 0
-        self.counters = role.counters
         self._serial = itertools.count()
-        self._on_the_way: list[tuple[float, int, Send]] = []
+        # Time of arrival, serial number as a tie-break, message.
+        self._in_flight: list[tuple[float, int, Send]] = []
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Hand an event to the role, and pass on what arrives by now.
-
-        Parameters
-        ----------
-        event
-            The event.
-        now_s
-            The time [s].
-
-        Returns
-        -------
-        list of Action
-            What arrives.
-        """
+        """Pass an event to the role and return the messages that arrive by `now_s` [s]."""
         arriving: list[Action] = []
         actions: list[Action] = []
         match event:
@@ -85,54 +68,62 @@ class ImpairedChannel:
             case SettingsOffered(impairments):
                 self._settings.newest = impairments
             case _:
-                arriving += self._begin(event)
+                arriving += self._begin_cycle(event)
                 actions = self._role.handle(event, now_s)
         for action in actions:
             if isinstance(action, Send):
                 self._send(action, now_s)
             else:
                 arriving.append(action)
-        while self._on_the_way and self._on_the_way[0][0] <= now_s:
-            arriving.append(heapq.heappop(self._on_the_way)[2])
+        while self._in_flight and self._in_flight[0][0] <= now_s:
+            arriving.append(heapq.heappop(self._in_flight)[2])
         return arriving
 
     def status(self) -> Mapping[str, str]:
-        """Return the impairments in use, and those that wait.
-
-        Returns
-        -------
-        Mapping
-            Values by name.
-        """
+        """Return the impairments in use and pending, by name."""
         return self._settings.describe()
 
+    @property
+    def SENDS(self) -> tuple[type[m.Message], ...]:
+        """Messages that the role sends."""
+        return self._role.SENDS
+
+    @property
+    def RECEIVES(self) -> tuple[type[m.Message], ...]:
+        """Messages that the role handles."""
+        return self._role.RECEIVES
+
+    @property
+    def state(self) -> enum.Enum | None:
+        """State of the role."""
+        return self._role.state
+
+    @property
+    def LACKING(self) -> frozenset[enum.Enum]:
+        """States in which something that the role needs is missing."""
+        return self._role.LACKING
+
     def next_deadline(self) -> float | None:
-        """Return when the next message arrives.
+        """Return when the next message arrives [s], or None if no message is in flight."""
+        return self._in_flight[0][0] if self._in_flight else None
 
-        Returns
-        -------
-        float or None
-            The time [s], on the clock of `handle`; None if nothing is on its way.
-        """
-        return self._on_the_way[0][0] if self._on_the_way else None
-
-    def _begin(self, event: Event) -> list[Action]:
+    def _begin_cycle(self, event: Event) -> list[Action]:
         if not isinstance(event, m.GroundTruth) or event.cycle_id in (0, self._cycle_id):
             return []
         self._cycle_id = event.cycle_id
-        return self._settings.settle()
+        return [*self._settings.settle()]
 
     def _send(self, action: Send, now_s: float) -> None:
-        what = self._settings.in_use
-        # All draws for every message: none depends on the fate of another one.
-        lost, doubled, *late = self._rng.random(4)
-        if lost < what.loss_probability:
+        impairments = self._settings.in_use
+        # The number of draws is fixed, so that the fate of one message does not affect another.
+        loss, duplication, *delays = self._rng.random(4)
+        if loss < impairments.loss_probability:
             self.counters['emulated_loss'] += 1
             return
         copies = 1
-        if doubled < what.double_probability:
+        if duplication < impairments.double_probability:
             copies = 2
             self.counters['emulated_double'] += 1
-        for share in late[:copies]:
-            arrives_s = now_s + what.delay_s + what.jitter_s * share
-            heapq.heappush(self._on_the_way, (arrives_s, next(self._serial), action))
+        for delay in delays[:copies]:
+            arrival_s = now_s + impairments.delay_s + impairments.jitter_s * delay
+            heapq.heappush(self._in_flight, (arrival_s, next(self._serial), action))

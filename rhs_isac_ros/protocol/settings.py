@@ -1,54 +1,76 @@
-"""What of a role may change while the network runs, by the names of its parameters."""
+"""Settings of the roles that may change while the network runs.
+
+Each field is declared once, by `setting`: the ROS parameter of the same name takes its default,
+range and description from here.
+"""
 
 import dataclasses
 from typing import Any
 
+from rhs_isac_ros.model import plugins
+from rhs_isac_ros.positioning import ESTIMATORS
 from rhs_isac_ros.protocol.ack_filter import parse_users
+from rhs_isac_ros.protocol.user_scheduler import POLICIES
+
+
+def setting(
+        default: bool | int | float | str, text: str, *, unit: str = '',
+        low: float | None = None, high: float | None = None, choices: tuple[str, ...] = (),
+        plugins: str = '', dynamic: bool = True) -> Any:
+    """Return a dataclass field with the declaration of its parameter as metadata.
+
+    Parameters
+    ----------
+    text
+        Description, one sentence.
+    low, high
+        Range of a number, inclusive.
+    choices
+        Valid strings; empty: any.
+    plugins
+        Entry point group whose names are valid too; empty: none.
+    dynamic
+        Whether the parameter may change while the node runs.
+    """
+    metadata = {'text': text, 'unit': unit, 'low': low, 'high': high, 'choices': choices,
+                'plugins': plugins, 'dynamic': dynamic}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True)
 class BaseStationSettings:
-    """How a base station works.
-
-    Attributes
-    ----------
-    policy
-        How to select among the users that answer, one of `POLICIES`.
-    receiver_noise
-        Whether the receiver adds thermal noise.
-    ack_timeout_s
-        How long to wait for acks [s].
-    step_timeout_s
-        How long to wait for the next message of a cycle [s].
-    retries
-        How often a step of a cycle is asked for again, before the cycle is given up.
-    rest_s
-        Pause between cycles [s].
-    data_duration_s
-        How long each direction transmits data [s].
-    allowed_users
-        Users whose acks it takes, as `parse_users` reads them.
-    ack_rate_hz
-        Acks that it takes of each user in a second.
+    """Settings of the base station.
 
     Raises
     ------
     ValueError
-        If ``allowed_users`` is no list of users.
+        If ``allowed_users`` is not a list of users, as `parse_users` reads it.
     """
 
-    policy: str = 'round_robin'
-    receiver_noise: bool = True
-    ack_timeout_s: float = 0.1
-    step_timeout_s: float = 1.0
-    retries: int = 3
-    rest_s: float = 0.1
-    data_duration_s: float = 1e-3
-    allowed_users: str = ''
-    ack_rate_hz: float = 200.0
+    policy: str = setting(
+        'round_robin', 'Policy that selects among the users that answer.', choices=POLICIES)
+    receiver_noise: bool = setting(
+        True, 'Whether to add thermal noise; false if the radio adds its own.')
+    ack_timeout_s: float = setting(
+        0.1, 'Time to wait for acks.', unit='s', low=0.001, high=60.0)
+    # Users apply the same timeout and are not notified of a change.
+    step_timeout_s: float = setting(
+        1.0, 'Time to wait for the next message of a cycle.', unit='s', low=0.01, high=60.0,
+        dynamic=False)
+    retries: int = setting(
+        3, 'Maximum number of times that a step is repeated within step_timeout_s.',
+        low=0, high=100)
+    rest_s: float = setting(0.1, 'Pause between cycles.', unit='s', low=0.0, high=3600.0)
+    data_duration_s: float = setting(
+        1e-3, 'Duration of the data transmission in each direction.', unit='s',
+        low=1e-6, high=10.0)
+    allowed_users: str = setting(
+        '', 'Users whose acks are accepted, such as 1, 4, 10-20; empty: all.')
+    ack_rate_hz: float = setting(
+        200.0, 'Maximum rate of acks accepted from each user.', unit='Hz', low=1.0, high=1e6)
 
     def __post_init__(self) -> None:
-        """Check what a type and a range do not tell."""
+        """Check what types and ranges cannot express."""
         try:
             parse_users(self.allowed_users)
         except ValueError as error:
@@ -57,83 +79,44 @@ class BaseStationSettings:
 
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
-    """How a positioner estimates.
+    """Settings of the positioner."""
 
-    Attributes
-    ----------
-    estimator
-        Name of the estimator.
-    model_file
-        Its trained model, if it needs one.
-    """
-
-    estimator: str = 'bayes'
-    model_file: str = ''
+    estimator: str = setting(
+        'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
+    model_file: str = setting('', 'Trained model; required by the estimator neural.')
 
 
 @dataclasses.dataclass(frozen=True)
 class TransmissionSettings:
-    """How a transmission chooses its band.
+    """Settings of the transmission."""
 
-    Attributes
-    ----------
-    band
-        Band of the transmission, from 0; -1: in each cycle the one of the best expected capacity.
-    """
-
-    band: int = -1
+    band: int = setting(
+        -1, 'Band of the transmission, from 0; -1: the best band of each cycle.',
+        low=-1, high=4095)
 
 
 def changes(old: Any, new: Any) -> dict[str, Any]:
-    """Compare settings of a role.
-
-    Parameters
-    ----------
-    old, new
-        Settings of one class.
-
-    Returns
-    -------
-    dict
-        The new values, by name, of what is another.
-    """
+    """Return the values of `new`, by name, that differ from those of `old`."""
     names = [field.name for field in dataclasses.fields(old)]
     return {name: getattr(new, name) for name in names
             if getattr(new, name) != getattr(old, name)}
 
 
 def describe_settings(in_use: Any, newest: Any) -> dict[str, str]:
-    """Put settings in words, for the diagnostics.
-
-    Parameters
-    ----------
-    in_use
-        The settings that the role works with.
-    newest
-        Those that it was given last.
+    """Return settings as text for the diagnostics.
 
     Returns
     -------
     dict
-        ``parameter.<name>``, what is in use, and ``pending.<name>``, what waits.
+        ``parameter.<name>`` for each value in use and ``pending.<name>`` for each newer value
+        that is not in use yet.
     """
-    told = {f'parameter.{name}': shown(value)
-            for name, value in dataclasses.asdict(in_use).items()}
-    return told | {f'pending.{name}': shown(value)
-                   for name, value in changes(in_use, newest).items()}
+    described = {f'parameter.{name}': shown(value)
+                 for name, value in dataclasses.asdict(in_use).items()}
+    return described | {f'pending.{name}': shown(value)
+                        for name, value in changes(in_use, newest).items()}
 
 
 def shown(value: Any) -> str:
-    """Write a value as ROS does.
-
-    Parameters
-    ----------
-    value
-        The value of a parameter.
-
-    Returns
-    -------
-    str
-        The text.
-    """
+    """Return a parameter value as ROS prints it."""
     return str(value).lower() if isinstance(value, bool) else str(value)

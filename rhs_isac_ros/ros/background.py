@@ -9,60 +9,54 @@ from rclpy.node import Node
 
 from rhs_isac_ros.ros.timers import steady_timer
 
-Result = TypeVar('Result')
-_SOON_S = 1e-6
+_Result = TypeVar('_Result')
+_IMMEDIATE_S = 1e-6
 
 
-class Background:
-    """Does one piece of work after the other in a thread of its own.
+class BackgroundWorker:
+    """A thread that runs jobs one after the other.
 
-    Results come back to the thread that spins the node, as if they were messages.
-
-    Parameters
-    ----------
-    node
-        The node that needs the results.
+    Results are delivered in the thread that spins the node, as messages are.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._open = True
-        self._done: collections.deque[tuple[Future, Callable[[Any], None]]] = collections.deque()
-        self._timer = steady_timer(node, _SOON_S, self._deliver)
+        self._is_open = True
+        self._done: collections.deque[tuple[Future[Any], Callable[[Any], None]]] = (
+            collections.deque())
+        self._timer = steady_timer(node, _IMMEDIATE_S, self._deliver)
         self._timer.cancel()
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
 
-    def run(self, work: Callable[[], Result], then: Callable[[Result], None]) -> None:
-        """Begin some work.
+    def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
+        """Queue a job.
 
         Parameters
         ----------
-        work
-            Function to call in the other thread.
-        then
-            Called with its result where the node's callbacks are. What `work` raises is raised
-            there instead.
+        on_result
+            Called with the result in the thread that spins the node. An exception of the job is
+            raised there instead.
         """
-        def hand_over(future: Future) -> None:
-            self._done.append((future, then))
+        def hand_over(future: Future[_Result]) -> None:
+            self._done.append((future, on_result))
             executor = self._node.executor
-            if self._open and executor is not None:
+            if self._is_open and executor is not None:
                 executor.create_task(self._wake)
-        self._pool.submit(work).add_done_callback(hand_over)
+        self._pool.submit(job).add_done_callback(hand_over)
 
     def close(self) -> None:
-        """Wait for the work that has begun, and forget its result and the rest."""
-        self._open = False
+        """Wait for the running job, cancel the others and discard all results."""
+        self._is_open = False
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _wake(self) -> None:
-        # Only sets the timer: the executor of events dies of an error in a task, and a task may
-        # outlive the node.
-        if self._open:
+        # The task only starts the timer: an exception in a task would stop the events executor,
+        # and a task may outlast the node.
+        if self._is_open:
             self._timer.reset()
 
     def _deliver(self) -> None:
         self._timer.cancel()
         while self._done:
-            future, then = self._done.popleft()
-            then(future.result())
+            future, on_result = self._done.popleft()
+            on_result(future.result())

@@ -1,4 +1,6 @@
-"""All conversions between the protocol's plain data and ROS messages."""
+"""Conversions between the plain messages of the protocol and ROS messages."""
+
+from __future__ import annotations
 
 import array
 import dataclasses
@@ -17,34 +19,23 @@ from std_msgs.msg import Header
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
-from rhs_isac_ros.ros.topics import MAP_FRAME
+from rhs_isac_ros.ros.topics import MAP_FRAME, NAMES
+
+_Codec = Callable[[Any], Any]
 
 
-def ros_type(kind: type[Message]) -> type:
-    """Return the ROS type of a message.
-
-    Parameters
-    ----------
-    kind
-        Class of the message.
-
-    Returns
-    -------
-    type
-        The class of `rhs_isac_msgs.msg` with the same name.
-    """
+def ros_type(kind: type[Message]) -> Any:
+    """Return the class of `rhs_isac_msgs.msg` with the name of a message class."""
     return getattr(ros, kind.__name__)
 
 
-def to_ros(message: Message, stamp: Time) -> Any:
+def to_ros(message: Message, stamp: Time | None) -> Any:
     """Convert a message to ROS.
 
     Parameters
     ----------
-    message
-        The message.
     stamp
-        Time for the header, if its type has one.
+        Time for the header, if the type has one.
 
     Returns
     -------
@@ -52,7 +43,7 @@ def to_ros(message: Message, stamp: Time) -> Any:
         A message of `ros_type`.
     """
     result = ros_type(type(message))()
-    for name, encode, _ in _fields(type(message)):
+    for name, encode, _ in _FIELDS[type(message)]:
         value = getattr(message, name)
         setattr(result, name, encode(value) if encode else value)
     if hasattr(result, 'header'):
@@ -61,27 +52,15 @@ def to_ros(message: Message, stamp: Time) -> Any:
 
 
 def from_ros(kind: type[Message], message: Any) -> Message:
-    """Convert a message from ROS.
-
-    Parameters
-    ----------
-    kind
-        Class of the result.
-    message
-        A message of its `ros_type`.
-
-    Returns
-    -------
-    Message
-        The message; its arrays may share the ROS message's memory.
+    """Convert a message of `ros_type` from ROS; the arrays may share its memory.
 
     Raises
     ------
     MessageError
-        If an array does not fill its shape, or a number is none of its constants.
+        If an array does not fill its shape, or a number is not one of its constants.
     """
     values = {}
-    for name, _, decode in _fields(kind):
+    for name, _, decode in _FIELDS[kind]:
         value = getattr(message, name)
         try:
             values[name] = decode(value) if decode else value
@@ -91,30 +70,18 @@ def from_ros(kind: type[Message], message: Any) -> Message:
 
 
 def from_bytes(kind: type[Message], serialized: bytes) -> Message:
-    """Convert a message from what a raw subscription gets.
+    """Convert a serialized message (CDR), as a raw subscription receives it.
 
-    rclpy drops what it cannot decode without a word; here it is an error like any other.
-
-    Parameters
-    ----------
-    kind
-        Class of the result.
-    serialized
-        A message of its `ros_type`, in CDR.
-
-    Returns
-    -------
-    Message
-        The message.
+    Other subscriptions of rclpy silently drop what they cannot deserialize.
 
     Raises
     ------
     MessageError
-        If the bytes are no such message, or as with `from_ros`.
+        If the bytes are not a message of `ros_type`, or as in `from_ros`.
     """
     try:
         message = deserialize_message(serialized, ros_type(kind))
-    # What rclpy raises is a RuntimeError without a public name; a string may be no UTF-8.
+    # rclpy raises a RuntimeError without a public class; a string may be invalid UTF-8.
     except (RuntimeError, ValueError) as error:
         raise MessageError(
             f'{kind.__name__}: {len(serialized)} bytes, expected one in CDR: '
@@ -123,20 +90,7 @@ def from_bytes(kind: type[Message], serialized: bytes) -> Message:
 
 
 def codebook_to_ros(codebook: Codebook, stamp: Time) -> ros.Codebook:
-    """Convert a codebook to ROS.
-
-    Parameters
-    ----------
-    codebook
-        The codebook.
-    stamp
-        Time for the header.
-
-    Returns
-    -------
-    rhs_isac_msgs.msg.Codebook
-        The message.
-    """
+    """Convert a codebook to ROS."""
     return ros.Codebook(
         header=Header(stamp=stamp, frame_id=MAP_FRAME), codebook_id=codebook.id,
         analog=_encode_real(codebook.analog), digital=_encode_complex(codebook.digital),
@@ -146,22 +100,12 @@ def codebook_to_ros(codebook: Codebook, stamp: Time) -> ros.Codebook:
 def codebook_from_ros(message: ros.Codebook) -> Codebook:
     """Convert a codebook from ROS.
 
-    Parameters
-    ----------
-    message
-        The message.
-
-    Returns
-    -------
-    Codebook
-        The codebook.
-
     Raises
     ------
     MessageError
         If an array does not fill its shape.
     CodebookError
-        If the arrays make no codebook.
+        If the arrays are not a valid codebook.
     """
     try:
         analog, digital = _decode_real(message.analog), _decode_complex(message.digital)
@@ -171,19 +115,9 @@ def codebook_from_ros(message: ros.Codebook) -> Codebook:
 
 
 def pose(estimate: PositionEstimate, stamp: Time) -> PoseWithCovarianceStamped:
-    """Return a position estimate as a standard pose; the orientation is unknown.
+    """Return a position estimate as a pose with unknown orientation.
 
-    Parameters
-    ----------
-    estimate
-        The estimate.
-    stamp
-        Time for the header.
-
-    Returns
-    -------
-    geometry_msgs.msg.PoseWithCovarianceStamped
-        The pose, with the variance of a uniform angle for each rotation.
+    Each rotation has the variance of an angle that is uniform from -pi to pi.
     """
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=MAP_FRAME))
     result.pose.pose.position = _encode_vector(Point, estimate.position)
@@ -199,30 +133,30 @@ def _encode_real(values: np.ndarray) -> ros.RealArray:
 
 
 def _encode_complex(values: np.ndarray) -> ros.ComplexArray:
-    # Filling from bytes is sixty times faster than from an iterable.
+    # Sixty times faster than from an iterable.
     return ros.ComplexArray(
         shape=array.array('I', values.shape), re=array.array('d', values.real.tobytes()),
         im=array.array('d', values.imag.tobytes()))
 
 
 def _decode_real(message: ros.RealArray) -> np.ndarray:
-    return _shaped(message.data, message.shape)
+    return _reshape(message.data, message.shape)
 
 
 def _decode_complex(message: ros.ComplexArray) -> np.ndarray:
-    real, imag = _shaped(message.re, message.shape), _shaped(message.im, message.shape)
+    real, imag = _reshape(message.re, message.shape), _reshape(message.im, message.shape)
     result = np.empty(real.shape, complex)
     result.real, result.imag = real, imag
     return result
 
 
-def _shaped(values: array.array, shape: array.array) -> np.ndarray:
+def _reshape(values: array.array[float], shape: array.array[int]) -> np.ndarray:
     if len(values) != math.prod(shape) or not len(values):
         raise ValueError(f'{len(values)} values, expected {list(shape)} of them, at least one')
     return np.frombuffer(values).reshape(tuple(shape))
 
 
-def _encode_vector(kind: type, values: np.ndarray) -> Any:
+def _encode_vector(kind: Any, values: np.ndarray) -> Any:
     x, y, z = values.tolist()
     return kind(x=x, y=y, z=z)
 
@@ -231,8 +165,8 @@ def _decode_vector(message: Any) -> np.ndarray:
     return np.array([message.x, message.y, message.z])
 
 
-# How a field of a ROS type is written and read; numbers and strings need nothing.
-_CODECS: dict[str, tuple[Callable, Callable]] = {
+# Encoder and decoder by ROS type; numbers and strings need neither.
+_CODECS: dict[str, tuple[_Codec, _Codec]] = {
     'rhs_isac_msgs/RealArray': (_encode_real, _decode_real),
     'rhs_isac_msgs/ComplexArray': (_encode_complex, _decode_complex),
     'geometry_msgs/Point': (functools.partial(_encode_vector, Point), _decode_vector),
@@ -243,14 +177,16 @@ _CODECS: dict[str, tuple[Callable, Callable]] = {
 }
 
 
-@functools.cache
-def _fields(kind: type[Message]) -> list[tuple[str, Callable | None, Callable | None]]:
-    """Name, encoder and decoder of every field."""
+def _fields_of(kind: type[Message]) -> list[tuple[str, _Codec | None, _Codec | None]]:
+    """Return name, encoder and decoder of each field of a message class."""
     types = ros_type(kind).get_fields_and_field_types()
-    result = []
+    result: list[tuple[str, _Codec | None, _Codec | None]] = []
     for field in dataclasses.fields(kind):
         encode, decode = _CODECS.get(types[field.name], (None, None))
         if isinstance(field.type, type) and issubclass(field.type, enum.IntEnum):
             encode, decode = int, field.type
         result.append((field.name, encode, decode))
     return result
+
+
+_FIELDS = {kind: _fields_of(kind) for kind in NAMES}

@@ -1,4 +1,4 @@
-"""What every node tells of itself, once a second, as `diagnostic_msgs/DiagnosticArray`."""
+"""The diagnostics of the nodes, published as `diagnostic_msgs/DiagnosticArray`."""
 
 from collections.abc import Callable, Iterator
 
@@ -15,21 +15,12 @@ _PERIOD_S = 1.0
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
-    """Convert a report to ROS.
+    """Convert the report of a node to one status, OK or WARN.
 
     Parameters
     ----------
-    report
-        The report.
     name
-        Full name of the node.
-    stamp
-        Time for the header.
-
-    Returns
-    -------
-    diagnostic_msgs.msg.DiagnosticArray
-        One status, OK or WARN, with all values.
+        Fully qualified name of the node.
     """
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
@@ -39,18 +30,7 @@ def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
 
 
 def from_ros(message: DiagnosticArray) -> Iterator[tuple[str, Report]]:
-    """Convert reports from ROS.
-
-    Parameters
-    ----------
-    message
-        The message.
-
-    Yields
-    ------
-    tuple
-        Full name of a node without its first slash, and its report.
-    """
+    """Yield the fully qualified name of each node, without its first slash, and its report."""
     for status in message.status:
         yield status.name, Report(
             status.level != DiagnosticStatus.OK, status.message,
@@ -58,15 +38,7 @@ def from_ros(message: DiagnosticArray) -> Iterator[tuple[str, Report]]:
 
 
 class Diagnostics:
-    """Publishes what a node tells of itself.
-
-    Parameters
-    ----------
-    node
-        The node.
-    report
-        Tells how it fares.
-    """
+    """Publishes the report of a node once a second."""
 
     def __init__(self, node: Node, report: Callable[[], Report]) -> None:
         self._node, self._report = node, report

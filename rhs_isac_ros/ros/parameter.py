@@ -1,4 +1,4 @@
-"""What the declaration of a ROS parameter says, and how a value is checked against it."""
+"""The declaration of a ROS parameter and the check of its values."""
 
 import dataclasses
 import math
@@ -18,22 +18,18 @@ class Parameter:
 
     Attributes
     ----------
-    name
-        Its name.
     default
-        Value when none is given; its type is the parameter's.
+        Value when none is given; its type is the type of the parameter.
     text
-        What it is.
-    unit
-        Its unit, if it has one.
+        Description, one sentence.
     low, high
         Range of a number, inclusive.
     choices
-        The values that a string may have; empty if any.
+        Valid strings; empty: any.
     plugins
-        Group of entry points whose names are choices too; empty if there is none.
+        Entry point group whose names are valid too; empty: none.
     dynamic
-        Whether it may change while the node runs; all others are read at the start.
+        Whether the parameter may change while the node runs; all others are read at the start.
     """
 
     name: str
@@ -48,13 +44,13 @@ class Parameter:
 
     @property
     def kind(self) -> str:
-        """Its ROS type."""
+        """ROS type of the parameter."""
         return {bool: 'bool', int: 'integer', float: 'double', str: 'string',
                 list: 'double_array'}[type(self.default)]
 
     @property
     def range(self) -> str:
-        """The values it may have within its type; empty if all."""
+        """Valid values within the type, as text; empty if all."""
         if self.choices:
             return ', '.join(self.choices) + (' or a plug-in' if self.plugins else '')
         if self.low is None:
@@ -65,7 +61,7 @@ class Parameter:
 
     @property
     def expected(self) -> str:
-        """The values it may have, in words."""
+        """Valid values as text, including the type."""
         if self.choices:
             return f'one of {self.range}' + (f' of {self.plugins}' if self.plugins else '')
         words = {'bool': 'true or false', 'integer': 'an integer', 'string': 'a string',
@@ -74,36 +70,38 @@ class Parameter:
         return f'{words}, {self.range}' if self.range else words
 
     def check(self, value: Any) -> None:
-        """Refuse a value that it may not have.
-
-        Parameters
-        ----------
-        value
-            The value.
+        """Check a value against the declaration.
 
         Raises
         ------
         ParameterError
-            If the value has the wrong type, is out of range or none of the choices.
+            If the value has the wrong type, is out of range or is not one of the choices.
         """
-        is_list = isinstance(self.default, list)
-        right = isinstance(value, Sequence) and not isinstance(value, str) if is_list else (
-            type(value) is type(self.default))
-        if right and (is_list or isinstance(self.default, float)):
-            # ROS checks no list, and is generous about the ends of a range.
-            right = all(isinstance(n, float) and math.isfinite(n) and self.low <= n <= self.high
-                        for n in (value if is_list else [value]))
-        elif right and self.low is not None:
-            right = self.low <= value <= self.high
-        if not right or self.choices and not self.plugins and value not in self.choices:
+        if not self._has_type(value) or not self._is_in_range(value):
             raise ParameterError(f'{self.name}: {value!r}, expected {self.expected}')
-        if self.plugins and value not in self.choices:
+        if self.choices and value not in self.choices:
+            if not self.plugins:
+                raise ParameterError(f'{self.name}: {value!r}, expected {self.expected}')
             self._check_plugin(value)
 
+    def _has_type(self, value: Any) -> bool:
+        if not isinstance(self.default, list):
+            return type(value) is type(self.default)
+        return (isinstance(value, Sequence) and not isinstance(value, str)
+                and all(isinstance(number, float) for number in value))
+
+    def _is_in_range(self, value: Any) -> bool:
+        # ROS does not check lists and tolerates small deviations at the ends of a range.
+        numbers = value if isinstance(self.default, list) else [value]
+        if self.low is None or self.high is None:
+            return True
+        return all(math.isfinite(number) and self.low <= number <= self.high
+                   for number in numbers)
+
     def _check_plugin(self, value: str) -> None:
-        """Refuse what is no plug-in either. Only here they are listed: that takes time."""
-        there = plugins.names(self.plugins)
-        if value not in there:
+        # Listing the installed plug-ins takes time; the built-in choices do not need it.
+        installed = plugins.names(self.plugins)
+        if value not in installed:
             raise ParameterError(
                 f'{self.name}: {value!r}, expected {self.expected}; '
-                f'installed: {", ".join(there) or "none"}')
+                f'installed: {", ".join(installed) or "none"}')

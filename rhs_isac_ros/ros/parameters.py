@@ -1,99 +1,93 @@
-"""Every ROS parameter, declared once; descriptors, checks and documentation come from here.
+"""The declarations of all ROS parameters: the source of descriptors, checks and documentation.
 
-``python -m rhs_isac_ros.ros.parameters`` prints the table of the README.
+``python -m rhs_isac_ros.ros.parameters`` prints the table of the README. Parameters that belong to
+the settings of a role are declared there.
 """
+
+from __future__ import annotations
 
 import dataclasses
 import types
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
-from rhs_isac_ros.model import mobility, plugins
-from rhs_isac_ros.positioning import ESTIMATORS
-from rhs_isac_ros.protocol.user_scheduler import POLICIES
+from rhs_isac_ros.model import Scenario, mobility, plugins
+from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.protocol.settings import (
+    BaseStationSettings,
+    PositionerSettings,
+    TransmissionSettings,
+)
 from rhs_isac_ros.ros.parameter import Parameter, ParameterError
 
-Settings = TypeVar('Settings')
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
-SCENARIO = Parameter(
-    'scenario_file', '', "YAML file of the scenario; empty: the paper's Table I.")
-SEED = Parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
-STEP_TIMEOUT = Parameter(
-    'step_timeout_s', 1.0, 'How long to wait for the next message of a cycle.', 's', 0.01, 60.0)
+
+class _Dataclass(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+
+_Settings = TypeVar('_Settings', bound=_Dataclass)
+
+
+def _declared_by(settings: type[_Dataclass]) -> dict[str, Parameter]:
+    """Return the parameters, by name, that the fields of a settings class declare."""
+    return {field.name: Parameter(field.name, getattr(settings, field.name), **field.metadata)
+            for field in dataclasses.fields(settings)}
+
+
+_SCENARIO = Parameter(
+    'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
+_SEED = Parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
+_BASE_STATION = _declared_by(BaseStationSettings)
+_POSITIONER = _declared_by(PositionerSettings)
 
 NODES: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
-        SCENARIO, SEED,
-        Parameter('policy', 'round_robin', 'How to select among the users that answer.',
-                  choices=POLICIES, dynamic=True),
-        Parameter('receiver_noise', True,
-                  'Add thermal noise; false where the radio has its own.', dynamic=True),
-        Parameter('ack_timeout_s', 0.1, 'How long to wait for acks.', 's', 0.001, 60.0,
-                  dynamic=True),
-        STEP_TIMEOUT,
-        Parameter('retries', 3, 'How often a step is asked for again within step_timeout_s.',
-                  low=0, high=100, dynamic=True),
-        Parameter('rest_s', 0.1, 'Pause between cycles.', 's', 0.0, 3600.0, dynamic=True),
-        Parameter('data_duration_s', 1e-3, 'Time that each direction transmits data.', 's',
-                  1e-6, 10.0, dynamic=True),
-        Parameter('allowed_users', '',
-                  'Users whose acks it takes, such as 1, 4, 10-20; empty: all.', dynamic=True),
-        Parameter('ack_rate_hz', 200.0, 'Acks that it takes of each user in a second.', 'Hz',
-                  1.0, 1e6, dynamic=True),
+        _SCENARIO, _SEED,
+        *_BASE_STATION.values(),
         Parameter('first_cycle', 0,
-                  'Number of the first cycle; 0: from the clock, so that none is repeated after '
-                  'a restart.', low=0, high=2**53),
+                  'Number of the first cycle; 0: from the clock, so that no number is repeated '
+                  'after a restart.', low=0, high=2**53),
     ),
     'user': (
-        SCENARIO, SEED,
+        _SCENARIO, _SEED,
         Parameter('user_id', 1, 'Number of the user.', low=1, high=2**31 - 1),
-        Parameter('mobility', 'static', 'How the user moves.', choices=mobility.KINDS,
+        Parameter('mobility', 'static', 'Mobility model.', choices=mobility.KINDS,
                   plugins=plugins.MOBILITIES),
-        Parameter('position_m', [], 'Where it starts: x, y, z; empty: at random in the region.',
+        Parameter('position_m', [],
+                  'Initial position x, y, z; empty: a random point of the region of interest.',
                   'm', -1e6, 1e6),
-        Parameter('waypoints_m', [], 'Its way: x, y, z of one point after the other.', 'm',
-                  -1e6, 1e6),
-        Parameter('speed_mps', 1.0, 'Its speed, at most max_user_speed_mps of the scenario.',
+        Parameter('waypoints_m', [], 'Waypoints: x, y, z of each, in order.', 'm', -1e6, 1e6),
+        Parameter('speed_mps', 1.0, 'Speed, at most max_user_speed_mps of the scenario.',
                   'm/s', 0.0, 1e4),
-        Parameter('ground_truth_period_s', 0.5, 'How often it tells its true position.', 's',
-                  0.01, 60.0),
-        STEP_TIMEOUT,
-        Parameter('beacon_timeout_s', 1.5, 'Without a beacon for so long, it says so.', 's', 0.1,
-                  7200.0),
+        Parameter('ground_truth_period_s', 0.5,
+                  'Period at which the true position is published.', 's', 0.01, 60.0),
+        _BASE_STATION['step_timeout_s'],
+        Parameter('beacon_timeout_s', 1.5,
+                  'Time without a beacon after which a warning is logged.', 's', 0.1, 7200.0),
     ),
-    'rhs_controller': (SCENARIO,),
-    'channel': (
-        SCENARIO, SEED,
-        Parameter('loss_probability', 0.0, 'That the air loses a signal or a packet.',
-                  low=0.0, high=1.0, dynamic=True),
-        Parameter('double_probability', 0.0, 'That one arrives twice.', low=0.0, high=1.0,
-                  dynamic=True),
-        Parameter('delay_s', 0.0, 'How long each takes at least.', 's', 0.0, 10.0, dynamic=True),
-        Parameter('jitter_s', 0.0, 'How much longer at most, each at random: they overtake.', 's',
-                  0.0, 10.0, dynamic=True),
-    ),
+    'rhs_controller': (_SCENARIO,),
+    'channel': (_SCENARIO, _SEED, *_declared_by(Impairments).values()),
     'positioner': (
-        SCENARIO,
-        Parameter('estimator', 'bayes', 'Estimator of the position.', choices=tuple(ESTIMATORS),
-                  plugins=plugins.ESTIMATORS, dynamic=True),
+        _SCENARIO,
+        _POSITIONER['estimator'],
         Parameter('table_folder', '',
-                  "Where tables are kept between runs; empty: the user's folder for caches."),
-        Parameter('model_file', '', 'Trained model; the estimator neural needs one.',
-                  dynamic=True),
+                  "Folder in which tables are cached; empty: the user's cache folder."),
+        _POSITIONER['model_file'],
     ),
-    'transmission': (
-        SCENARIO,
-        Parameter('band', -1, 'Band of the transmission, from 0; -1: in each cycle the best.',
-                  low=-1, high=4095, dynamic=True),
-    ),
+    'transmission': (_SCENARIO, *_declared_by(TransmissionSettings).values()),
     'optimizer': (
-        SCENARIO,
-        Parameter('codebook_file', '', 'Codebook to hold; empty: the one of the package.'),
+        _SCENARIO,
+        Parameter('codebook_file', '', 'Codebook file; empty: the default codebook.'),
     ),
     'visualizer': (
-        SCENARIO,
-        Parameter('period_s', 0.2, 'How often it shows the scene.', 's', 0.01, 60.0),
-        Parameter('forget_s', 10.0, 'After how long without a word a user is taken away.', 's',
+        _SCENARIO,
+        Parameter('period_s', 0.2, 'Period at which the scene is published.', 's', 0.01, 60.0),
+        Parameter('forget_s', 10.0, 'Time without a message after which a user is removed.', 's',
                   0.1, 3600.0),
     ),
     'network': (
@@ -101,80 +95,68 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     ),
 }
 
+# The parameters that hold the codebook, with their descriptions; only the optimizer has them.
+CODEBOOK: Mapping[str, str] = {
+    'codebook.id': 'Hash of the content, which must match.',
+    'codebook.shape': 'Sizes N_B, N_SB, F, K, N_E.',
+    'codebook.average_crlb': 'Average Cramer-Rao bound [m^2].',
+    'codebook.provenance': 'Provenance of the codebook.',
+    'codebook.analog': 'Configurations [N_B, F, N_E], from 0 to 1.',
+    'codebook.digital_re': 'Combining vectors [N_B, N_SB, F, K], real parts [sqrt(W)].',
+    'codebook.digital_im': 'Combining vectors [N_B, N_SB, F, K], imaginary parts [sqrt(W)].',
+}
 
-def declare(node: Any, executable: str) -> types.SimpleNamespace:
-    """Declare a node's parameters and read them.
 
-    Parameters
-    ----------
-    node
-        The node, an `rclpy.node.Node`.
-    executable
-        Name of its executable, a key of `NODES`.
-
-    Returns
-    -------
-    types.SimpleNamespace
-        Values by name.
+def declare(node: Node, executable: str) -> types.SimpleNamespace:
+    """Declare the parameters of an executable, a key of `NODES`, and return values by name.
 
     Raises
     ------
     ParameterError
-        If a value has the wrong type, is out of range or none of the choices.
+        If a value has the wrong type, is out of range or is not one of the choices.
     """
     return types.SimpleNamespace(
         **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
 
 
-def _declare_one(node: Any, parameter: Parameter) -> Any:
-    # Here, so that the table can be read without ROS.
+def _declare_one(node: Node, parameter: Parameter) -> Any:
+    # Imported here, so that the table can be read without ROS.
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
     from rclpy.parameter import Parameter as RosParameter
 
-    default = parameter.default
+    default, low, high = parameter.default, parameter.low, parameter.high
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.text + unit, additional_constraints=parameter.expected,
         read_only=not parameter.dynamic)
-    if parameter.low is not None and type(default) is int:
-        descriptor.integer_range = [
-            IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high))]
-    elif parameter.low is not None and type(default) is float:
-        descriptor.floating_point_range = [
-            FloatingPointRange(from_value=parameter.low, to_value=parameter.high)]
-    # An empty list would not tell its type.
-    typed = RosParameter.Type.DOUBLE_ARRAY if isinstance(default, list) else default
+    if low is not None and high is not None:
+        if type(default) is int:
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        elif type(default) is float:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    # ROS cannot infer the element type of an empty list.
+    is_list = isinstance(default, list)
+    typed = RosParameter.Type.DOUBLE_ARRAY if is_list else default
     try:
-        value = node.declare_parameter(parameter.name, typed, descriptor).value
+        value: Any = node.declare_parameter(parameter.name, typed, descriptor).value
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         raise ParameterError(
             f'{parameter.name}: {error}; expected {parameter.expected}') from None
-    value = default if value is None else value
-    value = list(value) if isinstance(default, list) else value
+    if value is None:
+        value = default
+    value = list(value) if is_list else value
     parameter.check(value)
     return value
 
 
-def settings_of(kind: type[Settings], values: types.SimpleNamespace) -> Settings:
-    """Take the settings of a role from a node's parameters.
-
-    Parameters
-    ----------
-    kind
-        A dataclass whose fields have names of parameters.
-    values
-        Values by name.
-
-    Returns
-    -------
-    Settings
-        The settings.
+def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settings:
+    """Return the settings of a role, a dataclass, from the parameters named as its fields.
 
     Raises
     ------
     ParameterError
-        If the class refuses them.
+        If the class rejects the values.
     """
     try:
         return kind(**{field.name: getattr(values, field.name)
@@ -183,25 +165,31 @@ def settings_of(kind: type[Settings], values: types.SimpleNamespace) -> Settings
         raise ParameterError(str(error)) from None
 
 
-def table() -> str:
-    """Write all parameters as a Markdown table.
+def scenario_of(values: types.SimpleNamespace) -> Scenario:
+    """Return the scenario of the parameter ``scenario_file``.
 
-    Returns
-    -------
-    str
-        One row for each parameter and the executables that have it.
+    Raises
+    ------
+    ScenarioError
+        If the file is wrong.
     """
+    file = values.scenario_file
+    return Scenario.from_yaml(file) if file else Scenario()
+
+
+def table() -> str:
+    """Return a Markdown table of all parameters, with the executables that have each."""
     rows: dict[str, tuple[Parameter, list[str]]] = {}
     for executable, parameters in NODES.items():
         for parameter in parameters:
             rows.setdefault(parameter.name, (parameter, []))[1].append(executable)
-    lines = ['| parameter | type | default | range | hot | nodes | what it is |',
+    lines = ['| parameter | type | default | range | dynamic | nodes | description |',
              '|---|---|---|---|---|---|---|']
     for name, (parameter, owners) in rows.items():
         default = parameter.default
-        shown = str(default).lower() if isinstance(default, bool) else default or 'empty'
-        shown = default if type(default) in (int, float) else shown
-        lines.append(f'| `{name}` | {parameter.kind} | {shown} | {parameter.range} | '
+        shown = str(default).lower() if isinstance(default, bool) else str(default)
+        lines.append(f'| `{name}` | {parameter.kind} | '
+                     f'{"empty" if default in ("", []) else shown} | {parameter.range} | '
                      f'{"yes" if parameter.dynamic else ""} | {", ".join(owners)} | '
                      f'{parameter.text} |')
     return '\n'.join(lines)

@@ -1,4 +1,4 @@
-"""Starting executables of the package as processes, and never leaving one behind."""
+"""Executables of the package as child processes, which never outlive their parent."""
 
 import ctypes
 import os
@@ -13,14 +13,14 @@ from typing import Any
 from ament_index_python.packages import get_package_prefix
 
 _PR_SET_PDEATHSIG = 1
-# Looked up here: between fork and exec, no library may be loaded.
+# Loaded here, because no library may be loaded between fork and exec.
 _PRCTL = ctypes.CDLL(None).prctl
-# Signals to end a process with, each with the time that it gets to obey [s].
-_ENDINGS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
+# Signals that end a process, each with the time to wait for the end [s].
+_STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 
 
 def private_domain() -> dict[str, str]:
-    """Return environment variables that keep a network to itself, unless they are set already.
+    """Return environment variables that isolate a network; variables that are set already stay.
 
     Returns
     -------
@@ -28,7 +28,7 @@ def private_domain() -> dict[str, str]:
         ``ROS_DOMAIN_ID``, different for most processes, and ``ROS_AUTOMATIC_DISCOVERY_RANGE``.
     """
     return {
-        # Above 101, the ports of a domain may meet those that Linux gives to clients.
+        # Above 101, the ports of a domain may collide with the ephemeral ports of Linux.
         'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', str(1 + os.getpid() % 101)),
         'ROS_AUTOMATIC_DISCOVERY_RANGE':
             os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'),
@@ -36,17 +36,17 @@ def private_domain() -> dict[str, str]:
 
 
 class Processes:
-    """Executables of this package, each in a process; a context manager that ends them.
+    """A context manager that runs executables of this package and ends them on exit.
 
     Parameters
     ----------
     logs
-        Directory for what each process prints: one file ``<name>.log`` each.
+        Directory for the output of the processes, ``<name>.log`` each.
     environment
-        Environment variables to set for all of them.
+        Environment variables to set for all processes.
     within
-        Function of a node's name that returns what to put before its command, such as
-        ``ip netns exec lab``; by default nothing.
+        Callable that takes the name of a node and returns a prefix of its command, such as
+        ``ip netns exec lab``.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Processes:
             within: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
         self._logs, self._within = logs, within
         self._environment = {**os.environ, **environment}
-        self._running: dict[str, subprocess.Popen] = {}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._commands: dict[str, list[str]] = {}
 
     def start(self, executable: str, name: str = '', **parameters: Any) -> None:
@@ -62,16 +62,14 @@ class Processes:
 
         Parameters
         ----------
-        executable
-            Which one.
         name
-            Name of its node, where it differs.
+            Name of its node; by default that of the executable.
         **parameters
             ROS parameters.
         """
         program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
         command = [str(program), '--ros-args']
-        # Without a name, none is remapped: an executable may have many nodes.
+        # Only a given name is remapped, because an executable may have several nodes.
         if name:
             command += ['-r', f'__node:={name}']
         name = name or executable
@@ -83,35 +81,17 @@ class Processes:
         self._spawn(name, 'wb')
 
     def kill(self, name: str) -> None:
-        """End a process with SIGKILL, as a crash or a pulled plug would.
-
-        Parameters
-        ----------
-        name
-            Name of its node.
-        """
+        """End the process of a node with SIGKILL, as a crash would."""
         process = self._running.pop(name)
         process.kill()
         process.wait()
 
     def restart(self, name: str) -> None:
-        """Start a process again as it was started before; it goes on in the same log.
-
-        Parameters
-        ----------
-        name
-            Name of its node.
-        """
+        """Start the process of a node again, with the same command and the same log."""
         self._spawn(name, 'ab')
 
     def memory_bytes(self) -> dict[str, int]:
-        """Return the resident memory of the processes.
-
-        Returns
-        -------
-        dict
-            Memory by name [bytes], of those that run.
-        """
+        """Return the resident memory of the running processes by name [bytes]."""
         page = os.sysconf('SC_PAGE_SIZE')
         result = {}
         for name, process in self._running.items():
@@ -128,42 +108,25 @@ class Processes:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the nodes that were started."""
+        """Names of all nodes that were started."""
         return tuple(self._commands)
 
     def ended(self) -> dict[str, int]:
-        """Return the processes that have ended by themselves.
-
-        Returns
-        -------
-        dict
-            Exit codes by name.
-        """
+        """Return the exit codes, by name, of processes that have ended without `kill`."""
         codes = {name: process.poll() for name, process in self._running.items()}
         return {name: code for name, code in codes.items() if code is not None}
 
     def log(self, name: str) -> str:
-        """Return what a process has printed.
-
-        Parameters
-        ----------
-        name
-            Name of its node.
-
-        Returns
-        -------
-        str
-            The text.
-        """
+        """Return the output of the process of a node."""
         return (self._logs / f'{name}.log').read_text(encoding='utf-8', errors='replace')
 
     def stop(self) -> None:
-        """End all processes, politely first."""
-        for ending, patience_s in _ENDINGS:
+        """End all processes, with signals of increasing severity."""
+        for number, timeout_s in _STOP_SIGNALS:
             running = [p for p in self._running.values() if p.poll() is None]
             for process in running:
-                process.send_signal(ending)
-            end_s = time.monotonic() + patience_s
+                process.send_signal(number)
+            end_s = time.monotonic() + timeout_s
             for process in running:
                 try:
                     process.wait(max(end_s - time.monotonic(), 0.0))
@@ -171,13 +134,13 @@ class Processes:
                     continue
 
     def __enter__(self) -> 'Processes':
-        """Return itself."""
+        """Return the object."""
         return self
 
     def __exit__(
             self, kind: type[BaseException] | None, error: BaseException | None,
             traceback: TracebackType | None) -> None:
-        """End all processes, even if the user presses Ctrl-C once more."""
+        """End all processes, even if Ctrl-C is pressed again."""
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             self.stop()
@@ -186,5 +149,5 @@ class Processes:
 
 
 def _end_with_parent() -> None:
-    """Have the kernel end this process when its parent dies, however that happens."""
+    """Have the kernel send SIGTERM to this process when its parent dies for any reason."""
     _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""The quality of service of every topic."""
+"""The quality of service of all topics."""
 
 from rclpy.duration import Duration
 from rclpy.qos import (
@@ -11,19 +11,19 @@ from rclpy.qos import (
 
 from rhs_isac_ros.protocol import messages as m
 
-# Handshakes and signals: each counts, none is of use to who joins later. The depth takes the
-# pilots of a band, or the acks of many users, at once.
+# For handshakes and signals, which must all arrive and are useless to late joiners. The depth
+# holds the pilots of a band, or simultaneous acks of many users.
 EXCHANGE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)
 
-# The present value of something: who joins later gets it.
+# For a current value, which late joiners receive as well.
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-# The same of something that somebody must go on holding: who listens is told within a second when
-# the holder dies, and not after the twenty that discovery takes.
+# For a current value whose publisher must stay alive. Subscribers are notified within a second
+# when the publisher dies, long before discovery times out.
 HELD = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL, liveliness=LivelinessPolicy.AUTOMATIC,
@@ -33,16 +33,5 @@ _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
 def of(kind: type[m.Message]) -> QoSProfile:
-    """Return the quality of service of a message's topic.
-
-    Parameters
-    ----------
-    kind
-        Class of the message.
-
-    Returns
-    -------
-    rclpy.qos.QoSProfile
-        `LATCHED` for what is the present value of something, else `EXCHANGE`.
-    """
+    """Return `LATCHED` for messages that are a current value, otherwise `EXCHANGE`."""
     return LATCHED if kind in _LATCHED_MESSAGES else EXCHANGE

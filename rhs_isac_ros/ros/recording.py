@@ -1,6 +1,6 @@
-"""Recordings: MCAP files as of ``ros2 bag``, with the definitions of their messages.
+"""Recordings: self-contained MCAP files in the format of ``ros2 bag``.
 
-They open in Foxglove and in ``ros2 bag info`` and ``play``. The library mcap is optional.
+Foxglove, ``ros2 bag info`` and ``ros2 bag play`` read them. The library mcap is optional.
 """
 
 import contextlib
@@ -23,8 +23,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.subscriptions import subscribe
 
-# What stands between the definitions of a schema, as in ROS 1 and 2.
-_RULE = '=' * 80
+# Separator between the message definitions of a schema, as in ROS 1 and 2.
+_SEPARATOR = '=' * 80
 _SCENARIO = 'scenario'
 _BUILT_IN = re.compile(r'(bool|byte|char|float\d+|u?int\d+|w?string)\b')
 
@@ -33,14 +33,8 @@ class RecordingError(Exception):
     """A recording cannot be written or read."""
 
 
-def outlets() -> dict[str, tuple[type, QoSProfile]]:
-    """Return every topic of a network.
-
-    Returns
-    -------
-    dict
-        Class of the messages and quality of service, by relative name.
-    """
+def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
+    """Return the type and the quality of service of each recorded topic, by relative name."""
     found = {name: (convert.ros_type(kind), qos.of(kind)) for kind, name in topics.NAMES.items()}
     found[topics.POSITION] = PoseWithCovarianceStamped, qos.EXCHANGE
     found[topics.CODEBOOK] = ros.Codebook, qos.LATCHED
@@ -49,34 +43,12 @@ def outlets() -> dict[str, tuple[type, QoSProfile]]:
 
 
 def type_name(kind: type) -> str:
-    """Return the name of a class of messages, such as ``std_msgs/msg/Header``.
-
-    Parameters
-    ----------
-    kind
-        The class.
-
-    Returns
-    -------
-    str
-        Its name.
-    """
+    """Return the name of a ROS message class, such as ``std_msgs/msg/Header``."""
     return f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
 
 
 def schema(kind: type) -> str:
-    """Return the definition of a class of messages, followed by those that it is made of.
-
-    Parameters
-    ----------
-    kind
-        The class.
-
-    Returns
-    -------
-    str
-        The text that MCAP calls ``ros2msg``.
-    """
+    """Return the definition of a message class and of its parts, in the encoding ``ros2msg``."""
     first = type_name(kind).replace('/msg/', '/')
     texts: dict[str, str] = {}
     wanted = [first]
@@ -88,21 +60,22 @@ def schema(kind: type) -> str:
             texts[name] = file.read_text(encoding='utf-8')
             wanted += _parts(texts[name], package)
     own = texts.pop(first)
-    return '\n'.join([own, *(f'{_RULE}\nMSG: {name}\n{text}' for name, text in texts.items())])
+    parts = (f'{_SEPARATOR}\nMSG: {name}\n{text}' for name, text in texts.items())
+    return '\n'.join([own, *parts])
 
 
-def _offered(profile: QoSProfile) -> str:
-    """Write a quality of service as ``ros2 bag play`` reads it: else nothing would be latched."""
-    for_ever = {'sec': 9223372036, 'nsec': 854775807}
+def _offered_qos(profile: QoSProfile) -> str:
+    """Return a quality of service as ``ros2 bag play`` reads it, so that it latches topics."""
+    unlimited = {'sec': 9223372036, 'nsec': 854775807}
     return yaml.safe_dump([{
         'history': profile.history.short_key, 'depth': profile.depth,
         'reliability': profile.reliability.short_key, 'durability': profile.durability.short_key,
-        'deadline': dict(for_ever), 'lifespan': dict(for_ever), 'liveliness': 'automatic',
-        'liveliness_lease_duration': dict(for_ever), 'avoid_ros_namespace_conventions': False}])
+        'deadline': dict(unlimited), 'lifespan': dict(unlimited), 'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(unlimited), 'avoid_ros_namespace_conventions': False}])
 
 
 def _parts(text: str, package: str) -> Iterator[str]:
-    """Yield the messages that a definition names."""
+    """Yield the names of the messages that a definition refers to."""
     for line in text.splitlines():
         field = re.match(r'\s*([A-Za-z][\w/]*)', line)
         if field and not _BUILT_IN.match(field[1]):
@@ -111,21 +84,20 @@ def _parts(text: str, package: str) -> Iterator[str]:
 
 
 class Recorder:
-    """Writes what is said in a network to a file, which is there under its name once closed.
+    """Writes the messages of a network to a file.
 
-    Until then it is ``<name>.part``, of which a broken run leaves what was written.
+    The file is ``<name>.part`` until it is closed, so that an interrupted run leaves its messages
+    there.
 
     Parameters
     ----------
-    path
-        The file.
     scenario
-        Scenario of the network, kept in the file.
+        Scenario of the network, stored in the file.
 
     Attributes
     ----------
     count
-        Messages written.
+        Number of messages written.
 
     Raises
     ------
@@ -139,9 +111,9 @@ class Recorder:
         except ImportError:
             raise RecordingError(_missing('recording')) from None
         self._path = Path(path)
-        self._aside = self._path.with_name(f'{self._path.name}.part')
+        self._partial = self._path.with_name(f'{self._path.name}.part')
         try:
-            self._stream = self._aside.open('wb')
+            self._stream = self._partial.open('wb')
         except OSError as error:
             raise RecordingError(f'{path}: cannot be written: {error.strerror}') from None
         self._writer = Writer(self._stream)
@@ -149,69 +121,64 @@ class Recorder:
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
         self.count = 0
 
-    def listen(self, node: Node, then: Callable[[str, bytes], None] | None = None) -> None:
-        """Record every topic of a node's namespace.
+    def listen(self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
+        """Record all topics in the namespace of a node.
 
         Parameters
         ----------
-        node
-            The node.
-        then
-            Called with the relative name of the topic and the serialised message once it is
-            written.
+        on_message
+            Called with the relative name of the topic and each serialized message, once written.
         """
-        for name, (kind, profile) in outlets().items():
+        for name, (kind, profile) in recorded_topics().items():
             channel = self._writer.register_channel(
                 topic=node.resolve_topic_name(name), message_encoding='cdr',
                 schema_id=self._writer.register_schema(
                     type_name(kind), 'ros2msg', schema(kind).encode()),
-                metadata={'offered_qos_profiles': _offered(profile)})
+                metadata={'offered_qos_profiles': _offered_qos(profile)})
             subscribe(
-                node, kind, name, self._writes(channel, name, then), profile, raw=True)
+                node, kind, name, self._writer_of(channel, name, on_message), profile, raw=True)
 
-    def _writes(
-            self, channel: int, name: str, then: Callable[[str, bytes], None] | None
+    def _writer_of(
+            self, channel: int, name: str, on_message: Callable[[str, bytes], None] | None
     ) -> Callable[[bytes], None]:
         def write(message: bytes) -> None:
             now_ns = time.time_ns()
             self._writer.add_message(
                 channel_id=channel, log_time=now_ns, publish_time=now_ns, data=message)
             self.count += 1
-            if then:
-                then(name, message)
+            if on_message:
+                on_message(name, message)
         return write
 
     def close(self) -> None:
-        """Complete the file and give it its name."""
+        """Complete the file and rename it."""
         if not self._stream.closed:
             self._writer.finish()
             self._stream.close()
-            self._aside.replace(self._path)
+            self._partial.replace(self._path)
 
 
 def read(
         path: str | Path, names: Collection[str] | None = None
 ) -> Iterator[tuple[str, Any, float]]:
-    """Read the messages of a recording in the order in which they were written.
+    """Yield the messages of a recording in the order in which they were written.
 
     Parameters
     ----------
-    path
-        The file.
     names
         Full names of the topics to read; None: all.
 
     Yields
     ------
     tuple
-        Full name of the topic, the ROS message, and when it was recorded [s].
+        Full name of the topic, ROS message and time of recording [s].
 
     Raises
     ------
     RecordingError
-        If mcap is not installed, or the file is no recording.
+        If mcap is not installed, or the file is not a recording.
     """
-    kinds = {type_name(kind): kind for kind, _ in outlets().values()}
+    kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     with _opened(path) as reader:
         for found, channel, message in reader.iter_messages(topics=names):
             if found is not None and found.name in kinds:
@@ -220,22 +187,12 @@ def read(
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Read the scenario that a recording keeps.
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Returns
-    -------
-    Scenario or None
-        The scenario; None if it keeps none, as a recording of ``ros2 bag``.
+    """Read the scenario of a recording; None if it has none, as a recording of ``ros2 bag``.
 
     Raises
     ------
     RecordingError
-        If mcap is not installed, or the file is no recording.
+        If mcap is not installed, or the file is not a recording.
     ScenarioError
         If the scenario is wrong.
     """
@@ -244,15 +201,15 @@ def read_scenario(path: str | Path) -> Scenario | None:
             if metadata.name == _SCENARIO:
                 try:
                     return Scenario(**yaml.safe_load(metadata.metadata['yaml']))
-                # Of another version, or written by someone else.
+                # The file may come from another version or another program.
                 except (KeyError, TypeError, yaml.YAMLError) as error:
-                    raise RecordingError(f'{path}: its scenario is none: {error}') from None
+                    raise RecordingError(f'{path}: invalid scenario: {error}') from None
     return None
 
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
-    """Yield a reader; what goes wrong with it becomes a `RecordingError`."""
+    """Yield a reader and convert its exceptions to `RecordingError`."""
     try:
         from mcap.exceptions import McapError
         from mcap.reader import make_reader
@@ -264,7 +221,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except McapError as error:
-        raise RecordingError(f'{path}: no whole recording: {error!r}') from None
+        raise RecordingError(f'{path}: not a complete recording: {error!r}') from None
 
 
 def _missing(purpose: str) -> str:

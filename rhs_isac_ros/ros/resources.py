@@ -1,4 +1,4 @@
-"""Files that come with the package."""
+"""Files of the installed package."""
 
 from pathlib import Path
 
@@ -6,22 +6,10 @@ from ament_index_python.packages import get_package_share_directory
 
 
 def default_codebook_file() -> Path:
-    """Return where the default codebook lies.
-
-    Returns
-    -------
-    pathlib.Path
-        The file ``config/codebook.yaml`` of the installed package.
-    """
+    """Return the path of the default codebook, ``config/codebook.yaml``."""
     return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'codebook.yaml'
 
 
 def discovery_profile_file() -> Path:
-    """Return where the profile for a swift discovery lies.
-
-    Returns
-    -------
-    pathlib.Path
-        The file ``config/discovery.xml`` of the installed package, for Fast DDS.
-    """
+    """Return the path of the Fast DDS discovery profile, ``config/discovery.xml``."""
     return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'discovery.xml'

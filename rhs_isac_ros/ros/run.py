@@ -1,4 +1,4 @@
-"""How every node spins and ends."""
+"""Spinning and shutdown of the nodes of an executable."""
 
 import os
 import signal
@@ -8,61 +8,63 @@ from collections.abc import Callable, Sequence
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
-from rclpy.experimental import EventsExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import ok, try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import ScenarioError
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.resources import discovery_profile_file
 
-# The executor looks at least this often whether a signal has come.
+# Maximum time between two checks for a signal.
 _POLL_S = 0.5
-# Where Fast DDS is told of a file with profiles.
+# Environment variable with the profile file of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
-def find_each_other_quickly() -> None:
-    """Have Fast DDS tell sooner than usual who is gone and who is back, in this process.
+def use_discovery_profile() -> None:
+    """Shorten the discovery times of Fast DDS in this process.
 
-    It reads a profile when the first node is made. One that the environment names already stays;
-    an empty name stands for none at all.
+    Fast DDS reads the profile when the first node is created. A file that the environment already
+    names takes precedence; an empty name selects the defaults of Fast DDS.
     """
     file = os.environ.setdefault(_PROFILES, str(discovery_profile_file()))
     if not file:
-        # Fast DDS would complain of it.
+        # Fast DDS reports an error for an empty name.
         del os.environ[_PROFILES]
 
 
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         done: Callable[[], bool] = lambda: False) -> int:
-    """Make nodes, spin them in this thread until a signal comes, and clean up.
+    """Create nodes, spin them in this thread until a signal arrives, and destroy them.
 
-    SIGINT and SIGTERM only set a flag: rclpy's own handlers would take the context away from a
-    callback that is just about to publish.
+    SIGINT and SIGTERM only set a flag: the handlers of rclpy would invalidate the context while a
+    callback publishes.
 
     Parameters
     ----------
     make
-        Makes the nodes.
+        Creates the nodes.
     args
-        Command line; by default the process's.
+        Command line; by default that of the process.
     done
-        Asked again and again whether to end without a signal.
+        Polled; the nodes stop spinning when it returns True.
 
     Returns
     -------
     int
-        Exit code: 0 after a signal, a shutdown or when done, 2 if a parameter or a file is wrong.
+        Exit code: 0 after a signal, a shutdown or when done; 2 if a parameter or a file is wrong.
     """
-    # A list: a handler may interrupt the other one, and must take no lock.
+    # A list, because a handler may interrupt the other one and must not take a lock.
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))
-    find_each_other_quickly()
+    use_discovery_profile()
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=None if args is None else list(args),
+                   signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
@@ -73,7 +75,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
-        while rclpy.ok() and not signals and not done():
+        while ok() and not signals and not done():
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass
@@ -85,26 +87,21 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
             node.destroy_node()
         if executor is not None:
             executor.shutdown()
-        rclpy.try_shutdown()
-        # Python gives a handler back when it ends: one more signal, as with Ctrl-C on a launch,
-        # would then kill what ends well.
+        try_shutdown()
+        # Python restores the default handlers when it exits. A further signal, as from Ctrl-C on
+        # a launch, would then kill a process that is about to exit normally.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
     return 0
 
 
 def entry(make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
-    """Return the main function of an executable.
-
-    Parameters
-    ----------
-    make
-        Makes its nodes.
+    """Return the main function of an executable whose nodes `make` creates.
 
     Returns
     -------
     Callable
-        Takes a command line, by default the process's, and returns the exit code of `run`.
+        Takes a command line, by default that of the process, and returns the exit code of `run`.
     """
     def main(args: Sequence[str] | None = None) -> int:
         return run(make, args)

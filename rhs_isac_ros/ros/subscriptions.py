@@ -1,5 +1,6 @@
-"""Subscribing, and listening to a network from outside."""
+"""Subscriptions without the events that slow down executors."""
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -14,22 +15,16 @@ from rhs_isac_ros.ros import convert, qos, topics
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
         raw: bool = False) -> None:
-    """Subscribe to a topic, without the events that would make executors slow.
+    """Subscribe to a topic.
 
     Parameters
     ----------
-    node
-        The node that listens.
     kind
         ROS type of the topic.
     name
         Name of the topic.
     callback
-        Called with each message.
-    profile
-        Quality of service.
-    raw
-        Whether the callback gets the message in CDR, as bytes.
+        Called with each message, or with its serialized bytes (CDR) if `raw`.
     """
     node.create_subscription(
         kind, name, callback, profile, raw=raw,
@@ -38,35 +33,29 @@ def subscribe(
 
 def listen(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
-        then: Callable[[m.Message], None],
-        dropped: Callable[[m.MessageError], None] | None = None) -> None:
-    """Subscribe to messages of the protocol; what is malformed is dropped, with a word in the log.
+        on_message: Callable[[m.Message], None],
+        on_error: Callable[[m.MessageError], None] | None = None) -> None:
+    """Subscribe to messages of the protocol; malformed ones are dropped.
 
     Parameters
     ----------
-    node
-        The node that listens.
-    kinds
-        Classes of the messages.
     sizes
-        Sizes by symbol, as `Scenario.sizes` gives them, that the messages must have; None: any.
-    then
-        Called with each message.
-    dropped
-        Called with the reason for each that is malformed; by default the node logs it.
+        Array sizes by symbol, as in `Scenario.sizes`, that the messages must have; None: any.
+    on_error
+        Called with the reason why a message was dropped; by default, the node logs it.
     """
-    def complain(error: m.MessageError) -> None:
+    def log(error: m.MessageError) -> None:
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
-    def take(kind: type[m.Message], serialized: bytes) -> None:
+    def receive(kind: type[m.Message], serialized: bytes) -> None:
         try:
             plain = convert.from_bytes(kind, serialized)
             if sizes is not None:
                 m.check(plain, sizes)
         except m.MessageError as error:
-            (dropped or complain)(error)
+            (on_error or log)(error)
             return
-        then(plain)
+        on_message(plain)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
-                  lambda serialized, kind=kind: take(kind, serialized), qos.of(kind), raw=True)
+                  functools.partial(receive, kind), qos.of(kind), raw=True)

@@ -1,4 +1,4 @@
-"""The name of every topic, relative, so that namespaces and remapping work."""
+"""The names of all topics. They are relative, so that namespaces and remapping apply."""
 
 from collections.abc import Mapping
 
@@ -23,17 +23,17 @@ NAMES: Mapping[type[m.Message], str] = {
     m.GroundTruth: 'ground_truth',
     m.ProtocolState: 'protocol_state',
 }
-# What is not a message of the protocol.
+# Topics without a message of the protocol.
 POSITION = 'position'
 CODEBOOK = 'codebook'
 DIAGNOSTICS = 'diagnostics'
 MARKERS = 'markers'
 
-# Of each user: where it is estimated to have been, and where it really was.
+# Estimated and true path of a user.
 PATH = 'users/user_{user}/path'
 TRUE_PATH = 'users/user_{user}/true_path'
 
-# The node that holds the codebook as its parameters.
+# Node whose parameters are the codebook.
 OPTIMIZER_NODE = 'optimizer'
-# Frame of all positions: the surface's centre, x outward, z up.
+# Frame of all positions: the origin is the centre of the surface, x points outward, z up.
 MAP_FRAME = 'map'

@@ -22,7 +22,7 @@ from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.resources import default_codebook_file
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo_report import draw, summary, table
 
 # Maximum time between two complete cycles [s].
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'error: {error}', file=sys.stderr)
         return 2
     os.environ.update(private_domain())
-    find_each_other_quickly()
+    use_discovery_profile()
     rclpy.init(args=[])
     observer = CycleObserver(recorder)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:

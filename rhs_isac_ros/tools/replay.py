@@ -28,12 +28,12 @@ from rhs_isac_ros.positioning import (
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.recording import RecordingError, outlets, read, read_scenario
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.tools.republish import RepublishError, republish, topic_prefix
 
 # Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
 # would contradict those of the running nodes.
-_TOPICS = sorted(set(outlets()) - {topics.CODEBOOK, topics.DIAGNOSTICS})
+_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from rhs_isac_ros.model.geometry import element_interval_m, element_positions, f
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
 from rhs_isac_ros.protocol.messages import Mode
-from rhs_isac_ros.ros.markers import WEAKEST_DB, lobe_m
+from rhs_isac_ros.ros.markers import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.tools.ellipses import ellipse_95
 
 _FIGURE_SIZE_IN = (14.0, 9.6)
@@ -160,13 +160,13 @@ def _draw_surface(axes: Any, scene: SceneState, scenario: Scenario) -> None:
 def _draw_pattern(axes: Any, beam: BeamMessage | None, pattern: BeamPattern | None) -> None:
     """Draw the cuts of the beam pattern through its peak, in decibels."""
     axes.set_theta_zero_location('N')
-    axes.set(thetamin=-90, thetamax=90, rlim=(WEAKEST_DB, 0),
-             rticks=np.linspace(WEAKEST_DB, 0, 5))
+    axes.set(thetamin=-90, thetamax=90, rlim=(MIN_LEVEL_DB, 0),
+             rticks=np.linspace(MIN_LEVEL_DB, 0, 5))
     axes.tick_params(labelsize='small')
     if beam is None or pattern is None:
         axes.set_title('no data beam yet', fontsize='medium')
         return
-    min_power = 10**(WEAKEST_DB / 10)
+    min_power = 10**(MIN_LEVEL_DB / 10)
     for name, (angles, power), style in (
             ('over azimuth', pattern.azimuth_cut(), '-'),
             ('over elevation', pattern.elevation_cut(), ':')):
@@ -192,7 +192,7 @@ def _legend(scene: SceneState) -> list[Any]:
         Patch(facecolor='0.8', edgecolor='0.4', label='95 % of the posterior'),
         marker('D', 'feed', markerfacecolor='white', markeredgecolor='black')]
     if scene.beam:
-        handles.append(Patch(facecolor='0.92', label=f'data beam, {WEAKEST_DB:g} to 0 dB'))
+        handles.append(Patch(facecolor='0.92', label=f'data beam, {MIN_LEVEL_DB:g} to 0 dB'))
     users = sorted(scene.users)
     handles += [Patch(color=_colour(user), label=f'user {user}') for user in users[:_MAX_LABELS]]
     if len(users) > _MAX_LABELS:

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 
 # Changes of the graph do not wake the executor up, so it is polled with this period [s].
 _POLL_PERIOD_S = 0.02
@@ -32,7 +32,7 @@ class Session:
     """A context with one node, which the command itself spins."""
 
     def __init__(self) -> None:
-        find_each_other_quickly()
+        use_discovery_profile()
         rclpy.init(args=[])
         self.node = Node(f'_rhs_isac_cli_{os.getpid()}', start_parameter_services=False)
         self._executor = SingleThreadedExecutor()

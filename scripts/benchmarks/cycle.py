@@ -23,7 +23,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import start_network, watch
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
@@ -41,7 +41,7 @@ def main() -> int:
     os.environ.update(private_domain())
     scenario = Scenario()
     hops = hops_of(scenario)
-    find_each_other_quickly()
+    use_discovery_profile()
     rclpy.init(args=[])
     try:
         before_s = ping_pong(scenario)

@@ -22,7 +22,7 @@ from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.resources import default_codebook_file
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import start_network
 
 TIMEOUT_S = 600.0
@@ -42,7 +42,7 @@ def main() -> int:
     parser.add_argument('--json', type=Path, help='JSON file for the figures')
     options = parser.parse_args()
     os.environ.update(private_domain())
-    find_each_other_quickly()
+    use_discovery_profile()
     rclpy.init(args=[])
     scenario = Scenario()
     cycles = options.rounds * options.users

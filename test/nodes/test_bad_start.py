@@ -1,4 +1,4 @@
-"""What is wrong at the start ends an executable with one clear line and exit code 2."""
+"""An error at the start ends an executable with one clear line and exit code 2."""
 
 import importlib
 import signal
@@ -41,7 +41,7 @@ CASES = {
 }
 
 
-# These as processes too, to see that the exit code gets out.
+# Cases that also run as processes, to check the exit code.
 PROCESSES = ('type', 'unknown key', 'position', 'codebook file')
 
 
@@ -73,7 +73,7 @@ def arguments(name, files):
 def assert_clear(code, log, name, crashed):
     assert code == 2, log
     assert not crashed(log), log
-    # ROS writes lines of its own, which begin with a level.
+    # The log lines of ROS begin with a severity.
     lines = [line for line in log.splitlines() if not line.startswith('[')]
     assert len(lines) == 1, log
     assert lines[0].startswith('error: ')
@@ -83,9 +83,9 @@ def assert_clear(code, log, name, crashed):
 
 @pytest.fixture
 def never_spins(monkeypatch):
-    """A start that is no failure raises here, and signals stay as they are."""
+    """Raise where a start succeeds, and restore the signal handlers."""
     def refuse():
-        raise AssertionError('it starts')
+        raise AssertionError('the executable starts')
     monkeypatch.setattr(run, 'EventsExecutor', refuse)
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
@@ -100,20 +100,20 @@ def test_a_bad_start_ends_with_one_clear_line(name, files, never_spins, crashed,
     assert_clear(code, capfd.readouterr().err, name, crashed)
 
 
-def test_a_good_start_is_none_of_these(files, never_spins):
-    with pytest.raises(AssertionError, match='it starts'):
+def test_a_valid_start_reaches_the_executor(files, never_spins):
+    with pytest.raises(AssertionError, match='the executable starts'):
         importlib.import_module('rhs_isac_ros.nodes.optimizer').main(
             ['--ros-args', '-p', f'codebook_file:={files / "good.yaml"}'])
 
 
 @pytest.fixture(scope='module')
 def started(module_processes, files):
-    """The processes of all cases, which run at the same time."""
+    """The processes of all cases, which run concurrently."""
     return {name: module_processes.start(CASES[name][0], *arguments(name, files))
             for name in PROCESSES}
 
 
 @pytest.mark.parametrize('name', PROCESSES)
-def test_exit_code_and_line_of_a_process(started, crashed, name):
+def test_a_process_has_the_same_exit_code_and_line(started, crashed, name):
     code = started[name].wait()
     assert_clear(code, started[name].log, name, crashed)

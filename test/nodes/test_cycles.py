@@ -1,4 +1,4 @@
-"""Cycles of a network of processes: what they carry, whom they serve, what they survive."""
+"""Cycles of a network of processes: their messages, their users and recovery from faults."""
 
 import collections
 import math
@@ -14,88 +14,88 @@ from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fields import check
 from rhs_isac_ros.ros import convert
-from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.resources import default_codebook_file
 
 SCENARIO = Scenario()
 SIZES = SCENARIO.sizes
-# How many messages of each kind one cycle has.
-WHOLE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
+# Number of messages of each class in one cycle.
+COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
          m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'],
          m.RhsConfiguration: SIZES['N_B'] + 1,
          m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'] * SIZES['F'],
          m.FeedSignals: SIZES['N_B'] * SIZES['F'], m.Data: 4, m.ProtocolState: 4}
-# In another order than those of test_life.
+# Parameters of the nodes, in another order than in test_life.
 BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.02, 'ack_timeout_s': 0.3},
         'positioner': {}, 'optimizer': {}, 'rhs_controller': {}}
-PLACES = {1: (9.0, 1.5, 0.3), 2: (12.0, -3.0, -0.5), 3: (6.5, 0.0, 0.0)}
+POSITIONS = {1: (9.0, 1.5, 0.3), 2: (12.0, -3.0, -0.5), 3: (6.5, 0.0, 0.0)}
 
 
 @pytest.fixture(scope='module')
 def network(module_processes, make_watch):
-    """Everything but users, in the paper's scenario."""
+    """A network without users, in the scenario of the paper."""
     running = {name: module_processes.start(name, **values) for name, values in BASE.items()}
     watch = make_watch()
-    watch.until(lambda: watch.heard[m.Beacon], 'the first beacon', running.values())
+    watch.until(lambda: watch.received[m.Beacon], 'the first beacon', running.values())
     return types.SimpleNamespace(watch=watch, running=running)
 
 
 def start_user(processes, user):
     return processes.start('user', name=f'user_{user}', user_id=user,
-                           position_m=list(PLACES[user]))
+                           position_m=list(POSITIONS[user]))
 
 
 @pytest.fixture
 def join(network, processes):
-    """Function that starts a user, which leaves at the end of the test."""
+    """Yield a function that starts a user, which ends with the test."""
     yield lambda user: start_user(processes, user)
     for process in network.running.values():
         assert process.running, process.log
 
 
 def beacons_in_a_row(watch, since):
-    """Whether the last four beacons since then belong to one cycle."""
-    cycle_ids = [beacon.cycle_id for beacon in watch.heard[m.Beacon][since:][-4:]]
+    """Return whether the last four of the beacons since an index belong to one cycle."""
+    cycle_ids = [beacon.cycle_id for beacon in watch.received[m.Beacon][since:][-4:]]
     return len(cycle_ids) == 4 and len(set(cycle_ids)) == 1
 
 
-def test_without_users_the_base_station_beacons_on(network):
+def test_without_users_the_base_station_repeats_its_beacon(network):
     watch = network.watch
-    before = len(watch.heard[m.Beacon])
-    watch.until(lambda: beacons_in_a_row(watch, before), 'beacon after beacon')
-    attempts = [beacon.attempt for beacon in watch.heard[m.Beacon][-4:]]
+    before = len(watch.received[m.Beacon])
+    watch.until(lambda: beacons_in_a_row(watch, before), 'repeated beacons')
+    attempts = [beacon.attempt for beacon in watch.received[m.Beacon][-4:]]
     assert attempts == list(range(attempts[0], attempts[0] + 4))
-    assert not watch.of_cycle(m.Grant, watch.heard[m.Beacon][-1].cycle_id)
+    assert not watch.of_cycle(m.Grant, watch.received[m.Beacon][-1].cycle_id)
 
 
 @pytest.fixture(scope='module')
 def cycles(network, make_processes):
-    """All messages of some served cycles of one user, by kind."""
+    """The messages of some served cycles of one user, by class, and the poses."""
     watch = network.watch
     with make_processes() as processes:
         start_user(processes, 1)
-        # The first cycles are not: the user sends before all have discovered its topics.
-        numbers = watch.until(lambda: whole_cycles(watch), 'cycles that are heard whole')
-        heard = [{kind: watch.of_cycle(kind, n) for kind in watch.heard} for n in numbers]
-        places = [message.position for cycle in heard for message in cycle[m.PositionEstimate]]
+        # The first cycles are incomplete: not all nodes have discovered the topics of the user.
+        numbers = watch.until(lambda: complete_cycles(watch), 'complete cycles')
+        messages = [{kind: watch.of_cycle(kind, n) for kind in watch.received} for n in numbers]
+        places = [message.position for cycle in messages for message in cycle[m.PositionEstimate]]
         poses = watch.until(lambda: poses_at(watch.poses, places), 'the poses')
-    return types.SimpleNamespace(heard=heard, poses=poses)
+    return types.SimpleNamespace(messages=messages, poses=poses)
 
 
-def whole_cycles(watch, n=5):
-    """Numbers of the last n cycles of which everything was heard, or None if there are fewer."""
-    numbers = [end.cycle_id for end in watch.served[-20:] if is_whole(watch, end.cycle_id)]
+def complete_cycles(watch, n=5):
+    """Return the numbers of the last n complete cycles, or None if there are fewer."""
+    numbers = [end.cycle_id for end in watch.served[-20:] if is_complete(watch, end.cycle_id)]
     return numbers[-n:] if len(numbers) >= n else None
 
 
-def is_whole(watch, cycle_id):
-    """Whether watch and transmission have heard everything of a cycle."""
-    return (all(len(watch.of_cycle(kind, cycle_id)) == n for kind, n in WHOLE.items())
+def is_complete(watch, cycle_id):
+    """Return whether the observer and the transmission have received all messages of a cycle."""
+    return (all(len(watch.of_cycle(kind, cycle_id)) == n for kind, n in COMPLETE.items())
             and math.isfinite(watch.of_cycle(m.Capacity, cycle_id)[0].actual_bps))
 
 
 def poses_at(poses, places):
-    """One pose for each of some places, or None if there is not one for each."""
+    """Return one pose for each position, or None if one is missing."""
     found = [pose for place in places for pose in poses
              if tuple(place) == position_of(pose)]
     return found if len(found) == len(places) else None
@@ -108,9 +108,9 @@ def position_of(pose):
 
 def test_all_messages_of_a_cycle_carry_its_user_and_codebook(cycles):
     codebook = Codebook.load(default_codebook_file())
-    for heard in cycles.heard:
-        assert {kind: len(heard[kind]) for kind in WHOLE} == WHOLE
-        everything = [message for kind in WHOLE for message in heard[kind]]
+    for messages in cycles.messages:
+        assert {kind: len(messages[kind]) for kind in COMPLETE} == COMPLETE
+        everything = [message for kind in COMPLETE for message in messages[kind]]
         assert {message.user for message in everything if hasattr(message, 'user')} == {1}
         assert {message.codebook_id for message in everything
                 if hasattr(message, 'codebook_id')} == {codebook.id}
@@ -118,9 +118,9 @@ def test_all_messages_of_a_cycle_carry_its_user_and_codebook(cycles):
             check(message, SIZES)
 
 
-def test_the_phases_of_a_cycle_come_in_turn(cycles):
-    for heard in cycles.heard:
-        assert [(state.phase, state.outcome) for state in heard[m.ProtocolState]] == [
+def test_the_phases_of_a_cycle_are_in_order(cycles):
+    for messages in cycles.messages:
+        assert [(state.phase, state.outcome) for state in messages[m.ProtocolState]] == [
             (m.Phase.POSITIONING, ''), (m.Phase.ESTIMATING, ''), (m.Phase.TRANSMITTING, ''),
             (m.Phase.BEACONING, 'served')]
 
@@ -128,24 +128,24 @@ def test_the_phases_of_a_cycle_come_in_turn(cycles):
 def test_received_signals_are_the_combined_feed_signals_and_noise(cycles):
     codebook = Codebook.load(default_codebook_file())
     residuals = []
-    for heard in cycles.heard:
+    for messages in cycles.messages:
         feeds = np.empty((2, 4, 8, 3), complex)
-        for message in heard[m.FeedSignals]:
+        for message in messages[m.FeedSignals]:
             feeds[message.band, message.frame] = message.signals
-        received, = heard[m.ReceivedSignals]
+        received, = messages[m.ReceivedSignals]
         residuals.append(received.signals - receive_feeds(SCENARIO, codebook, feeds, None))
     power = np.mean(np.abs(residuals)**2)
-    # 320 samples: the mean power lies within 20 % but for three chances in ten thousand.
+    # Of 320 samples, the mean power deviates by more than 20 % with probability 0.0003.
     assert power == pytest.approx(SCENARIO.noise_power_w, rel=0.2)
 
 
-def test_estimates_are_near_the_user(cycles):
+def test_estimates_are_close_to_the_user(cycles):
     low, high = SCENARIO.roi_bounds_m
     errors = []
-    for heard in cycles.heard:
-        estimate, = heard[m.PositionEstimate]
-        truth, = heard[m.GroundTruth]
-        assert tuple(truth.position) == PLACES[1]
+    for messages in cycles.messages:
+        estimate, = messages[m.PositionEstimate]
+        truth, = messages[m.GroundTruth]
+        assert tuple(truth.position) == POSITIONS[1]
         assert not truth.velocity.any()
         assert ((low <= estimate.position) & (estimate.position <= high)).all()
         assert np.linalg.eigvalsh(estimate.covariance_m2)[0] > 0
@@ -153,14 +153,14 @@ def test_estimates_are_near_the_user(cycles):
         assert 0 < estimate.crlb_m2 < 1
         assert 0 < estimate.latency_s < 30
         errors.append(np.linalg.norm(estimate.position - truth.position))
-    # Anywhere in the region would be 5 m away.
+    # A random point of the region is about 5 m away.
     assert np.median(errors) < 2.5
 
 
 def test_poses_are_the_estimates(cycles):
-    assert len(cycles.poses) == len(cycles.heard)
-    for pose, heard in zip(cycles.poses, cycles.heard, strict=True):
-        estimate, = heard[m.PositionEstimate]
+    assert len(cycles.poses) == len(cycles.messages)
+    for pose, messages in zip(cycles.poses, cycles.messages, strict=True):
+        estimate, = messages[m.PositionEstimate]
         assert position_of(pose) == tuple(estimate.position)
         covariance = np.reshape(pose.pose.covariance, (6, 6))
         np.testing.assert_array_equal(covariance[:3, :3], estimate.covariance_m2)
@@ -168,28 +168,28 @@ def test_poses_are_the_estimates(cycles):
         assert pose.header.stamp.sec > 0
 
 
-def test_the_capacity_is_what_the_beam_carries(cycles):
-    for heard in cycles.heard:
-        report, beam = heard[m.Capacity][0], heard[m.Beam][0]
+def test_the_capacities_are_consistent_with_the_beam_and_the_data(cycles):
+    for messages in cycles.messages:
+        report, beam = messages[m.Capacity][0], messages[m.Beam][0]
         assert report.expected_bps == beam.expected_bps
         assert 0 < report.actual_bps
         assert report.loss_bps == report.perfect_bps - report.actual_bps
         assert report.loss_percent == pytest.approx(100 * report.loss_bps / report.perfect_bps)
-        # The search for the best beam may end a little below another beam.
+        # The search for the best beam may end slightly below the optimum.
         assert report.loss_percent > -0.05
         for direction in m.Direction:
             offered, delivered = (
-                next(data for data in heard[m.Data]
+                next(data for data in messages[m.Data]
                      if (data.direction, data.stage) == (direction, stage)) for stage in m.Stage)
             assert 0 < delivered.bits <= min(
                 offered.bits, report.actual_bps * delivered.duration_s)
             assert offered.bits <= report.expected_bps * offered.duration_s
 
 
-def test_the_statistics_are_of_the_capacities(cycles):
+def test_the_statistics_cover_the_capacities(cycles):
     seen = []
-    for heard in cycles.heard:
-        report, statistics = heard[m.Capacity][0], heard[m.CapacityStatistics][0]
+    for messages in cycles.messages:
+        report, statistics = messages[m.Capacity][0], messages[m.CapacityStatistics][0]
         seen.append(statistics.n_reports)
         for name in ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent'):
             quartiles = getattr(statistics, name)
@@ -200,7 +200,7 @@ def test_the_statistics_are_of_the_capacities(cycles):
     assert seen == sorted(set(seen))
 
 
-def test_who_joins_later_is_served_and_both_in_turn(network, join):
+def test_a_late_user_is_served_and_both_users_take_turns(network, join):
     watch = network.watch
     join(1)
     watch.until_served(2, user=1)
@@ -209,26 +209,26 @@ def test_who_joins_later_is_served_and_both_in_turn(network, join):
     turns = collections.Counter(end.user for end in watch.until_served(8))
     assert set(turns) == {1, 2}
     assert min(turns.values()) >= 2
-    # Each is found at its own place.
+    # Each is located at its own position.
     for user in (1, 2):
-        places = [estimate.position for estimate in watch.heard[m.PositionEstimate]
+        places = [estimate.position for estimate in watch.received[m.PositionEstimate]
                   if estimate.user == user][-4:]
-        distances = [math.dist(place, PLACES[user]) for place in places]
+        distances = [math.dist(place, POSITIONS[user]) for place in places]
         assert np.median(distances) < 3.5
 
 
-def test_a_user_that_dies_in_its_cycle_is_served_after_its_restart(network, join):
+def test_a_user_that_crashes_in_its_cycle_is_served_after_its_restart(network, join):
     watch = network.watch
     victim = join(3)
     watch.until_served(user=3, processes=[victim])
     given_up = len(watch.given_up)
-    # A user of an earlier test may be granted a last cycle, too.
+    # A user of an earlier test may still be granted a cycle.
     watch.hooks[m.Grant] = lambda grant: grant.user == 3 and victim.signal(signal.SIGKILL)
     watch.until(lambda: not victim.running, 'the end of the user')
     assert victim.wait() == -signal.SIGKILL
     del watch.hooks[m.Grant]
-    before = len(watch.heard[m.Beacon])
-    watch.until(lambda: beacons_in_a_row(watch, before), 'beacon after beacon',
+    before = len(watch.received[m.Beacon])
+    watch.until(lambda: beacons_in_a_row(watch, before), 'repeated beacons',
                 network.running.values())
     assert 3 in {end.user for end in watch.given_up[given_up:]}
     watch.until_served(2, user=3, processes=[join(3)])
@@ -237,7 +237,7 @@ def test_a_user_that_dies_in_its_cycle_is_served_after_its_restart(network, join
 @pytest.mark.parametrize('names', [
     ('bs',), ('channel', 'positioner', 'rhs_controller', 'transmission', 'optimizer')],
     ids=lambda names: '+'.join(names))
-def test_cycles_go_on_after_nodes_die_and_are_restarted(network, module_processes, join, names):
+def test_cycles_continue_after_nodes_crash_and_restart(network, module_processes, join, names):
     watch, running = network.watch, network.running
     join(1)
     watch.until_served(user=1)
@@ -246,27 +246,28 @@ def test_cycles_go_on_after_nodes_die_and_are_restarted(network, module_processe
     for name in names:
         assert running[name].wait() == -signal.SIGKILL
         running[name] = module_processes.start(name, **BASE[name])
-    before = len(watch.heard[m.Beacon])
-    watch.until(lambda: len(watch.heard[m.Beacon]) > before, 'beacons', running.values())
+    before = len(watch.received[m.Beacon])
+    watch.until(lambda: len(watch.received[m.Beacon]) > before, 'beacons', running.values())
     watch.until_served(3, user=1, processes=running.values())
-    # No life of the base station repeats a number.
-    numbers = [beacon.cycle_id for beacon in watch.heard[m.Beacon]]
+    # The base station repeats no number after a restart.
+    numbers = [beacon.cycle_id for beacon in watch.received[m.Beacon]]
     assert numbers == sorted(numbers)
-    assert len({grant.cycle_id for grant in watch.heard[m.Grant]}) == len(watch.heard[m.Grant])
+    grants = [grant.cycle_id for grant in watch.received[m.Grant]]
+    assert len(set(grants)) == len(grants)
 
 
 def not_finite(message):
     return not np.isfinite(message.signals).all()
 
 
-def test_nothing_wrong_comes_of_nan(network, join):
-    """A rogue sends NaN for the very cycle that runs."""
+def test_nan_does_not_spread(network, join):
+    """A faulty node sends NaN for the present cycle."""
     watch, running = network.watch, network.running
     codebook = Codebook.load(default_codebook_file())
-    feeds, received = watch.outlet(m.FeedSignals), watch.outlet(m.ReceivedSignals)
+    feeds, received = watch.publisher(m.FeedSignals), watch.publisher(m.ReceivedSignals)
     sent = collections.Counter()
 
-    def spoil(request):
+    def send_nan(request):
         for frame in range(request.n_frames):
             signals = np.full((8, 3), complex(math.nan, 0))
             feeds.publish(convert.to_ros(m.FeedSignals(
@@ -277,21 +278,21 @@ def test_nothing_wrong_comes_of_nan(network, join):
             request.cycle_id, request.user, codebook.id, signals), stamp))
         sent.update({m.FeedSignals: request.n_frames, m.ReceivedSignals: 1})
 
-    since = {kind: len(messages) for kind, messages in watch.heard.items()}
-    watch.hooks[m.PilotRequest] = spoil
+    since = {kind: len(messages) for kind, messages in watch.received.items()}
+    watch.hooks[m.PilotRequest] = send_nan
     join(2)
     watch.until_served(3, user=2, processes=running.values())
     del watch.hooks[m.PilotRequest]
-    watch.until(lambda: all(sum(map(not_finite, watch.heard[kind][since[kind]:])) == n
-                            for kind, n in sent.items()), 'what the rogue sent')
+    watch.until(lambda: all(sum(map(not_finite, watch.received[kind][since[kind]:])) == n
+                            for kind, n in sent.items()), 'the messages with NaN')
     assert sent[m.FeedSignals] >= 24
     assert 'dropped: FeedSignals.signals: not finite' in running['bs'].log
     assert 'dropped: ReceivedSignals.signals: not finite' in running['positioner'].log
-    for kind in watch.heard:
+    for kind in watch.received:
         if kind not in sent:
-            for message in watch.heard[kind][since[kind]:]:
+            for message in watch.received[kind][since[kind]:]:
                 check(message, SIZES)
-    # One line for each, however often.
+    # Each error is logged once.
     assert running['bs'].log.count('dropped: ') == 1
     assert running['positioner'].log.count('dropped: ') == 1
 
@@ -302,7 +303,7 @@ def test_a_restarted_optimizer_with_another_codebook_is_followed(
     codebooks = {name: Codebook.load(small_files / f'{name}.yaml')
                  for name in ('first', 'second')}
     got = []
-    CodebookSource(watch.node, Scenario.from_yaml(small_files / 'scenario.yaml'), got.append)
+    CodebookClient(watch.node, Scenario.from_yaml(small_files / 'scenario.yaml'), got.append)
     for name, codebook in codebooks.items():
         process = processes.start(
             'optimizer', namespace='/restart', scenario_file=small_files / 'scenario.yaml',

@@ -1,4 +1,4 @@
-"""Every node of a running network tells how it fares."""
+"""The diagnostics of every node of a running network."""
 
 from diagnostic_msgs.msg import DiagnosticArray
 
@@ -8,33 +8,33 @@ from rhs_isac_ros.ros import convert, qos, topics
 NODES = {'bs', 'channel', 'rhs_controller', 'positioner', 'transmission', 'optimizer', 'user_1'}
 
 
-def test_every_node_tells_phase_cycles_drops_and_codebook(processes, make_watch, small_files):
-    watch = make_watch('/told')
-    told = {}
+def test_every_node_reports_phase_cycles_drops_and_codebook(processes, make_watch, small_files):
+    watch = make_watch('/diagnosed')
+    reported = {}
 
-    def keep(message):
+    def store(message):
         for status in message.status:
-            told[status.name.removeprefix('told/')] = status
+            reported[status.name.removeprefix('diagnosed/')] = status
     watch.node.create_subscription(
-        DiagnosticArray, topics.DIAGNOSTICS, keep, qos.EXCHANGE)
+        DiagnosticArray, topics.DIAGNOSTICS, store, qos.EXCHANGE)
     network = processes.start(
-        'network', namespace='/told', users=1, rest_s=0.0,
+        'network', namespace='/diagnosed', users=1, rest_s=0.0,
         scenario_file=small_files / 'scenario.yaml', codebook_file=small_files / 'first.yaml')
     watch.until_served(3, processes=[network])
-    told.clear()
-    watch.until(lambda: told.keys() >= NODES, 'the diagnostics of every node', [network])
+    reported.clear()
+    watch.until(lambda: reported.keys() >= NODES, 'the diagnostics of every node', [network])
     values = {name: {pair.key: pair.value for pair in status.values}
-              for name, status in told.items()}
-    assert told.keys() == NODES
+              for name, status in reported.items()}
+    assert reported.keys() == NODES
     assert int(values['bs']['cycles.served']) >= 3
     assert {'phase', 'cycle_ms.p50', 'handling_ms.p99'} <= values['bs'].keys()
     assert values['user_1']['phase'] in {'disconnected', 'listening', 'acknowledged', 'granted'}
     assert float(values['positioner']['estimate_ms.p50']) > 0
-    takers = {'bs', 'rhs_controller', 'positioner', 'transmission', 'optimizer'}
-    assert len({values[name]['codebook_id'] for name in takers}) == 1
+    followers = {'bs', 'rhs_controller', 'positioner', 'transmission', 'optimizer'}
+    assert len({values[name]['codebook_id'] for name in followers}) == 1
 
-    # What is malformed is counted where it is dropped.
-    outlet = watch.outlet(m.Pilot)
-    outlet.publish(convert.ros_type(m.Pilot)(cycle_id=1, user=1, band=99))
+    # Malformed messages are counted where they are dropped.
+    publisher = watch.publisher(m.Pilot)
+    publisher.publish(convert.ros_type(m.Pilot)(cycle_id=1, user=1, band=99))
     watch.until(lambda: ('dropped.malformed', '1') in {
-        (pair.key, pair.value) for pair in told['channel'].values}, 'the count', [network])
+        (pair.key, pair.value) for pair in reported['channel'].values}, 'the count', [network])

@@ -1,4 +1,4 @@
-"""A network of processes from its start, in any order, to its end by a signal."""
+"""A network of processes, started in random order and ended by a signal."""
 
 import random
 import signal
@@ -16,49 +16,50 @@ EXECUTABLES = ('bs', 'user', 'rhs_controller', 'channel', 'positioner', 'transmi
 @pytest.fixture(scope='module', params=[signal.SIGINT, signal.SIGTERM],
                 ids=lambda number: number.name)
 def life(request, module_processes, make_watch, small_files):
-    """What was seen of a network, and exit code and log of each process after a signal."""
+    """The observer of a network, and exit code and log of each process after a signal."""
     number = request.param
     namespace = f'/{number.name.lower()}'
     watch = make_watch(namespace)
     order = random.Random(number).sample(EXECUTABLES, len(EXECUTABLES))
     assert order != list(EXECUTABLES)
-    own = {'optimizer': {'codebook_file': small_files / 'first.yaml'}, 'bs': {'rest_s': 0.0}}
+    parameters = {'optimizer': {'codebook_file': small_files / 'first.yaml'},
+                  'bs': {'rest_s': 0.0}}
     running = {}
     for name in order:
         running[name] = module_processes.start(
             name, namespace=namespace, scenario_file=small_files / 'scenario.yaml',
-            **own.get(name, {}))
+            **parameters.get(name, {}))
         if len(running) == 2:
-            # These are well under way before the others start.
-            watch.answering(*running)
+            # The first two are running before the others start.
+            watch.wait_for_nodes(*running)
     watch.until_served(2, processes=running.values())
-    # At work: the callbacks of the busiest are hardly ever done.
+    # The signal arrives while most nodes are busy.
     for process in running.values():
         process.signal(number)
     ends = {name: (process.wait(), process.log) for name, process in running.items()}
     return types.SimpleNamespace(watch=watch, ends=ends)
 
 
-def test_cycles_begin_by_themselves_in_any_order_of_starts(life, small_files):
-    heard = life.watch.heard
+def test_cycles_begin_whatever_the_order_of_the_starts(life, small_files):
+    received = life.watch.received
     used = Codebook.load(small_files / 'first.yaml').id
-    assert {message.codebook_id for message in heard[m.ReceivedSignals]} == {used}
+    assert {message.codebook_id for message in received[m.ReceivedSignals]} == {used}
     assert {message.user for message in life.watch.served} == {1}
-    numbers = [message.cycle_id for message in heard[m.Grant]]
+    numbers = [message.cycle_id for message in received[m.Grant]]
     assert numbers == sorted(set(numbers))
 
 
 @pytest.mark.parametrize('executable', EXECUTABLES)
-def test_a_signal_ends_each_process_well(life, crashed, executable):
+def test_a_signal_ends_each_process_with_exit_code_0(life, crashed, executable):
     code, log = life.ends[executable]
     assert code == 0, log
     assert not crashed(log), log
     assert '[ERROR]' not in log, log
 
 
-def test_signals_up_to_the_very_end_do_no_harm(processes, make_watch):
+def test_repeated_signals_do_no_harm(processes, make_watch):
     process = processes.start('rhs_controller', namespace='/impatient')
-    make_watch('/impatient').answering('rhs_controller')
+    make_watch('/impatient').wait_for_nodes('rhs_controller')
     while process.running:
         process.signal(signal.SIGINT)
     assert process.wait() == 0, process.log

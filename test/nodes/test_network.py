@@ -1,4 +1,4 @@
-"""The executable that composes a whole network in one process; two of them side by side."""
+"""The executable that runs a whole network in one process; two of them on one domain."""
 
 import signal
 import types
@@ -32,22 +32,22 @@ def serve_all(network, n=2):
 
 
 def codebook_ids(watch, since=0):
-    return {message.codebook_id for kind in watch.heard for message in watch.heard[kind]
+    return {message.codebook_id for kind in watch.received for message in watch.received[kind]
             if hasattr(message, 'codebook_id') and message.cycle_id > since}
 
 
-def test_each_serves_all_of_its_users_and_hears_nothing_of_the_other(networks):
+def test_each_network_serves_its_users_and_none_of_the_other(networks):
     for network in (networks.a, networks.b):
         serve_all(network)
         watch = network.watch
         assert {end.user for end in watch.served} == network.users
         watch.until(lambda watch=watch, users=network.users: users <= {
-            truth.user for truth in watch.heard[m.GroundTruth]}, 'all true positions')
-        assert {truth.user for truth in watch.heard[m.GroundTruth]} == network.users
+            truth.user for truth in watch.received[m.GroundTruth]}, 'all true positions')
+        assert {truth.user for truth in watch.received[m.GroundTruth]} == network.users
         assert codebook_ids(watch) == {network.codebook.id}
-    places = [{tuple(truth.position) for truth in network.watch.heard[m.GroundTruth]}
-              for network in (networks.a, networks.b)]
-    assert not places[0] & places[1]
+    positions = [{tuple(truth.position) for truth in network.watch.received[m.GroundTruth]}
+                 for network in (networks.a, networks.b)]
+    assert not positions[0] & positions[1]
     nodes = networks.a.watch.node.get_node_names_and_namespaces()
     names = {'network', 'bs', 'channel', 'rhs_controller', 'positioner', 'transmission',
              'optimizer', 'user_1'}
@@ -61,7 +61,7 @@ def test_a_new_codebook_is_used_from_one_cycle_to_the_next(networks):
     watch.until_served(processes=[process])
     parameters = [Parameter(name, value=value)
                   for name, value in networks.b.codebook.to_parameters().items()]
-    answer = watch.answer(AsyncParameterClient(watch.node, 'optimizer'),
+    answer = watch.call(AsyncParameterClient(watch.node, 'optimizer'),
                           lambda client: client.set_parameters_atomically(parameters), [process])
     assert answer.result.successful
 
@@ -74,18 +74,18 @@ def test_a_new_codebook_is_used_from_one_cycle_to_the_next(networks):
     used = {}
     for kind in (m.RhsCommand, m.RhsConfiguration, m.ReceivedSignals, m.PositionEstimate, m.Beam,
                  m.Capacity):
-        for message in watch.heard[kind]:
+        for message in watch.received[kind]:
             used.setdefault(message.cycle_id, set()).add(message.codebook_id)
     assert all(len(names) == 1 for names in used.values())
-    in_turn = [used[cycle_id] for cycle_id in sorted(used) if cycle_id <= last]
-    changes = [one for one, next_one in zip(in_turn, in_turn[1:], strict=False)
+    in_order = [used[cycle_id] for cycle_id in sorted(used) if cycle_id <= last]
+    changes = [one for one, next_one in zip(in_order, in_order[1:], strict=False)
                if one != next_one]
     assert changes == [{networks.a.codebook.id}]
     serve_all(networks.b)
     assert codebook_ids(networks.b.watch) == {networks.b.codebook.id}
 
 
-def test_they_end_on_signals_also_on_many(networks, crashed):
+def test_both_end_after_one_or_many_signals(networks, crashed):
     for network in (networks.a, networks.b):
         network.watch.until_served(processes=[network.process])
     for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGINT):

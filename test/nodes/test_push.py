@@ -1,4 +1,4 @@
-"""The optimizer as a command: it optimises and holds, or hands a codebook to a network."""
+"""The optimizer as a command, which optimises and holds a codebook or pushes it to a network."""
 
 import signal
 
@@ -16,7 +16,7 @@ from rhs_isac_ros.ros.push import PushError, push
 
 @pytest.fixture(scope='module')
 def network(make_watch, module_processes, small_files):
-    """A running optimizer, and what it publishes latched."""
+    """A running optimizer, its observer and the ids of its codebooks."""
     process = module_processes.start(
         'optimizer', namespace='/push', scenario_file=small_files / 'scenario.yaml',
         codebook_file=small_files / 'first.yaml')
@@ -28,8 +28,8 @@ def network(make_watch, module_processes, small_files):
     return process, watch, ids
 
 
-def call(processes, network, *own):
-    process = processes.start('optimizer', namespace='/push', own=own)
+def call(processes, network, *options):
+    process = processes.start('optimizer', namespace='/push', options=options)
     network[1].until(lambda: not process.running, 'the end of the command', [network[0]])
     return process.wait(), process.log
 
@@ -43,7 +43,7 @@ def test_a_file_is_pushed_to_a_running_network(processes, network, small_files):
     watch.until(lambda: ids[-1] == wanted, 'the new codebook')
 
 
-def test_what_is_optimised_is_pushed_and_the_command_ends(
+def test_an_optimised_codebook_is_pushed_and_the_command_ends(
         processes, network, small_files, tmp_path):
     _, watch, ids = network
     output = tmp_path / 'new.yaml'
@@ -54,7 +54,7 @@ def test_what_is_optimised_is_pushed_and_the_command_ends(
     watch.until(lambda: ids[-1] == Codebook.load(output).id, 'the new codebook')
 
 
-def test_a_codebook_of_another_scenario_is_refused_and_nothing_changes(
+def test_a_codebook_of_another_scenario_is_refused(
         processes, network, table1, tmp_path):
     process, _, ids = network
     before = ids[-1]
@@ -66,44 +66,44 @@ def test_a_codebook_of_another_scenario_is_refused_and_nothing_changes(
     assert process.running
 
 
-@pytest.mark.parametrize('spoil', ['nan', 'missing'])
-def test_a_bad_file_is_not_sent(processes, network, small_files, tmp_path, spoil, crashed):
+@pytest.mark.parametrize('fault', ['nan', 'missing'])
+def test_an_invalid_file_is_not_sent(processes, network, small_files, tmp_path, fault, crashed):
     before = list(network[2])
-    bad = tmp_path / 'bad.yaml'
-    if spoil == 'nan':
+    invalid = tmp_path / 'bad.yaml'
+    if fault == 'nan':
         data = yaml.safe_load((small_files / 'first.yaml').read_text(encoding='utf-8'))
         next(iter(data.values()))['ros__parameters']['codebook']['analog'][0] = float('nan')
-        bad.write_text(yaml.safe_dump(data), encoding='utf-8')
-    code, log = call(processes, network, '--push-file', bad)
+        invalid.write_text(yaml.safe_dump(data), encoding='utf-8')
+    code, log = call(processes, network, '--push-file', invalid)
     assert code == 2, log
     assert log.startswith('error: ') and not crashed(log), log
     assert network[2] == before
 
 
-def test_without_an_optimizer_the_error_says_so(small_files):
+def test_the_error_names_a_missing_optimizer(small_files):
     context = Context()
     rclpy.init(args=[], context=context)
     node = Node('pusher', namespace='/nobody', context=context)
     try:
         with pytest.raises(PushError, match='^/nobody/optimizer: not there within 0.2 s'):
-            push(node, Codebook.load(small_files / 'first.yaml'), patience_s=0.2)
+            push(node, Codebook.load(small_files / 'first.yaml'), timeout_s=0.2)
     finally:
         node.destroy_node()
         rclpy.shutdown(context=context)
 
 
-def test_with_options_it_optimises_writes_and_then_holds(
+def test_with_options_the_command_optimises_writes_and_holds(
         processes, make_watch, small_files, tmp_path, crashed):
     output = tmp_path / 'new.yaml'
-    process = processes.start('optimizer', namespace='/hold', own=(
+    process = processes.start('optimizer', namespace='/hold', options=(
         '--method', 'directional', '--positions', '8', '--quiet', '--output', output,
         '--scenario', small_files / 'scenario.yaml'))
-    watch, heard = make_watch('/hold'), []
-    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, heard.append, qos.LATCHED)
-    watch.until(lambda: heard, 'the codebook', [process])
+    watch, received = make_watch('/hold'), []
+    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, received.append, qos.LATCHED)
+    watch.until(lambda: received, 'the codebook', [process])
     written = Codebook.load(output)
-    assert heard[0].codebook_id == written.id
-    assert convert.codebook_from_ros(heard[0]).id == written.id
+    assert received[0].codebook_id == written.id
+    assert convert.codebook_from_ros(received[0]).id == written.id
     process.signal(signal.SIGINT)
     assert process.wait() == 0
     assert not crashed(process.log), process.log

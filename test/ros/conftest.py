@@ -1,4 +1,4 @@
-"""Nodes of one process, spun by the test itself, on a domain of this process."""
+"""Nodes in the process of the test, which spins them itself, on a domain of that process."""
 
 import contextlib
 import dataclasses
@@ -13,7 +13,7 @@ import yaml
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.experimental import EventsExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
@@ -21,20 +21,20 @@ from rclpy.type_support import check_for_type_support
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.ros import convert, qos, topics
 
-# Before rclpy reads them.
+# Set before rclpy reads them.
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
-# Type supports load a parser that is older than this Python.
+# Type supports load a parser that uses deprecated modules.
 with warnings.catch_warnings():
     warnings.simplefilter('ignore', DeprecationWarning)
     check_for_type_support(ros.Beacon)
 
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 
 
 class Bench:
-    """A context with its own executor; the nodes end with the test."""
+    """A context with an executor; its nodes are destroyed with it."""
 
     def __init__(self, make_executor):
         self.context = Context()
@@ -43,7 +43,7 @@ class Bench:
         self._nodes = []
 
     def add(self, kind, *args, **options):
-        """Make a node, spun from now on."""
+        """Create a node and spin it from now on."""
         node = kind(*args, context=self.context, **options)
         self._nodes.append(node)
         self._executor.add_node(node)
@@ -55,35 +55,35 @@ class Bench:
         node.destroy_node()
 
     def until(self, condition, what='the condition'):
-        """Spin until a condition holds, and return its value."""
-        end_s = time.monotonic() + PATIENCE_S
+        """Spin until a condition holds and return its value."""
+        end_s = time.monotonic() + TIMEOUT_S
         while not (value := condition()):
-            assert time.monotonic() < end_s, f'{what} does not come about'
-            # A request that a removed node had not answered yet is still in the queue.
+            assert time.monotonic() < end_s, f'{what}: not within {TIMEOUT_S:g} s'
+            # The queue may still hold a request to a node that was removed.
             with contextlib.suppress(InvalidHandle):
                 self._executor.spin_once(timeout_sec=0.1)
         return value
 
     def result(self, future):
-        """Spin until a future is done, and return its result."""
+        """Spin until a future is done and return its result."""
         self.until(future.done, 'the answer')
         return future.result()
 
-    def outlet(self, node, kind):
-        """Publisher of a message, as soon as somebody listens."""
+    def publisher(self, node, kind):
+        """Return a publisher of a message once there is a subscriber."""
         publisher = node.create_publisher(
             convert.ros_type(kind), topics.NAMES[kind], qos.EXCHANGE)
-        self.until(publisher.get_subscription_count, f'a listener of {kind.__name__}')
+        self.until(publisher.get_subscription_count, f'a subscriber of {kind.__name__}')
         return publisher
 
-    def hear(self, node, kind):
-        """List that fills with the messages of a kind, as soon as somebody publishes."""
-        heard = []
+    def collect(self, node, kind):
+        """Return a list that collects the messages of a kind, once there is a publisher."""
+        received = []
         subscription = node.create_subscription(
             convert.ros_type(kind), topics.NAMES[kind],
-            lambda message: heard.append(convert.from_ros(kind, message)), qos.EXCHANGE)
+            lambda message: received.append(convert.from_ros(kind, message)), qos.EXCHANGE)
         self.until(subscription.get_publisher_count, f'a publisher of {kind.__name__}')
-        return heard
+        return received
 
     def close(self):
         for node in list(self._nodes):
@@ -101,7 +101,7 @@ def bench():
 
 @pytest.fixture(params=[EventsExecutor, SingleThreadedExecutor], ids=['events', 'single'])
 def each_bench(request):
-    """A bench on each executor with which the nodes are to work."""
+    """A bench with each executor that the nodes support."""
     bench = Bench(request.param)
     yield bench
     bench.close()
@@ -114,7 +114,7 @@ def probe(bench):
 
 @pytest.fixture(scope='session')
 def small_files(small, random_beams, tmp_path_factory):
-    """Files of a small scenario and of two codebooks for it."""
+    """Folder with the files of a small scenario and of two codebooks for it."""
     folder = tmp_path_factory.mktemp('small')
     fields = {key: list(value) if isinstance(value, tuple) else value
               for key, value in dataclasses.asdict(small.scenario).items()}

@@ -22,7 +22,7 @@ SIZES = Scenario().sizes
 STAMP = Time(sec=12, nanosec=345)
 KINDS = list(topics.NAMES)
 FILES = Path(__file__).resolve().parents[2] / 'msg_defs' / 'msg'
-# Types that are parts of messages, and the one that is no message of the protocol.
+# Types that are parts of messages, and a message outside the protocol.
 OTHER_TYPES = {'RealArray', 'ComplexArray', 'Codebook'}
 ENUMS = {'RhsConfiguration': [m.Mode], 'Data': [m.Direction, m.Stage], 'ProtocolState': [m.Phase]}
 
@@ -44,7 +44,7 @@ def random_scalar(field, rng):
 
 
 def random_array(meta, rng):
-    """An array with any number of frames, which nothing but the check fixes."""
+    """Return an array with a random number of frames, which only `check` restricts."""
     shape = [SIZES.get(d) or int(d if d.isdigit() else rng.integers(1, 6)) for d in meta['dims']]
     if meta['kind'] is complex:
         return rng.normal(size=(*shape, 2)) @ [1, 1j] * 10.0**rng.integers(-200, 200)
@@ -60,7 +60,7 @@ def random_message(kind, rng):
 
 
 def assert_same(one, other):
-    """Equal class, types and values, bit for bit."""
+    """Assert equal classes, types and values, bit for bit."""
     assert type(one) is type(other)
     for field in dataclasses.fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
@@ -75,7 +75,7 @@ def assert_same(one, other):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_round_trip_keeps_every_bit(kind):
+def test_a_round_trip_preserves_every_bit(kind):
     rng = np.random.default_rng(KINDS.index(kind))
     for _ in range(20):
         message = random_message(kind, rng)
@@ -88,11 +88,11 @@ def test_round_trip_keeps_every_bit(kind):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_arrays_travel_in_c_order_whatever_their_layout(kind):
+def test_arrays_are_sent_in_c_order_whatever_their_layout(kind):
     message = random_message(kind, np.random.default_rng(0))
-    turned = {field.name: np.asfortranarray(getattr(message, field.name))
+    fortran = {field.name: np.asfortranarray(getattr(message, field.name))
               for field in dataclasses.fields(kind) if 'dims' in field.metadata}
-    sent = convert.to_ros(dataclasses.replace(message, **turned), STAMP)
+    sent = convert.to_ros(dataclasses.replace(message, **fortran), STAMP)
     assert_same(message, convert.from_ros(kind, sent))
 
 
@@ -162,7 +162,7 @@ COMPLEX = 'FeedSignals.signals'
     (COMPLEX, ros.ComplexArray()),
     (COMPLEX, ros.ComplexArray(re=[1.0, 2.0], im=[1.0, 2.0])),
     (COMPLEX, ros.ComplexArray(shape=[1] * 200, re=[1.0], im=[1.0])),
-    # One value that claims to fill 16 TB, and more than an address can count.
+    # One value with a shape of 16 TB, and with one beyond the address space.
     (COMPLEX, ros.ComplexArray(shape=[2**20] * 2, re=[1.0], im=[1.0])),
     (COMPLEX, ros.ComplexArray(shape=[2**32 - 1] * 2, re=[1.0], im=[1.0])),
     (REAL, ros.RealArray(shape=[3], data=[1.0] * 2)),
@@ -183,7 +183,7 @@ def test_an_array_that_does_not_fill_its_shape_is_refused(where, array):
         convert.from_ros(kind, message)
 
 
-def test_a_number_without_shape_is_no_vector():
+def test_a_value_without_a_shape_is_not_a_vector():
     message = convert.to_ros(random_message(m.Beam, np.random.default_rng(0)), STAMP)
     message.analog = ros.RealArray(data=[1.0])
     with pytest.raises(MessageError, match=r'^Beam.analog: shape \[\], expected \[N_E = 100\]'):
@@ -201,7 +201,7 @@ def test_an_unknown_constant_is_refused(kind, field, number):
 
 
 @pytest.mark.parametrize('kind', KINDS, ids=lambda kind: kind.__name__)
-def test_bytes_are_the_message_or_an_error_that_names_it(kind):
+def test_bytes_convert_to_the_message_or_an_error_that_names_it(kind):
     message = random_message(kind, np.random.default_rng(3))
     serialized = serialize_message(convert.to_ros(message, STAMP))
     assert_same(message, convert.from_bytes(kind, serialized))
@@ -210,7 +210,7 @@ def test_bytes_are_the_message_or_an_error_that_names_it(kind):
             m.check(convert.from_bytes(kind, broken), SIZES)
 
 
-def test_codebook_travels_bit_for_bit(shipped):
+def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):
     sent = convert.codebook_to_ros(shipped, STAMP)
     received = deserialize_message(serialize_message(sent), ros.Codebook)
     assert received.codebook_id == shipped.id
@@ -222,7 +222,7 @@ def test_codebook_travels_bit_for_bit(shipped):
     assert back.id == shipped.id
 
 
-def test_codebook_without_a_bound_travels(small):
+def test_a_codebook_without_a_bound_survives_a_round_trip(small):
     assert math.isnan(small.codebook.average_crlb_m2)
     back = convert.codebook_from_ros(convert.codebook_to_ros(small.codebook, STAMP))
     assert math.isnan(back.average_crlb_m2)
@@ -261,7 +261,7 @@ def test_pose_holds_position_and_covariance():
     covariance = np.reshape(pose.pose.covariance, (6, 6))
     np.testing.assert_array_equal(covariance[:3, :3], estimate.covariance_m2)
     # The variance of an angle that is uniform from -pi to pi; nothing correlates with it.
-    turned = np.linspace(-math.pi, math.pi, 100_001)
-    np.testing.assert_allclose(covariance[3:, 3:], np.eye(3) * np.var(turned), rtol=1e-4)
+    angles = np.linspace(-math.pi, math.pi, 100_001)
+    np.testing.assert_allclose(covariance[3:, 3:], np.eye(3) * np.var(angles), rtol=1e-4)
     assert not covariance[:3, 3:].any()
     assert not covariance[3:, :3].any()

@@ -1,4 +1,4 @@
-"""What nodes tell of themselves."""
+"""The diagnostics of the nodes."""
 
 import pytest
 from builtin_interfaces.msg import Time
@@ -13,28 +13,29 @@ from rhs_isac_ros.ros.diagnostics import Diagnostics, from_ros, to_ros
     (False, DiagnosticStatus.OK), (True, DiagnosticStatus.WARN)])
 def test_a_report_becomes_one_status(fault, level):
     values = {'phase': 'resting', 'cycles.served': '3'}
-    told = to_ros(Report(fault, 'in words', values), '/a/bs', Time(sec=4))
-    (status,) = told.status
-    assert told.header.stamp.sec == 4
-    assert (status.level, status.name, status.message) == (level, 'a/bs', 'in words')
+    message = to_ros(Report(fault, 'a summary', values), '/a/bs', Time(sec=4))
+    (status,) = message.status
+    assert message.header.stamp.sec == 4
+    assert (status.level, status.name, status.message) == (level, 'a/bs', 'a summary')
     assert {pair.key: pair.value for pair in status.values} == values
 
 
 @pytest.mark.parametrize('fault', [False, True])
-def test_a_report_comes_back_from_ros(fault):
-    report = Report(fault, 'in words', {'phase': 'resting', 'cycles.served': '3'})
+def test_a_report_survives_a_round_trip(fault):
+    report = Report(fault, 'a summary', {'phase': 'resting', 'cycles.served': '3'})
     assert list(from_ros(to_ros(report, '/a/bs', Time()))) == [('a/bs', report)]
 
 
-def test_a_node_tells_once_a_second(bench, probe):
-    heard, asked = [], []
-    probe.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, heard.append, qos.EXCHANGE)
+def test_a_report_is_published_once_a_second(bench, probe):
+    received, reports = [], []
+    probe.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, received.append, qos.EXCHANGE)
 
     def report():
-        asked.append(None)
-        return Report(False, str(len(asked)), {})
+        reports.append(None)
+        return Report(False, str(len(reports)), {})
     Diagnostics(probe, report)
-    bench.until(lambda: len(heard) == 2, 'the second report')
-    assert [told.status[0].message for told in heard] == ['1', '2']
-    stamps_s = [told.header.stamp.sec + 1e-9 * told.header.stamp.nanosec for told in heard]
+    bench.until(lambda: len(received) == 2, 'the second report')
+    assert [message.status[0].message for message in received] == ['1', '2']
+    stamps = [message.header.stamp for message in received]
+    stamps_s = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
     assert 0.5 < stamps_s[1] - stamps_s[0] < 10

@@ -1,6 +1,6 @@
-"""Messages that pass every check of their form and still make no sense: no node dies of them.
+"""Messages that are well-formed but absurd do not crash a node.
 
-In a test the executor passes on what a callback raises, so that a node that would die fails it.
+The executor raises the exceptions of callbacks in the test, so a node that would crash fails it.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fields import check
 from rhs_isac_ros.ros import convert
 
-# A node at work only prints them.
+# Outside tests, warnings are only printed.
 pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
 
 PLACE = np.array([10.0, 0.5, 0.2])
@@ -29,9 +29,9 @@ HUGE = (1e100, 1e200, 1e308)
 
 
 class Stage:
-    """One node under test, and outlets for what the rest of the network would send it."""
+    """A node under test and publishers for the messages that it receives."""
 
-    def __init__(self, bench, files, kind, hears, answers, **values):
+    def __init__(self, bench, files, kind, inputs, answers, **values):
         overrides = [Parameter('scenario_file', value=str(files / 'scenario.yaml'))]
         if kind is not ChannelNode:
             bench.add(OptimizerNode, parameter_overrides=[
@@ -40,37 +40,37 @@ class Stage:
         self.node = bench.add(kind, parameter_overrides=overrides)
         self._bench = bench
         probe = bench.add(Node, 'probe')
-        self._outlets = {kind: bench.outlet(probe, kind) for kind in hears}
-        self._told, self._tell = 0, self.node.dispatch
-        self.node.dispatch = self._note
-        self.heard = bench.hear(probe, answers)
+        self._publishers = {kind: bench.publisher(probe, kind) for kind in inputs}
+        self._dispatched, self._dispatch = 0, self.node.dispatch
+        self.node.dispatch = self._count
+        self.received = bench.collect(probe, answers)
         self.scenario = self.node.scenario
         self.codebook = Codebook.load(files / 'first.yaml')
 
-    def _note(self, event):
+    def _count(self, event):
         try:
-            self._tell(event)
+            self._dispatch(event)
         finally:
-            self._told += 1
+            self._dispatched += 1
 
     @property
     def _handled(self):
-        """How many messages have been told to the role, or dropped before."""
-        return self._told + self.node._role.counters['malformed']
+        """Number of messages that the role has handled or the node has dropped."""
+        return self._dispatched + self.node.role.counters['malformed']
 
     def send(self, *messages):
-        """Send messages, one after the other has been handled: topics have no common order."""
+        """Send messages, each once the previous one has been handled: topics share no order."""
         stamp = self.node.get_clock().now().to_msg()
         for message in messages:
             before = self._handled
-            self._outlets[type(message)].publish(convert.to_ros(message, stamp))
+            self._publishers[type(message)].publish(convert.to_ros(message, stamp))
             self._bench.until(lambda before=before: self._handled > before, 'the handling')
 
     def until_answer(self, cycle_id):
-        """Wait for the answer to a sane message, and see that all answers make sense."""
-        self._bench.until(lambda: self.heard and self.heard[-1].cycle_id == cycle_id,
-                          'the answer to a sane message')
-        for message in self.heard:
+        """Wait for the answer to a plausible message and check all answers."""
+        self._bench.until(lambda: self.received and self.received[-1].cycle_id == cycle_id,
+                          'the answer to a plausible message')
+        for message in self.received:
             check(message, self.scenario.sizes)
 
 
@@ -105,7 +105,7 @@ def beam(scenario, cycle_id, amplitude=1e-3, expected_bps=1e6):
     return m.Beam(cycle_id, 1, '', 0, np.full(scenario.n_elements, 0.5), digital, expected_bps)
 
 
-def sane_pilot(stage):
+def send_plausible_pilot(stage):
     stage.send(truth(9), applied(stage.scenario, 9), pilot(9))
     stage.until_answer(9)
 
@@ -113,7 +113,7 @@ def sane_pilot(stage):
 @pytest.mark.parametrize('rows', [1, 3, 5])
 def test_channel_survives_configurations_for_another_number_of_frames(channel, rows):
     channel.send(truth(1), applied(channel.scenario, 1, rows=rows), pilot(1))
-    sane_pilot(channel)
+    send_plausible_pilot(channel)
 
 
 @pytest.mark.parametrize('place', [
@@ -124,7 +124,7 @@ def test_channel_survives_users_in_impossible_places(channel, place):
     channel.send(truth(1, place), applied(scenario, 1), pilot(1),
                  applied(scenario, 1, m.Mode.TRANSMISSION), beam(scenario, 1),
                  m.Data(1, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1.0, 1.0))
-    sane_pilot(channel)
+    send_plausible_pilot(channel)
 
 
 @pytest.mark.parametrize('number', HUGE)
@@ -136,15 +136,15 @@ def test_channel_survives_huge_numbers(channel, number):
         m.Data(1, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, number, number),
         truth(2), applied(scenario, 2, m.Mode.TRANSMISSION), beam(scenario, 2, number),
         m.Data(2, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1.0, 1.0))
-    sane_pilot(channel)
+    send_plausible_pilot(channel)
 
 
-def test_channel_survives_messages_of_no_cycle(channel):
+def test_channel_survives_messages_with_unknown_cycles(channel):
     last = 2**64 - 1
     for cycle_id in (0, last):
         channel.send(pilot(cycle_id), applied(channel.scenario, cycle_id), truth(cycle_id),
                      m.Data(cycle_id, 0, m.Direction.UPLINK, m.Stage.DELIVERED, -1.0, -1.0))
-    sane_pilot(channel)
+    send_plausible_pilot(channel)
 
 
 def estimate(stage, cycle_id, place=PLACE):
@@ -171,7 +171,8 @@ def test_positioner_survives_huge_signals(stage, number):
     stage = stage(PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
     scenario, codebook = stage.scenario, stage.codebook
     shape = codebook.digital.shape[:3]
-    sane = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(0))[0]
+    plausible = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(0))[0]
     received = m.ReceivedSignals(1, 1, codebook.id, np.full(shape, number * (1 + 1j)))
-    stage.send(received, dataclasses.replace(received, cycle_id=9, signals=sane.reshape(shape)))
+    stage.send(received)
+    stage.send(dataclasses.replace(received, cycle_id=9, signals=plausible.reshape(shape)))
     stage.until_answer(9)

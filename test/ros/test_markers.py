@@ -1,4 +1,4 @@
-"""Markers against plain geometry."""
+"""Markers, compared with their geometry."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def of(vector):
 
 
 def rotation(q):
-    """Matrix of a unit quaternion, written out."""
+    """Return the rotation matrix of a unit quaternion."""
     return np.array([
         [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w), 2 * (q.x * q.z + q.y * q.w)],
         [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2), 2 * (q.y * q.z - q.x * q.w)],
@@ -46,12 +46,12 @@ def test_the_ellipsoid_is_that_of_the_covariance(seed):
         CHI_SQUARE_95 * root @ root.T, rel=1e-3, abs=1e-3)
 
 
-def test_a_certain_position_is_drawn_all_the_same():
+def test_a_position_without_variance_is_visible():
     marker = markers.estimate(an_estimate(np.zeros((3, 3))), STAMP)
     assert of(marker.scale).min() > 0
 
 
-def test_truth_and_estimate_of_a_user_share_a_hue_and_users_do_not():
+def test_each_user_has_one_hue_for_truth_and_estimate():
     hues = {}
     for user in (1, 2, 2**32 - 1):
         position = np.array([user % 7, 0.0, 0.0], float)
@@ -78,7 +78,7 @@ def test_the_board_shows_its_configuration(small):
     assert len({color.r for color in unknown.colors}) == 1
 
 
-def test_the_region_is_where_the_scenario_says(small):
+def test_the_region_has_the_bounds_of_the_scenario(small):
     marker = markers.region(small.scenario, STAMP)
     low, high = small.scenario.roi_bounds_m
     assert of(marker.pose.position) - of(marker.scale) / 2 == pytest.approx(low)
@@ -87,8 +87,8 @@ def test_the_region_is_where_the_scenario_says(small):
     assert marker.pose.orientation.w == 1
 
 
-def test_the_lobe_has_the_radius_of_the_power_in_decibels():
-    """From 0 dB, at the distance of the pattern, to -20 dB, at the centre."""
+def test_the_radius_of_a_lobe_is_the_level_in_decibels():
+    """0 dB is at the distance of the pattern, -20 dB at the centre."""
     directions = np.array([[[1.0, 0, 0], [0, 1, 0]], [[0, 0, 1], [0.6, 0.8, 0]]])
     relative = np.array([[1.0, 0.1], [0.01, 0.0]])
     points = markers.lobe_m(BeamPattern(directions, relative, 8.0))
@@ -112,7 +112,7 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     assert marker.color.r == markers.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
 
 
-def test_a_path_goes_through_its_positions_in_their_order():
+def test_a_path_contains_its_positions_in_order():
     places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
     path = markers.path(places, STAMP)
     assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
@@ -121,6 +121,6 @@ def test_a_path_goes_through_its_positions_in_their_order():
                for pose in path.poses)
 
 
-def test_what_takes_a_marker_away_names_it():
-    marker = markers.gone('truth', 4, STAMP)
+def test_a_deletion_names_its_marker():
+    marker = markers.deletion('truth', 4, STAMP)
     assert (marker.ns, marker.id, marker.action) == ('truth', 4, Marker.DELETE)

@@ -16,7 +16,7 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.ros import convert, qos
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.resources import default_codebook_file
 
 TYPES = {
@@ -48,10 +48,10 @@ def other(random_beams):
 
 
 def latched(bench, node):
-    heard = []
-    node.create_subscription(ros.Codebook, 'codebook', heard.append, qos.LATCHED)
-    bench.until(lambda: heard, 'the latched codebook')
-    return heard
+    received = []
+    node.create_subscription(ros.Codebook, 'codebook', received.append, qos.LATCHED)
+    bench.until(lambda: received, 'the latched codebook')
+    return received
 
 
 def as_parameters(codebook, **changes):
@@ -80,35 +80,35 @@ def test_the_codebook_is_in_the_parameter_services(bench, client, shipped):
         assert not descriptor.read_only
 
 
-def test_who_joins_late_gets_the_codebook(bench, optimizer, probe, shipped):
+def test_a_late_joiner_receives_the_codebook(bench, optimizer, probe, shipped):
     message, = latched(bench, probe)
     assert message.codebook_id == shipped.id
     assert message.header.frame_id == 'map'
     assert convert.codebook_from_ros(message).id == shipped.id
 
 
-def test_a_change_of_all_at_once_is_taken_and_published(bench, optimizer, client, probe, other):
-    heard = latched(bench, probe)
+def test_a_complete_change_is_accepted_and_published(bench, optimizer, client, probe, other):
+    received = latched(bench, probe)
     answer = bench.result(client.set_parameters_atomically(as_parameters(other)))
     assert answer.result.successful
     assert held(optimizer).id == other.id
-    bench.until(lambda: len(heard) == 2, 'the new codebook')
-    assert convert.codebook_from_ros(heard[1]).id == other.id
-    assert math.isnan(heard[1].average_crlb_m2)
+    bench.until(lambda: len(received) == 2, 'the new codebook')
+    assert convert.codebook_from_ros(received[1]).id == other.id
+    assert math.isnan(received[1].average_crlb_m2)
     late, = latched(bench, bench.add(Node, 'late'))
     assert late.codebook_id == other.id
 
 
-def test_a_change_without_an_id_gets_one(bench, optimizer, client, probe, other):
-    """Whoever sets the arrays need not know how the hash is made."""
-    heard = latched(bench, probe)
+def test_a_change_without_an_id_receives_one(bench, optimizer, client, probe, other):
+    """A client that sets the arrays need not compute the hash."""
+    received = latched(bench, probe)
     answer = bench.result(client.set_parameters_atomically(as_parameters(other, id='')))
     assert answer.result.successful, answer.result.reason
-    bench.until(lambda: len(heard) == 2, 'the new codebook')
-    assert heard[1].codebook_id == other.id
+    bench.until(lambda: len(received) == 2, 'the new codebook')
+    assert received[1].codebook_id == other.id
 
 
-def test_the_same_codebook_again_is_taken(bench, client, shipped):
+def test_the_same_codebook_is_accepted_again(bench, client, shipped):
     assert bench.result(
         client.set_parameters_atomically(as_parameters(shipped))).result.successful
 
@@ -119,17 +119,17 @@ def wrong_sets():
     return {
         'analog alone': ({'analog': [0.5] * 800}, 'codebook.id'),
         'digital alone': ({'digital_re': [0.001] * 192}, 'codebook.id|power'),
-        'one value less': ({'analog': [0.5] * 799}, 'codebook.analog: 799 values, expected 800'),
+        'missing value': ({'analog': [0.5] * 799}, 'codebook.analog: 799 values, expected 800'),
         'no values': ({'digital_im': Parameter.Type.DOUBLE_ARRAY}, 'codebook.digital_im'),
         'wrong id': ({'id': 'deadbeefdeadbeef'}, "codebook.id: 'deadbeefdeadbeef', expected"),
         'NaN': ({'analog': nan_at_5, 'id': ''}, 'analog: not finite'),
-        'beyond 1': ({'analog': high_at_5, 'id': ''}, 'analog: 0.5 to 1.25, expected 0 to 1'),
+        'above 1': ({'analog': high_at_5, 'id': ''}, 'analog: 0.5 to 1.25, expected 0 to 1'),
         'infinite': ({'digital_re': [math.inf] * 192, 'id': ''}, 'digital: not finite'),
         'power': ({'digital_re': [1.0] * 192, 'id': ''}, 'digital: .*power'),
-        'another shape': ({'shape': [2, 8, 4, 3, 99]}, 'codebook.analog: 800 values, .*792'),
-        'no shape': ({'shape': [2, 8, 4]}, r'codebook.shape: .*\[2, 8, 4\].*, expected'),
+        'wrong shape': ({'shape': [2, 8, 4, 3, 99]}, 'codebook.analog: 800 values, .*792'),
+        'short shape': ({'shape': [2, 8, 4]}, r'codebook.shape: .*\[2, 8, 4\].*, expected'),
         'negative shape': ({'shape': [2, 8, -4, -3, 100]}, 'codebook.shape: .*positive'),
-        'endless shape': ({'shape': [10**5, 10**5, 100, 3, 100]}, 'codebook'),
+        'huge shape': ({'shape': [10**5, 10**5, 100, 3, 100]}, 'codebook'),
         'another scenario': (
             {'shape': [1, 8, 4, 3, 100], 'analog': [0.5] * 400, 'digital_re': [0.001] * 96,
              'digital_im': [0.0] * 96, 'id': ''},
@@ -138,16 +138,16 @@ def wrong_sets():
 
 
 @pytest.mark.parametrize('name', wrong_sets())
-def test_a_set_that_makes_no_codebook_is_refused_whole(
+def test_a_change_to_an_invalid_codebook_is_refused_as_a_whole(
         bench, optimizer, client, probe, shipped, other, name):
-    heard = latched(bench, probe)
+    received = latched(bench, probe)
     changes, text = wrong_sets()[name]
     wrong = [Parameter(f'codebook.{k}', value=v) if isinstance(v, list | str) else
              Parameter(f'codebook.{k}', v, []) for k, v in changes.items()]
     answer = bench.result(client.set_parameters_atomically(wrong))
     assert not answer.result.successful
     assert re.search(text, answer.result.reason), answer.result.reason
-    # Alone, none of them is taken either: the node stays with what it has.
+    # No parameter is accepted alone either: the node keeps its codebook.
     for parameter in wrong:
         result, = bench.result(client.set_parameters([parameter])).results
         if parameter.value != '':
@@ -155,8 +155,8 @@ def test_a_set_that_makes_no_codebook_is_refused_whole(
             assert result.reason
     assert held(optimizer).id == shipped.id
     bench.result(client.set_parameters_atomically(as_parameters(other)))
-    bench.until(lambda: heard[-1].codebook_id == other.id, 'the next good codebook')
-    assert {message.codebook_id for message in heard} == {shipped.id, other.id}
+    bench.until(lambda: received[-1].codebook_id == other.id, 'the next good codebook')
+    assert {message.codebook_id for message in received} == {shipped.id, other.id}
 
 
 @pytest.mark.parametrize('name', [*TYPES, 'codebook.provenance'])
@@ -170,7 +170,7 @@ def test_a_value_of_another_type_is_refused(bench, optimizer, client, shipped, n
         shipped.to_parameters()[name], nan_ok=True)
 
 
-def test_own_settings_do_not_change_at_run_time(bench, client):
+def test_the_files_are_read_only_at_run_time(bench, client):
     for name in ('scenario_file', 'codebook_file'):
         result, = bench.result(client.set_parameters([Parameter(name, value='/x')])).results
         assert not result.successful
@@ -190,7 +190,7 @@ def test_a_codebook_file_is_a_parameter_file(bench, other, tmp_path, shipped, na
         bench.remove(node)
 
 
-def test_a_codebook_file_can_be_loaded_while_it_runs(bench, optimizer, client, other, tmp_path):
+def test_a_codebook_file_can_be_loaded_at_run_time(bench, optimizer, client, other, tmp_path):
     path = tmp_path / 'other.yaml'
     dataclasses.replace(other, average_crlb_m2=0.2, provenance='a test').save(path)
     answer = bench.result(client.load_parameter_file_atomically(str(path), use_wildcard=True))
@@ -198,7 +198,7 @@ def test_a_codebook_file_can_be_loaded_while_it_runs(bench, optimizer, client, o
     assert held(optimizer).id == other.id
 
 
-def test_scenario_and_codebook_of_other_files(bench, small, small_files):
+def test_scenario_and_codebook_come_from_the_given_files(bench, small, small_files):
     node = bench.add(OptimizerNode, parameter_overrides=[
         Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
         Parameter('codebook_file', value=str(small_files / 'first.yaml'))])
@@ -228,6 +228,6 @@ def test_a_bad_codebook_is_refused_at_the_start(bench):
             Parameter('codebook.id', value='deadbeefdeadbeef')])
 
 
-def test_a_setting_of_the_wrong_type_is_refused_at_the_start(bench):
+def test_a_parameter_of_the_wrong_type_is_refused_at_the_start(bench):
     with pytest.raises(ParameterError, match='codebook_file: .*expected a string'):
         bench.add(OptimizerNode, parameter_overrides=[Parameter('codebook_file', value=1)])

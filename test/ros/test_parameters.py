@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import types
 
 import pytest
 from rcl_interfaces.msg import ParameterType
@@ -21,7 +22,8 @@ from rhs_isac_ros.protocol.settings import (
     TransmissionSettings,
 )
 from rhs_isac_ros.ros import parameters
-from rhs_isac_ros.ros.parameters import NODES, ParameterError, declare
+from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.parameters import NODES, declare, settings_of
 
 PAIRS = [(executable, p) for executable, group in NODES.items() for p in group]
 NAMES = [f'{executable}-{p.name}' for executable, p in PAIRS]
@@ -32,7 +34,7 @@ TYPES = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGE
 
 
 def only(choose):
-    """Parametrise over the parameters that a function chooses."""
+    """Parametrize over the parameters that a function selects."""
     chosen = [(pair, name) for pair, name in zip(PAIRS, NAMES, strict=True) if choose(pair[1])]
     assert chosen
     return pytest.mark.parametrize(
@@ -47,7 +49,7 @@ has_fractions = only(lambda p: type(p.default) in (float, list))
 
 @pytest.fixture
 def make(bench):
-    """Function that makes a node with the given start-up values."""
+    """Return a function that creates a node with initial parameter values."""
     numbers = itertools.count()
 
     def make(**values):
@@ -62,14 +64,14 @@ def value_of(parameter, number):
 
 
 def refusal(make, executable, name, value):
-    """What declare() says to a bad value."""
+    """Return the error of `declare` for an invalid value."""
     with pytest.raises(ParameterError) as caught:
         declare(make(**{name: value}), executable)
     return str(caught.value)
 
 
 @pytest.mark.parametrize('executable', NODES)
-def test_defaults(make, executable):
+def test_the_defaults_apply_with_their_types(make, executable):
     values = vars(declare(make(), executable))
     assert values == {p.name: p.default for p in NODES[executable]}
     assert [type(values[p.name]) for p in NODES[executable]] == [
@@ -77,7 +79,7 @@ def test_defaults(make, executable):
 
 
 @pytest.mark.parametrize('executable', NODES)
-def test_descriptors(make, executable):
+def test_descriptors_match_the_declarations(make, executable):
     node = make()
     declare(node, executable)
     for p in NODES[executable]:
@@ -111,7 +113,7 @@ def test_a_value_of_another_type_is_refused(make, executable, parameter):
 
 @only(lambda p: isinstance(p.default, int | float) and not isinstance(p.default, bool))
 def test_a_number_given_as_a_string_is_refused(make, executable, parameter):
-    # As `ros2 param set` sends 28e9.
+    # `ros2 param set` sends 28e9 as a string.
     text = refusal(make, executable, parameter.name, '28e9')
     assert text.startswith(f'{parameter.name}: ')
     assert "'28e9'" in text
@@ -120,7 +122,7 @@ def test_a_number_given_as_a_string_is_refused(make, executable, parameter):
 
 @has_range
 @pytest.mark.parametrize('side', ['low', 'high'])
-def test_ends_of_a_range_are_in_it_and_what_is_beyond_is_not(make, executable, parameter, side):
+def test_a_range_includes_its_ends_and_nothing_beyond(make, executable, parameter, side):
     end = getattr(parameter, side)
     inside = value_of(parameter, end)
     assert getattr(declare(make(**{parameter.name: inside}), executable),
@@ -136,7 +138,7 @@ def test_ends_of_a_range_are_in_it_and_what_is_beyond_is_not(make, executable, p
 
 @has_fractions
 @pytest.mark.parametrize('number', [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_refused(make, executable, parameter, number):
+def test_a_number_that_is_not_finite_is_refused(make, executable, parameter, number):
     text = refusal(make, executable, parameter.name, value_of(parameter, number))
     assert text.startswith(f'{parameter.name}: ')
     assert str(number) in text
@@ -144,7 +146,7 @@ def test_what_is_not_finite_is_refused(make, executable, parameter, number):
 
 
 @has_choices
-def test_choices(make, executable, parameter):
+def test_choices_are_accepted_and_other_strings_refused(make, executable, parameter):
     for choice in parameter.choices:
         node = make(**{parameter.name: choice})
         assert getattr(declare(node, executable), parameter.name) == choice
@@ -155,39 +157,38 @@ def test_choices(make, executable, parameter):
 
 
 @only(lambda p: not p.dynamic)
-def test_what_is_not_hot_does_not_change_at_run_time(make, executable, parameter):
+def test_a_parameter_that_is_not_dynamic_is_read_only(make, executable, parameter):
     node = make()
     declare(node, executable)
-    # A value that would be right at the start.
-    right = parameter.choices[-1] if parameter.choices else {
+    # A value that would be valid at the start.
+    valid = parameter.choices[-1] if parameter.choices else {
         bool: not parameter.default, int: 1, float: parameter.low, str: 'a', list: [1.0]}[
             type(parameter.default)]
-    result, = node.set_parameters([Parameter(parameter.name, value=right)])
+    result, = node.set_parameters([Parameter(parameter.name, value=valid)])
     assert not result.successful
     assert 'read-only' in result.reason
     unset = Parameter(parameter.name, value=[])
     assert node.get_parameter_or(parameter.name, unset).value == parameter.default
 
 
-@pytest.mark.parametrize(('executable', 'settings'), [
-    ('bs', BaseStationSettings), ('channel', Impairments), ('positioner', PositionerSettings),
-    ('transmission', TransmissionSettings)])
-def test_what_is_hot_is_in_the_settings_of_the_role(executable, settings):
-    fields = {field.name: field.default for field in dataclasses.fields(settings)}
+@pytest.mark.parametrize(('executable', 'settings', 'fixed'), [
+    ('bs', BaseStationSettings, {'step_timeout_s'}), ('channel', Impairments, set()),
+    ('positioner', PositionerSettings, set()), ('transmission', TransmissionSettings, set())])
+def test_the_dynamic_parameters_are_the_settings_of_the_role(executable, settings, fixed):
     declared = {p.name: p for p in NODES[executable]}
-    hot = {name for name, p in declared.items() if p.dynamic}
-    # A base station shares its patience with users, who know of no change.
-    assert fields.keys() - hot == ({'step_timeout_s'} if executable == 'bs' else set())
-    assert hot <= fields.keys()
-    assert fields == {name: declared[name].default for name in fields}
+    fields = {field.name for field in dataclasses.fields(settings)}
+    assert {name for name, p in declared.items() if p.dynamic} == fields - fixed
+    # The node passes all of them on, with the same values.
+    values = types.SimpleNamespace(**{p.name: p.default for p in NODES[executable]})
+    assert settings_of(settings, values) == settings()
 
 
-def test_other_nodes_have_nothing_hot():
-    hot = {executable for executable, p in PAIRS if p.dynamic}
-    assert hot == {'bs', 'channel', 'positioner', 'transmission'}
+def test_other_nodes_have_no_dynamic_parameters():
+    dynamic = {executable for executable, p in PAIRS if p.dynamic}
+    assert dynamic == {'bs', 'channel', 'positioner', 'transmission'}
 
 
-def test_table_lists_every_parameter_once_with_all_that_is_to_know():
+def test_the_table_lists_every_parameter_once_with_its_declaration():
     head, rule, *rows = parameters.table().splitlines()
     columns = head.count('|')
     assert rule == '|' + '---|' * (columns - 1)
@@ -208,7 +209,7 @@ def test_table_lists_every_parameter_once_with_all_that_is_to_know():
         assert ('yes' in cells) == p.dynamic
 
 
-def test_a_parameter_that_nodes_share_is_the_same_in_all():
+def test_nodes_share_declarations_of_equal_names():
     shared = {}
     for _, p in PAIRS:
         assert shared.setdefault(p.name, p) == p
@@ -226,31 +227,31 @@ def test_a_parameter_that_nodes_share_is_the_same_in_all():
     ({'mobility': 'random_walk', 'speed_mps': 5.6},
      r'speed_mps: 5.6, expected at most max_user_speed_mps = 5.55'),
 ])
-def test_values_of_a_user_that_do_not_fit_the_scenario_are_refused(bench, values, text):
+def test_values_of_a_user_that_contradict_the_scenario_are_refused(bench, values, text):
     overrides = [Parameter(name, value=value) for name, value in values.items()]
     with pytest.raises(ParameterError, match=text):
         bench.add(UserNode, parameter_overrides=overrides)
 
 
-@pytest.mark.parametrize(('values', 'place'), [
+@pytest.mark.parametrize(('values', 'position'), [
     ({'position_m': [9.0, 1.0, -0.5]}, (9.0, 1.0, -0.5)),
     ({'mobility': 'random_walk', 'position_m': [9.0, 1.0, -0.5], 'speed_mps': 0.0},
      (9.0, 1.0, -0.5)),
     ({'mobility': 'waypoints', 'waypoints_m': [5.0, 5.0, 1.0]}, (5.0, 5.0, 1.0)),
 ])
-def test_a_user_starts_where_its_parameters_say(bench, values, place):
+def test_the_parameters_of_a_user_set_its_initial_position(bench, values, position):
     overrides = [Parameter(name, value=value) for name, value in values.items()]
     bench.add(UserNode, parameter_overrides=overrides)
-    truths = bench.hear(bench.add(Node, 'probe'), m.GroundTruth)
+    truths = bench.collect(bench.add(Node, 'probe'), m.GroundTruth)
     bench.until(lambda: truths, 'the true position')
-    assert truths[0].position == pytest.approx(place, abs=1e-12)
+    assert truths[0].position == pytest.approx(position, abs=1e-12)
     assert truths[0].user == 1
 
 
 def test_a_user_without_a_position_starts_in_the_region(bench):
     bench.add(UserNode)
     bench.add(UserNode, 'second', parameter_overrides=[Parameter('user_id', value=2)])
-    truths = bench.hear(bench.add(Node, 'probe'), m.GroundTruth)
+    truths = bench.collect(bench.add(Node, 'probe'), m.GroundTruth)
     bench.until(lambda: {truth.user for truth in truths} == {1, 2}, 'both true positions')
     low, high = Scenario().roi_bounds_m
     assert all(((low <= truth.position) & (truth.position <= high)).all() for truth in truths)
@@ -259,7 +260,7 @@ def test_a_user_without_a_position_starts_in_the_region(bench):
     assert first != second
 
 
-def test_a_band_that_the_scenario_does_not_have_is_refused(bench):
+def test_a_band_beyond_those_of_the_scenario_is_refused(bench):
     with pytest.raises(ParameterError, match='band: 2, expected 0 to 1 of the scenario'):
         bench.add(TransmissionNode, parameter_overrides=[Parameter('band', value=2)])
 
@@ -286,12 +287,12 @@ def nothing(scenario, speed_mps, rng, start):
 
 
 @pytest.mark.parametrize(('position', 'place'), [([], (10, 0, 0)), ([9.0, 1.0, -0.5],) * 2])
-def test_a_user_moves_as_a_plug_in_says(bench, install, position, place):
+def test_a_plug_in_moves_the_user(bench, install, position, place):
     install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb'}})
     values = {'mobility': 'climb', 'speed_mps': 0.5, 'position_m': position}
     overrides = [Parameter(name, value=value) for name, value in values.items() if value]
     bench.add(UserNode, parameter_overrides=overrides)
-    truths = bench.hear(bench.add(Node, 'probe'), m.GroundTruth)
+    truths = bench.collect(bench.add(Node, 'probe'), m.GroundTruth)
     bench.until(lambda: truths, 'the true position')
     assert tuple(truths[0].position) == tuple(place)
     assert tuple(truths[0].velocity) == (0.0, 0.0, 0.5)
@@ -302,7 +303,7 @@ def test_a_user_moves_as_a_plug_in_says(bench, install, position, place):
             'rhs_isac_ros.mobilities; installed: climb, nothing'),
     ('nothing', 'mobility: entry point .*: nothing = moves:nothing of moves: made None'),
 ])
-def test_what_is_no_mobility_is_refused(bench, install, name, words):
+def test_an_invalid_mobility_is_refused(bench, install, name, words):
     install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb', 'nothing': 'nothing'}})
     with pytest.raises(ParameterError, match=words):
         bench.add(UserNode, parameter_overrides=[Parameter('mobility', value=name)])

@@ -16,7 +16,7 @@ from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros import convert
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.parameter import ParameterError
 
 PLACE = np.array([10.0, 0.5, 0.2])
 
@@ -28,7 +28,7 @@ def codebooks(small_files):
 
 @pytest.fixture
 def values():
-    """Parameters besides those of every test."""
+    """Additional parameters."""
     return {}
 
 
@@ -42,23 +42,25 @@ def node(bench, small_files, tmp_path, values):
 
 @pytest.fixture
 def send(bench, node, codebooks):
-    """Function that sends good signals of a cycle, and returns them."""
-    outlets = []
+    """Return a function that sends valid signals of a cycle and returns them."""
+    publishers = []
 
     def send(cycle_id, number=0, factor=1.0):
-        outlets or outlets.append(bench.outlet(bench.add(Node, 'probe'), m.ReceivedSignals))
+        if not publishers:
+            probe = bench.add(Node, 'probe')
+            publishers.append(bench.publisher(probe, m.ReceivedSignals))
         codebook = codebooks[number]
         rng = np.random.default_rng(cycle_id)
         signals = factor * simulate_received(node.scenario, codebook, PLACE[None], rng)[0]
         message = m.ReceivedSignals(
             cycle_id, 1, codebook.id, signals.reshape(codebook.digital.shape[:3]))
-        outlets[0].publish(convert.to_ros(message, node.get_clock().now().to_msg()))
+        publishers[0].publish(convert.to_ros(message, node.get_clock().now().to_msg()))
         return signals
     return send
 
 
-def test_the_estimate_is_that_of_the_library(bench, node, send, codebooks, tmp_path):
-    estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, tmp_path):
+    estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
     signals = send(3)
     (estimate,) = bench.until(lambda: estimates)
@@ -68,17 +70,17 @@ def test_the_estimate_is_that_of_the_library(bench, node, send, codebooks, tmp_p
     assert len(list((tmp_path / 'tables').iterdir())) == 1
 
 
-def test_signals_are_answered_while_another_estimator_is_made(
+def test_signals_are_answered_while_another_estimator_is_built(
         bench, node, send, codebooks, monkeypatch):
-    free, begun = threading.Event(), threading.Event()
+    released, begun = threading.Event(), threading.Event()
 
     def slowly(name, scenario, codebook, **options):
         if codebook.id == codebooks[1].id:
             begun.set()
-            free.wait()
+            released.wait()
         return make_estimator(name, scenario, codebook, **options)
     monkeypatch.setattr(positioner, 'make_estimator', slowly)
-    estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+    estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
     send(1)
     bench.until(lambda: len(estimates) == 1)
@@ -87,13 +89,13 @@ def test_signals_are_answered_while_another_estimator_is_made(
     send(2, 1)
     send(3)
     bench.until(lambda: len(estimates) == 2)
-    free.set()
+    released.set()
     bench.until(lambda: len(estimates) == 3)
     assert [(e.cycle_id, e.codebook_id) for e in estimates] == [
         (1, codebooks[0].id), (3, codebooks[0].id), (2, codebooks[1].id)]
 
 
-def test_a_node_that_ends_meanwhile_ends_well(bench, node, codebooks, monkeypatch):
+def test_a_node_can_be_destroyed_while_an_estimator_is_built(bench, node, codebooks, monkeypatch):
     begun, made = threading.Event(), []
 
     def slowly(name, scenario, codebook, **options):
@@ -108,18 +110,19 @@ def test_a_node_that_ends_meanwhile_ends_well(bench, node, codebooks, monkeypatc
     assert not [t for t in threading.enumerate() if t.name.startswith('positioner')]
 
 
-def test_without_a_fix_it_says_so(bench, node, send, codebooks):
-    ear = bench.add(Node, 'ear')
-    told, estimates = bench.hear(ear, m.NoFix), bench.hear(ear, m.PositionEstimate)
+def test_invalid_signals_are_answered_without_a_fix(bench, node, send, codebooks):
+    receiver = bench.add(Node, 'receiver')
+    missed = bench.collect(receiver, m.NoFix)
+    estimates = bench.collect(receiver, m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
     send(1, factor=0.0)
     send(2, factor=1e3)
     send(3)
-    bench.until(lambda: estimates and len(told) == 2)
-    assert [message.cycle_id for message in told] == [1, 2]
+    bench.until(lambda: estimates and len(missed) == 2)
+    assert [message.cycle_id for message in missed] == [1, 2]
     assert [message.cycle_id for message in estimates] == [3]
-    assert 'energy' in told[0].reason
-    assert 'residual' in told[1].reason
+    assert 'energy' in missed[0].reason
+    assert 'residual' in missed[1].reason
 
 
 class TestNeural:
@@ -139,19 +142,19 @@ class TestNeural:
         model.save(tmp_path / 'model.npz')
         return {'estimator': 'neural', 'model_file': str(tmp_path / 'model.npz')}
 
-    def test_it_estimates_with_its_model_and_refuses_another_codebook(
+    def test_its_model_is_used_for_one_codebook_and_refused_for_another(
             self, bench, node, send, codebooks, monkeypatch):
-        said = []
+        logged = []
         monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
-            info=said.append, warning=said.append))
-        estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+            info=logged.append, warning=logged.append))
+        estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
         node.dispatch(CodebookOffered(codebooks[0]))
         send(1)
         bench.until(lambda: len(estimates) == 1)
         node.dispatch(CodebookOffered(codebooks[1]))
-        bench.until(lambda: len(said) == 2)
-        assert f'no estimator for codebook {codebooks[1].id}: ' in said[1]
-        assert f'model.npz: trained for codebook {codebooks[0].id}, expected' in said[1]
+        bench.until(lambda: len(logged) == 2)
+        assert f'no estimator for codebook {codebooks[1].id}: ' in logged[1]
+        assert f'model.npz: trained for codebook {codebooks[0].id}, expected' in logged[1]
         send(2, 1)
         send(3)
         bench.until(lambda: len(estimates) == 2)
@@ -186,8 +189,8 @@ def fails(scenario, codebook):
         install('guesses', self.CODE, {plugins.ESTIMATORS: {'centre': 'Centre'}})
         return {'estimator': 'centre', 'model_file': request.param}
 
-    def test_it_estimates_with_it(self, bench, node, send, codebooks, values):
-        estimates = bench.hear(bench.add(Node, 'ear'), m.PositionEstimate)
+    def test_the_plug_in_estimates(self, bench, node, send, codebooks, values):
+        estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
         node.dispatch(CodebookOffered(codebooks[0]))
         send(1)
         (estimate,) = bench.until(lambda: estimates)
@@ -201,23 +204,23 @@ def fails(scenario, codebook):
              r"rhs_isac_ros.estimators; installed: absent, fails"),
     ('absent', 'estimator: entry point .*: absent = guesses:Absent of guesses: cannot be loaded'),
 ])
-def test_a_plug_in_that_is_not_there_is_refused_at_the_start(bench, install, name, words):
+def test_a_missing_plug_in_is_refused_at_the_start(bench, install, name, words):
     install('guesses', TestPlugin.CODE, {
         plugins.ESTIMATORS: {'fails': 'fails', 'absent': 'Absent'}})
     with pytest.raises(ParameterError, match=words):
         bench.add(PositionerNode, parameter_overrides=[Parameter('estimator', value=name)])
 
 
-def test_a_plug_in_that_fails_is_told_and_named(
+def test_the_log_names_a_plug_in_that_fails(
         bench, install, codebooks, small_files, monkeypatch):
     install('guesses', TestPlugin.CODE, {plugins.ESTIMATORS: {'fails': 'fails'}})
     node = bench.add(PositionerNode, parameter_overrides=[
         Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
         Parameter('estimator', value='fails')])
-    said = []
+    logged = []
     monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
-        info=said.append, warning=said.append))
+        info=logged.append, warning=logged.append))
     node.dispatch(CodebookOffered(codebooks[0]))
-    bench.until(lambda: said)
-    assert said[0].endswith(
+    bench.until(lambda: logged)
+    assert logged[0].endswith(
         "fails = guesses:fails of guesses: failed: KeyError: 'no such file'")

@@ -1,4 +1,4 @@
-"""The example of a radio in the place of the channel, in a network that serves a user with it."""
+"""The example of a radio that replaces the channel, in a network that serves a user."""
 
 import importlib.util
 from pathlib import Path
@@ -36,7 +36,7 @@ def example():
 
 
 class Hardware:
-    """Surface, user and receivers with noise of their own, in a room without scattering."""
+    """Surface, user and noisy receivers, without scattering."""
 
     def __init__(self, scenario):
         self._scenario, self._rng = scenario, np.random.default_rng(8)
@@ -56,7 +56,7 @@ class Hardware:
         return data.bits // 2
 
 
-def test_a_network_serves_a_user_with_it(bench, example, small_files):
+def test_a_network_with_the_radio_serves_a_user(bench, example, small_files):
     file = small_files / 'scenario.yaml'
     scenario, codebook = Scenario.from_yaml(file), Codebook.load(small_files / 'first.yaml')
     hardware = Hardware(scenario)
@@ -72,13 +72,13 @@ def test_a_network_serves_a_user_with_it(bench, example, small_files):
     add(UserNode, position_m=PLACE)
     add(BsNode, receiver_noise=False, rest_s=0.0)
     add(lambda **options: example.RadioNode(hardware.measure, hardware.carry, **options))
-    ear = bench.add(Node, 'ear')
-    states = bench.hear(ear, m.ProtocolState)
-    received = bench.hear(ear, m.ReceivedSignals)
+    receiver = bench.add(Node, 'receiver')
+    states = bench.collect(receiver, m.ProtocolState)
+    received = bench.collect(receiver, m.ReceivedSignals)
     bench.until(lambda: any(state.outcome == 'served' for state in states), 'a served cycle')
     cycle_id = next(state.cycle_id for state in states if state.outcome == 'served')
     signals = next(r.signals for r in received if r.cycle_id == cycle_id)
-    # What the base station made of them is what was measured, combined, with nothing added.
+    # The base station combined the measured signals and added nothing.
     feeds = np.array([[hardware.measured[cycle_id, band, frame]
                        for frame in range(scenario.n_frames)]
                       for band in range(scenario.n_bands)])
@@ -108,7 +108,7 @@ def answers(radio, event):
     return [action.message for action in actions]
 
 
-def test_pilots_that_overtake_their_configuration_wait_for_it(radio):
+def test_pilots_that_arrive_before_their_configuration_wait_for_it(radio):
     assert answers(radio, pilot(5, 0)) == []
     assert answers(radio, pilot(5, 1)) == []
     sent = answers(radio, configuration(5))
@@ -124,13 +124,13 @@ def test_an_old_configuration_does_not_answer_a_new_cycle(radio):
     assert [s.cycle_id for s in answers(radio, configuration(6))] == [6]
 
 
-def test_what_nobody_can_answer_is_forgotten(radio):
+def test_the_oldest_unanswered_pilots_are_discarded(radio):
     for number in range(1000):
         answers(radio, pilot(7, number))
     assert len(radio._waiting) == 256
 
 
-def test_data_arrive_as_far_as_they_are_carried(radio):
+def test_data_are_delivered_as_far_as_the_radio_carries_them(radio):
     offered = m.Data(5, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1e-3, 100.0)
     (delivered,) = answers(radio, offered)
     assert (delivered.stage, delivered.bits) == (m.Stage.DELIVERED, 3.0)

@@ -1,4 +1,4 @@
-"""Recordings: written from a node, read back here and by an independent decoder."""
+"""Recordings, read back by the package and by independent decoders."""
 
 import array
 import importlib
@@ -16,9 +16,9 @@ from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import (
     Recorder,
     RecordingError,
-    outlets,
     read,
     read_scenario,
+    recorded_topics,
     schema,
     type_name,
 )
@@ -35,7 +35,7 @@ def received(cycle_id):
 
 @pytest.fixture
 def recording(bench, probe, tmp_path):
-    """A file of three messages of two kinds, and the messages."""
+    """A recording of three messages of two types, and the messages."""
     recorder = Recorder(tmp_path / 'run.mcap', Scenario(n_frames=2))
     recorder.listen(probe)
     sent = [received(1), ros.PositionEstimate(cycle_id=1, covariance_m2=np.arange(9.0)),
@@ -57,7 +57,7 @@ def recording(bench, probe, tmp_path):
     return path, sent
 
 
-def test_what_was_said_is_read_back(recording):
+def test_messages_are_read_back(recording):
     path, sent = recording
     found = list(read(path))
     assert [message for _, message, _ in found] == sent
@@ -69,7 +69,7 @@ def test_what_was_said_is_read_back(recording):
 
 
 def test_another_decoder_needs_only_the_file(recording):
-    """It knows the messages from the definitions in the file alone, as Foxglove does."""
+    """Like Foxglove, it takes the message definitions from the file."""
     mcap_ros2 = pytest.importorskip('mcap_ros2.decoder', reason='there is no mcap_ros2 here')
     from mcap.reader import make_reader
     path, sent = recording
@@ -79,7 +79,7 @@ def test_another_decoder_needs_only_the_file(recording):
         summary = reader.get_summary()
         found = [message for *_, message in reader.iter_decoded_messages()]
     assert {channel.topic for channel in summary.channels.values()} == {
-        f'/{name}' for name in outlets()}
+        f'/{name}' for name in recorded_topics()}
     offered = {channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])
                for channel in summary.channels.values()}
     assert [offered[topic][0]['durability'] for topic in ('/codebook', '/pilot')] == [
@@ -93,11 +93,11 @@ def test_another_decoder_needs_only_the_file(recording):
 def test_every_definition_can_be_parsed():
     pytest.importorskip('mcap_ros2', reason='there is no mcap_ros2 here')
     from mcap_ros2._dynamic import generate_dynamic
-    for kind, _ in outlets().values():
+    for kind, _ in recorded_topics().values():
         assert type_name(kind) in generate_dynamic(type_name(kind), schema(kind))
 
 
-def test_a_definition_names_each_of_its_parts_once():
+def test_a_definition_contains_each_of_its_parts_once():
     text = schema(PoseWithCovarianceStamped)
     parts = [line for line in text.splitlines() if line.startswith('MSG: ')]
     assert sorted(parts) == [
@@ -106,7 +106,7 @@ def test_a_definition_names_each_of_its_parts_once():
         'MSG: std_msgs/Header']
 
 
-def test_an_observer_sees_what_it_records(bench, probe, tmp_path):
+def test_an_observer_logs_the_cycles_that_it_records(bench, probe, tmp_path):
     recorder = Recorder(tmp_path / 'run.mcap', Scenario())
     observer = bench.add(CycleObserver, recorder)
     beacon = probe.create_publisher(ros.Beacon, 'beacon', qos.EXCHANGE)
@@ -123,7 +123,7 @@ def test_an_observer_sees_what_it_records(bench, probe, tmp_path):
 
 
 @pytest.mark.parametrize('content', [b'', b'no recording at all', None], ids=str)
-def test_what_is_no_recording_is_named(tmp_path, content):
+def test_the_error_names_a_file_that_is_not_a_recording(tmp_path, content):
     path = tmp_path / 'bad.mcap'
     if content is not None:
         path.write_bytes(content)
@@ -132,29 +132,29 @@ def test_what_is_no_recording_is_named(tmp_path, content):
             act()
 
 
-def test_half_a_recording_is_named(recording):
+def test_the_error_names_an_incomplete_recording(recording):
     path, _ = recording
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(RecordingError, match=f'^{path}: no whole recording'):
+    with pytest.raises(RecordingError, match=f'^{path}: not a complete recording'):
         list(read(path))
 
 
-def test_a_scenario_of_another_version_is_named(tmp_path):
+def test_a_scenario_of_another_version_is_an_error(tmp_path):
     class Other:
         def changes(self):
             return {'n_moons': 2}
     recorder = Recorder(tmp_path / 'run.mcap', Other())
     recorder.close()
-    with pytest.raises(RecordingError, match='its scenario is none: .*n_moons'):
+    with pytest.raises(RecordingError, match='invalid scenario: .*n_moons'):
         read_scenario(tmp_path / 'run.mcap')
 
 
-def test_a_place_that_is_not_there_is_named(tmp_path):
+def test_the_error_names_a_missing_folder(tmp_path):
     with pytest.raises(RecordingError, match='none/run.mcap: cannot be written: No such file'):
         Recorder(tmp_path / 'none' / 'run.mcap', Scenario())
 
 
-def test_without_the_library_the_error_says_so(tmp_path, monkeypatch):
+def test_the_error_names_the_missing_library(tmp_path, monkeypatch):
     for name in ('mcap.writer', 'mcap.reader'):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(RecordingError, match=r'^recording needs mcap.*pip install mcap'):
@@ -165,7 +165,7 @@ def test_without_the_library_the_error_says_so(tmp_path, monkeypatch):
 
 
 def filled(kind, rng):
-    """A message with a random value in every field."""
+    """Return a message with a random value in every field."""
     message = kind()
     for name, text in kind.get_fields_and_field_types().items():
         value = getattr(message, name)
@@ -190,11 +190,11 @@ def filled(kind, rng):
 
 
 def agree(ours, theirs):
-    """Whether two messages of different libraries have equal values in the same fields."""
+    """Return whether two messages of different libraries have the same fields and values."""
     if hasattr(ours, 'get_fields_and_field_types'):
         names = set(ours.get_fields_and_field_types())
         fields = {name for name in theirs.__dataclass_fields__ if name.islower()}
-        # Constants are in capitals.
+        # Names of constants are in upper case.
         return names == fields - {'__msgtype__'} and all(
             agree(getattr(ours, name), getattr(theirs, name)) for name in names)
     if isinstance(ours, list):
@@ -204,12 +204,12 @@ def agree(ours, theirs):
     return np.array_equal(np.asarray(ours), np.asarray(theirs))
 
 
-def test_all_topics_are_read_by_a_reader_of_bags(bench, probe, tmp_path):
-    """By the definitions in the file alone: types, counts and contents."""
+def test_rosbags_reads_all_topics(bench, probe, tmp_path):
+    """Types, counts and contents follow from the definitions in the file alone."""
     highlevel = pytest.importorskip('rosbags.highlevel', reason='there is no rosbags here')
     recorder, rng, sent = Recorder(tmp_path / 'all.mcap', Scenario()), np.random.default_rng(0), {}
     recorder.listen(probe)
-    for number, (name, (kind, profile)) in enumerate(outlets().items()):
+    for number, (name, (kind, profile)) in enumerate(recorded_topics().items()):
         publisher = probe.create_publisher(kind, name, profile)
         bench.until(publisher.get_subscription_count, 'the recorder')
         sent[f'/{name}'] = [filled(kind, rng) for _ in range(1 + number % 3)]
@@ -227,15 +227,15 @@ def test_all_topics_are_read_by_a_reader_of_bags(bench, probe, tmp_path):
                                    for policy in connection.ext.offered_qos_profiles]
                 for connection in reader.connections} == {
             f'/{name}': [profile.durability.short_key]
-            for name, (_, profile) in outlets().items()}
+            for name, (_, profile) in recorded_topics().items()}
         for connection, _, content in reader.messages():
             ours = sent[connection.topic].pop(0)
             assert agree(ours, reader.deserialize(content, connection.msgtype)), connection.topic
     assert not any(sent.values())
 
 
-def test_the_file_says_what_it_is(recording):
-    """As ``ros2 bag`` looks for it where there is no ``metadata.yaml``."""
+def test_the_file_declares_its_profile_and_encodings(recording):
+    """``ros2 bag`` reads them if there is no ``metadata.yaml``."""
     from mcap.reader import make_reader
     path, _ = recording
     with path.open('rb') as stream:
@@ -245,4 +245,4 @@ def test_the_file_says_what_it_is(recording):
     assert summary.statistics.message_count == 3
     assert {found.encoding for found in summary.schemas.values()} == {'ros2msg'}
     assert {channel.message_encoding for channel in summary.channels.values()} == {'cdr'}
-    assert len(summary.channels) == len(outlets())
+    assert len(summary.channels) == len(recorded_topics())

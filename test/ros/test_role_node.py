@@ -1,6 +1,5 @@
 """The adapter between a role and ROS 2."""
 
-import collections
 import itertools
 import math
 
@@ -10,41 +9,40 @@ from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Tick
+from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.role_node import RoleNode
 
 
-class Scripted:
-    """A role that notes what it is told and does what the test says."""
+class Scripted(PlainRole):
+    """A role that records its events and follows the script of the test."""
 
-    def __init__(self, script=lambda role, event, now_s: []):
-        self.counters = collections.Counter()
+    def __init__(self, script=lambda role, event, now_s: [], sends=(), receives=()):
+        super().__init__()
+        self.SENDS, self.RECEIVES = tuple(sends), tuple(receives)
         self.deadline_s = None
-        self.told = []
+        self.events = []
         self._script = script
 
     def handle(self, event, now_s):
-        self.told.append((event, now_s))
+        self.events.append((event, now_s))
         return self._script(self, event, now_s) or []
 
     def next_deadline(self):
         return self.deadline_s
 
-    def status(self):
-        return {}
-
     @property
     def ticks_s(self):
-        return [now_s for event, now_s in self.told if isinstance(event, Tick)]
+        return [now_s for event, now_s in self.events if isinstance(event, Tick)]
 
 
 @pytest.fixture
 def start():
-    """Function that puts a scripted role on a node of a bench."""
-    def start(bench, role, *, sends=(), receives=(), name='scripted', **options):
-        # The executable only decides about the parameters.
-        node = bench.add(RoleNode, 'channel', sends, name, **options)
-        node.start(role, receives)
+    """Function that starts a scripted role on a node of a bench."""
+    def start(bench, role, *, name='scripted', **options):
+        # The executable only determines the parameters.
+        node = bench.add(RoleNode, 'channel', name, **options)
+        node.start(role)
         return node
     return start
 
@@ -67,13 +65,13 @@ NAN = np.where(np.arange(24).reshape(8, 3) == 5, math.nan, 1.0 + 0j)
 ])
 def test_a_malformed_message_is_dropped_counted_and_logged_once(
         each_bench, start, capfd, changes, text):
-    role = Scripted()
-    start(each_bench, role, receives=(m.FeedSignals,))
-    outlet = each_bench.outlet(each_bench.add(Node, 'probe'), m.FeedSignals)
+    role = Scripted(receives=[m.FeedSignals])
+    start(each_bench, role)
+    publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.FeedSignals)
     for message in (feed_signals(**changes), feed_signals(**changes), feed_signals(user=7)):
-        outlet.publish(convert.to_ros(message, None))
-    each_bench.until(lambda: role.told, 'the good message')
-    (event, _), = role.told
+        publisher.publish(convert.to_ros(message, None))
+    each_bench.until(lambda: role.events, 'the good message')
+    (event, _), = role.events
     assert event.user == 7
     assert role.counters == {'malformed': 2}
     log = capfd.readouterr().err
@@ -81,84 +79,92 @@ def test_a_malformed_message_is_dropped_counted_and_logged_once(
     assert '[ERROR]' in log
 
 
-def test_what_does_not_even_convert_is_dropped_too(bench, start, probe, capfd):
-    role = Scripted()
-    start(bench, role, receives=(m.Data, m.FeedSignals))
-    data, feeds = bench.outlet(probe, m.Data), bench.outlet(probe, m.FeedSignals)
+def test_a_message_that_cannot_be_converted_is_dropped_too(bench, start, probe, capfd):
+    role = Scripted(receives=[m.Data, m.FeedSignals])
+    start(bench, role)
+    data, feeds = bench.publisher(probe, m.Data), bench.publisher(probe, m.FeedSignals)
     data.publish(convert.ros_type(m.Data)(direction=9))
     feeds.publish(convert.ros_type(m.FeedSignals)())
     bench.until(lambda: role.counters['malformed'] == 2, 'the second malformed message')
-    assert not role.told
+    assert not role.events
     log = capfd.readouterr().err
     assert 'dropped: Data.direction: 9 ' in log
     assert 'dropped: FeedSignals.signals: 0 values' in log
 
 
-def test_a_babbling_sender_does_not_fill_the_log(bench, start, probe, capfd):
-    role = Scripted()
-    start(bench, role, receives=(m.RhsCommand,))
-    outlet = bench.outlet(probe, m.RhsCommand)
+def test_many_malformed_messages_do_not_fill_the_log(bench, start, probe, capfd):
+    role = Scripted(receives=[m.RhsCommand])
+    start(bench, role)
+    publisher = bench.publisher(probe, m.RhsCommand)
     for part in range(10):
         for band in range(50):
             message = m.RhsCommand(1, 2 + 50 * part + band, '')
-            outlet.publish(convert.to_ros(message, None))
-        bench.until(lambda part=part: role.counters['malformed'] == 50 * (part + 1), 'them all')
+            publisher.publish(convert.to_ros(message, None))
+        bench.until(lambda part=part: role.counters['malformed'] == 50 * (part + 1), 'all of them')
     assert 1 <= capfd.readouterr().err.count('dropped: ') <= 100
 
 
-def test_a_wrong_message_of_the_role_is_not_published(each_bench, start, capfd):
+def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capfd):
     bad, good = m.FeedSignals(1, 1, 0, 0, NAN), feed_signals(user=2)
-    role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)])
-    node = start(each_bench, role, sends=(m.FeedSignals,))
-    heard = each_bench.hear(each_bench.add(Node, 'probe'), m.FeedSignals)
+    role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)],
+                    sends=[m.FeedSignals])
+    node = start(each_bench, role)
+    received = each_bench.collect(each_bench.add(Node, 'probe'), m.FeedSignals)
     node.dispatch(m.Ack(1, 1))
-    each_bench.until(lambda: heard, 'the good message')
-    assert [message.user for message in heard] == [2]
+    each_bench.until(lambda: received, 'the good message')
+    assert [message.user for message in received] == [2]
     log = capfd.readouterr().err
     assert log.count('not sent: FeedSignals.signals: not finite') == 1
     assert '[ERROR]' in log
 
 
-def test_notes_go_to_the_log(bench, start, capfd):
+def test_log_messages_are_logged_with_their_severity(bench, start, capfd):
     role = Scripted(
-        lambda role, event, now_s: [LogMessage('all is well'), LogMessage('beware', True)])
+        lambda role, event, now_s: [LogMessage('information'), LogMessage('a warning', True)])
     start(bench, role).dispatch(m.Ack(1, 1))
     first, second = capfd.readouterr().err.strip().splitlines()
     assert '[INFO]' in first
-    assert first.endswith('[scripted]: all is well')
+    assert first.endswith('[scripted]: information')
     assert '[WARN]' in second
-    assert second.endswith('[scripted]: beware')
+    assert second.endswith('[scripted]: a warning')
 
 
-def test_messages_go_through_in_their_order(each_bench, start):
+def test_messages_keep_their_order(each_bench, start):
     role = Scripted(lambda role, event, now_s: [
-        Send(m.Grant(event.cycle_id, event.user)), Send(m.Grant(event.cycle_id, 99))])
-    start(each_bench, role, sends=(m.Grant,), receives=(m.Ack,))
+        Send(m.Grant(event.cycle_id, event.user)), Send(m.Grant(event.cycle_id, 99))],
+        sends=[m.Grant], receives=[m.Ack])
+    start(each_bench, role)
     probe = each_bench.add(Node, 'probe')
-    heard = each_bench.hear(probe, m.Grant)
-    outlet = each_bench.outlet(probe, m.Ack)
+    received = each_bench.collect(probe, m.Grant)
+    publisher = each_bench.publisher(probe, m.Ack)
     for user in range(1, 51):
-        outlet.publish(convert.to_ros(m.Ack(3, user), None))
-    each_bench.until(lambda: len(heard) == 100, 'the last grant')
-    assert [message.user for message in heard] == [
+        publisher.publish(convert.to_ros(m.Ack(3, user), None))
+    each_bench.until(lambda: len(received) == 100, 'the last grant')
+    assert [message.user for message in received] == [
         user for number in range(1, 51) for user in (number, 99)]
 
 
-def test_listening_twice_hears_once(bench, start, probe):
-    role = Scripted()
-    node = start(bench, role, receives=(m.Ack,))
-    node.listen((m.Ack, m.Grant))
-    acks, grants = bench.outlet(probe, m.Ack), bench.outlet(probe, m.Grant)
-    assert acks.get_subscription_count() == 1
-    for outlet, kind in ((acks, m.Ack), (acks, m.Ack), (grants, m.Grant)):
-        outlet.publish(convert.to_ros(kind(1, 1), None))
-    bench.until(lambda: len(role.told) == 3, 'all messages')
-    assert collections.Counter(type(event) for event, _ in role.told) == {m.Ack: 2, m.Grant: 1}
+def test_a_role_may_connect_to_its_topics_later_and_only_once(bench, probe):
+    role = Scripted(sends=[m.Grant], receives=[m.Ack])
+    node = bench.add(RoleNode, 'channel', 'scripted')
+    node.start(role, advertise=False, subscribe=False)
+    assert not node.count_publishers('grant')
+    assert not node.count_subscribers('ack')
+    for _ in range(2):
+        node.advertise()
+        node.subscribe()
+    publisher = bench.publisher(probe, m.Ack)
+    assert node.count_publishers('grant') == publisher.get_subscription_count() == 1
+    for user in (1, 2):
+        publisher.publish(convert.to_ros(m.Ack(1, user), None))
+    bench.until(lambda: len(role.events) >= 2, 'both messages')
+    assert [event.user for event, _ in role.events] == [1, 2]
 
 
 def test_topics_follow_the_namespace_and_remapping(bench, start):
-    # What is remapped is written on the command line.
-    start(bench, Scripted(), sends=(m.Beacon, m.Grant), receives=(m.Ack,), namespace='/a',
+    # The command line defines the remapping.
+    role = Scripted(sends=[m.Beacon, m.Grant], receives=[m.Ack])
+    start(bench, role, namespace='/a',
           cli_args=['--ros-args', '-r', 'grant:=permit'], use_global_arguments=False)
     probe = bench.add(Node, 'probe')
     names = bench.until(lambda: {'/a/beacon', '/a/permit', '/a/ack'} <= {
@@ -168,75 +174,75 @@ def test_topics_follow_the_namespace_and_remapping(bench, start):
     assert probe.count_publishers('/a/beacon') == probe.count_publishers('/a/permit') == 1
 
 
-# Deadlines. How late a tick is depends on the machine, so that only "not early" is certain.
+# Deadlines. The delay of a tick depends on the machine; only that it is not early is certain.
 
 def deadlines(*delays_s):
-    """Script: each event sets the deadline this much after it; None sets none."""
-    rest = iter(delays_s)
+    """Return a role whose events set the deadline to a delay after them; None: no deadline."""
+    remaining = iter(delays_s)
 
     def script(role, event, now_s):
-        delay_s = next(rest, None)
+        delay_s = next(remaining, None)
         role.deadline_s = None if delay_s is None else now_s + delay_s
-        role.asked_s = [*getattr(role, 'asked_s', []), role.deadline_s]
+        role.deadlines_s = [*getattr(role, 'deadlines_s', []), role.deadline_s]
     return Scripted(script)
 
 
-def test_a_tick_comes_when_it_is_due(each_bench, start):
+def test_a_tick_follows_each_deadline(each_bench, start):
     role = deadlines(0.05, 0.02, 0.1)
     node = start(each_bench, role)
     node.dispatch(m.Ack(1, 1))
     assert not role.ticks_s
     each_bench.until(lambda: len(role.ticks_s) == 3, 'the last tick')
-    for asked_s, tick_s in zip(role.asked_s[:3], role.ticks_s, strict=True):
-        assert tick_s >= asked_s
+    for deadline_s, tick_s in zip(role.deadlines_s[:3], role.ticks_s, strict=True):
+        assert tick_s >= deadline_s
     assert role.deadline_s is None
 
 
-def test_a_deadline_that_moves_ahead_is_met(each_bench, start):
+def test_an_earlier_deadline_replaces_a_later_one(each_bench, start):
     role = deadlines(3000.0, 0.05)
     node = start(each_bench, role)
     node.dispatch(m.Ack(1, 1))
     node.dispatch(m.Ack(1, 1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
-    assert role.ticks_s[0] >= role.asked_s[1]
+    assert role.ticks_s[0] >= role.deadlines_s[1]
 
 
-def test_a_deadline_that_moves_back_is_met_once(each_bench, start):
+def test_a_later_deadline_replaces_an_earlier_one(each_bench, start):
     role = deadlines(0.02, 0.3)
     node = start(each_bench, role)
     node.dispatch(m.Ack(1, 1))
     node.dispatch(m.Ack(1, 1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
-    assert role.ticks_s[0] >= role.asked_s[1]
-    assert len(role.told) == 3
+    assert role.ticks_s[0] >= role.deadlines_s[1]
+    assert len(role.events) == 3
 
 
-def test_a_deadline_that_is_lifted_brings_no_tick(each_bench, start):
-    lifted, later = deadlines(0.02, None), deadlines(0.2)
-    node = start(each_bench, lifted)
+def test_a_cancelled_deadline_causes_no_tick(each_bench, start):
+    cancelled, later = deadlines(0.02, None), deadlines(0.2)
+    node = start(each_bench, cancelled)
     node.dispatch(m.Ack(1, 1))
     node.dispatch(m.Ack(1, 1))
     start(each_bench, later, name='later').dispatch(m.Ack(1, 1))
     each_bench.until(lambda: later.ticks_s, 'the later tick')
-    assert not lifted.ticks_s
-    # And the node takes a new one.
-    lifted._script = deadlines(0.02)._script
+    assert not cancelled.ticks_s
+    # The node accepts a new deadline afterwards.
+    cancelled._script = deadlines(0.02)._script
     node.dispatch(m.Ack(1, 1))
-    each_bench.until(lambda: lifted.ticks_s, 'the tick')
+    each_bench.until(lambda: cancelled.ticks_s, 'the tick')
 
 
-def test_a_deadline_in_the_past_brings_its_tick_at_once(bench, start):
+def test_a_deadline_in_the_past_causes_a_tick_at_once(bench, start):
     role = deadlines(-1.0, 0.0, -5.0, 0.02)
     node = start(bench, role)
     node.dispatch(m.Ack(1, 1))
-    assert [type(event) for event, _ in role.told] == [m.Ack, Tick, Tick, Tick]
+    assert [type(event) for event, _ in role.events] == [m.Ack, Tick, Tick, Tick]
     bench.until(lambda: len(role.ticks_s) == 4, 'the tick that was not due')
 
 
-def test_deadlines_go_on_while_messages_come(each_bench, start):
-    """Each of many messages moves the deadline, and between them many pass."""
+def test_deadlines_are_kept_while_messages_arrive(each_bench, start):
+    """Each of many messages changes the deadline, and many deadlines pass in between."""
     delays_s = itertools.cycle((0.002, 0.05, 0.0, 0.01, 3000.0, 0.001))
-    asked_s = []
+    deadlines_s = []
 
     def script(role, event, now_s):
         if isinstance(event, Tick):
@@ -244,36 +250,35 @@ def test_deadlines_go_on_while_messages_come(each_bench, start):
             role.deadline_s = None
             return
         role.deadline_s = now_s + next(delays_s)
-        asked_s.append(role.deadline_s)
+        deadlines_s.append(role.deadline_s)
 
-    role = Scripted(script)
-    start(each_bench, role, receives=(m.Ack,))
-    outlet = each_bench.outlet(each_bench.add(Node, 'probe'), m.Ack)
+    role = Scripted(script, receives=[m.Ack])
+    start(each_bench, role)
+    publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.Ack)
     for number in range(120):
-        outlet.publish(convert.to_ros(m.Ack(1, 1 + number), None))
-        # Those messages that set a short deadline get time to see it pass.
-        each_bench.until(lambda number=number: len(asked_s) > number and (
+        publisher.publish(convert.to_ros(m.Ack(1, 1 + number), None))
+        # Short deadlines get time to pass.
+        each_bench.until(lambda number=number: len(deadlines_s) > number and (
             number % 2 or role.deadline_s is None or number % 6 == 4), 'message or tick')
-    assert len(asked_s) == 120
+    assert len(deadlines_s) == 120
     assert len(role.ticks_s) >= 40
 
 
-def test_topic_of_every_message_is_the_listed_one(bench, start, probe):
-    start(bench, Scripted(), sends=topics.NAMES)
+def test_every_message_has_the_listed_topic(bench, start, probe):
+    start(bench, Scripted(sends=topics.NAMES))
     for name in topics.NAMES.values():
         bench.until(lambda name=name: probe.count_publishers(f'/{name}'), name)
 
 
-def test_who_joins_late_hears_the_present_statistics(bench, start):
-    node = start(bench, Scripted(), sends=(m.CapacityStatistics,))
+def test_a_late_joiner_receives_the_latest_statistics(bench, start):
+    node = start(bench, Scripted(sends=[m.CapacityStatistics]))
     for n in (1, 2):
         assert node.publish(m.CapacityStatistics(
             n, n, *(number * np.arange(3.0) for number in (3, 2, 4, 1, 5))))
-    late, heard = bench.add(Node, 'late'), []
+    late, received, kind = bench.add(Node, 'late'), [], m.CapacityStatistics
     late.create_subscription(
-        convert.ros_type(m.CapacityStatistics), topics.NAMES[m.CapacityStatistics], heard.append,
-        qos.LATCHED)
-    bench.until(lambda: heard, 'the statistics')
-    (message,) = heard
+        convert.ros_type(kind), topics.NAMES[kind], received.append, qos.LATCHED)
+    bench.until(lambda: received, 'the statistics')
+    (message,) = received
     assert message.n_reports == 2
     assert list(message.loss_percent) == [0, 5, 10]

@@ -1,4 +1,4 @@
-"""The node that shows a network."""
+"""The node that publishes the scene for RViz and Foxglove."""
 
 import math
 
@@ -16,101 +16,104 @@ from rhs_isac_ros.ros import convert, qos, topics
 
 @pytest.fixture
 def shown(bench, probe, small_files, request):
-    """What the node publishes, by namespace and id, always the latest."""
+    """Dictionary of the latest markers of the node, by namespace and id."""
     bench.add(VisualizerNode, parameter_overrides=[
         Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
         Parameter('period_s', value=0.02),
         Parameter('forget_s', value=getattr(request, 'param', 60.0))])
     latest = {}
 
-    def take(array):
-        # As RViz does: what is not taken away stays.
+    def receive(array):
+        # As in RViz, a marker stays until it is deleted.
         for marker in array.markers:
             if marker.action == Marker.DELETE:
                 del latest[marker.ns, marker.id]
             else:
                 latest[marker.ns, marker.id] = marker
-    probe.create_subscription(MarkerArray, topics.MARKERS, take, qos.EXCHANGE)
+    probe.create_subscription(MarkerArray, topics.MARKERS, receive, qos.EXCHANGE)
     return latest
 
 
-def test_the_scene_is_there_before_anybody_speaks(bench, shown):
+def test_the_scene_is_shown_before_any_message(bench, shown):
     bench.until(lambda: shown, 'markers')
     assert set(shown) == {('region', 0), ('board', 0)}
 
 
-def a_truth(user, x):
+def ground_truth(user, x):
     return m.GroundTruth(0, user, np.array([x, user, 0.0]), np.zeros(3))
 
 
-def test_users_and_estimates_come_as_they_are_told(bench, probe, shown):
-    truths, estimates = (bench.outlet(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
+def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
+    truths, estimates = (
+        bench.publisher(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()
     for user in (1, 2):
-        truths.publish(convert.to_ros(a_truth(user, 9.0), stamp))
+        truths.publish(convert.to_ros(ground_truth(user, 9.0), stamp))
     estimates.publish(convert.to_ros(m.PositionEstimate(
         1, 2, 'cb', np.array([8.0, 2.5, 0.1]), np.eye(3), 0.1, 'bayes', 0.01), stamp))
     bench.until(lambda: {('truth', 1), ('truth', 2), ('estimate', 2)} <= shown.keys(), 'the users')
     assert shown['truth', 2].pose.position.y == 2.0
     assert shown['estimate', 2].pose.position.x == 8.0
     assert shown['estimate', 2].type == Marker.SPHERE
-    truths.publish(convert.to_ros(a_truth(1, 9.5), stamp))
-    bench.until(lambda: shown['truth', 1].pose.position.x == 9.5, 'the step')
+    truths.publish(convert.to_ros(ground_truth(1, 9.5), stamp))
+    bench.until(lambda: shown['truth', 1].pose.position.x == 9.5, 'the new position')
 
 
-def test_the_board_takes_the_colours_of_its_configuration(bench, probe, shown, small):
-    outlet = bench.outlet(probe, m.RhsConfiguration)
+def test_the_board_has_the_colours_of_its_configuration(bench, probe, shown, small):
+    publisher = bench.publisher(probe, m.RhsConfiguration)
     scenario = small.scenario
     analog = np.ones((scenario.n_frames, scenario.n_elements))
-    outlet.publish(ros.RhsConfiguration(cycle_id=1))
-    outlet.publish(convert.to_ros(m.RhsConfiguration(1, m.Mode.POSITIONING, 0, 'cb', analog),
+    publisher.publish(ros.RhsConfiguration(cycle_id=1))
+    publisher.publish(convert.to_ros(m.RhsConfiguration(1, m.Mode.POSITIONING, 0, 'cb', analog),
                                   probe.get_clock().now().to_msg()))
     bench.until(lambda: shown and shown['board', 0].colors[0].r == 1.0, 'the colours')
 
 
 @pytest.mark.parametrize('shown', [0.5], indirect=True)
-def test_a_user_that_falls_silent_is_taken_away(bench, probe, shown, small):
-    """With its beam and its topics; one that goes on stays."""
-    truths, beams = (bench.outlet(probe, kind) for kind in (m.GroundTruth, m.Beam))
+def test_a_user_without_messages_is_removed(bench, probe, shown, small):
+    """Its beam and its topics are removed as well; the other user stays."""
+    truths, beams = (bench.publisher(probe, kind) for kind in (m.GroundTruth, m.Beam))
     stamp, sizes = probe.get_clock().now().to_msg(), small.scenario.sizes
     beam = m.Beam(1, 1, 'cb', 0, np.ones(sizes['N_E']),
                   np.ones((sizes['N_SB'], sizes['K']), complex), 1.0)
-    talking = {1, 2}
+    sending = {1, 2}
 
-    def talk():
-        for user in talking:
-            truths.publish(convert.to_ros(a_truth(user, 9.0), stamp))
-        if 1 in talking:
+    def send():
+        for user in sending:
+            truths.publish(convert.to_ros(ground_truth(user, 9.0), stamp))
+        if 1 in sending:
             beams.publish(convert.to_ros(beam, stamp))
-    probe.create_timer(0.05, talk)
+    probe.create_timer(0.05, send)
     bench.until(lambda: {('truth', 1), ('truth', 2), ('beam', 0)} <= shown.keys(), 'both users')
     lobe = np.array([[p.x, p.y, p.z] for p in shown['beam', 0].points])
     distance = math.hypot(*small.scenario.roi_center_m)
     assert np.linalg.norm(lobe, axis=1).max() == pytest.approx(distance)
-    talking.remove(1)
-    bench.until(lambda: ('truth', 1) not in shown, 'the end of user 1')
+    sending.remove(1)
+    bench.until(lambda: ('truth', 1) not in shown, 'removal of user 1')
     assert set(shown) == {('region', 0), ('board', 0), ('truth', 2)}
-    bench.until(lambda: not probe.count_publishers('users/user_1/true_path'), 'its path to end')
+    bench.until(lambda: not probe.count_publishers('users/user_1/true_path'),
+                'removal of its path')
     assert probe.count_publishers('users/user_2/true_path')
 
 
 def test_each_user_has_a_path(bench, probe, shown):
-    ways = {}
+    paths = {}
     for name in (topics.PATH, topics.TRUE_PATH):
         probe.create_subscription(
-            Path, name.format(user=7), lambda path, name=name: ways.update({name: path}),
+            Path, name.format(user=7), lambda path, name=name: paths.update({name: path}),
             qos.EXCHANGE)
-    truths, estimates = (bench.outlet(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
+    truths, estimates = (
+        bench.publisher(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()
     for cycle_id, x in enumerate((8.0, 8.5, 9.0), start=1):
-        truths.publish(convert.to_ros(a_truth(7, x), stamp))
+        truths.publish(convert.to_ros(ground_truth(7, x), stamp))
         estimates.publish(convert.to_ros(m.PositionEstimate(
             cycle_id, 7, 'cb', np.array([x + 0.1, 2.5, 0.1]), np.eye(3), 0.1, 'bayes', 0.01),
             stamp))
 
-    def places(name):
-        return [pose.pose.position.x for pose in ways[name].poses] if name in ways else []
-    bench.until(lambda: len(places(topics.PATH)) == len(places(topics.TRUE_PATH)) == 3, 'paths')
-    assert places(topics.TRUE_PATH) == [8.0, 8.5, 9.0]
-    assert places(topics.PATH) == [8.1, 8.6, 9.1]
-    assert ways[topics.PATH].header.frame_id == 'map'
+    def xs(name):
+        return [pose.pose.position.x for pose in paths[name].poses] if name in paths else []
+    bench.until(lambda: len(xs(topics.PATH)) == len(xs(topics.TRUE_PATH)) == 3, 'the paths')
+    assert xs(topics.TRUE_PATH) == [8.0, 8.5, 9.0]
+    assert xs(topics.PATH) == [8.1, 8.6, 9.1]
+    assert paths[topics.PATH].header.frame_id == 'map'

@@ -21,7 +21,7 @@ from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.monitoring.invariants import SETTLE_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.run import find_each_other_quickly
+from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import load_files, start_network
 from system.chaos import crashes, fuzzing, report, soaking
 from system.observer import NetworkObserver
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'error: {error}', file=sys.stderr)
         return 2
     os.environ.update(private_domain())
-    find_each_other_quickly()
+    use_discovery_profile()
     rclpy.init(args=[])
     observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:

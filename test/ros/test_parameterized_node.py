@@ -1,4 +1,4 @@
-"""Parameters that change while a node runs."""
+"""Changes of the parameters of a running node."""
 
 import math
 
@@ -14,35 +14,35 @@ from rhs_isac_ros.ros.parameters import NODES
 
 KINDS = {'bs': BsNode, 'channel': ChannelNode, 'positioner': PositionerNode,
          'transmission': TransmissionNode}
-HOT = [(executable, p) for executable, group in NODES.items() for p in group if p.dynamic]
+DYNAMIC = [(executable, p) for executable, group in NODES.items() for p in group if p.dynamic]
 
 
 @pytest.fixture
 def make(bench, small_files, tmp_path, monkeypatch):
-    """Function that makes a node, whose role only notes what it is offered in `offers`."""
+    """Return a function that creates a node which only records new settings, in `offered`."""
     def make(executable):
         values = {'scenario_file': str(small_files / 'scenario.yaml')}
         if executable == 'positioner':
             values['table_folder'] = str(tmp_path)
         node = bench.add(KINDS[executable], parameter_overrides=[
             Parameter(name, value=value) for name, value in values.items()])
-        node.offers = []
+        node.offered = []
 
-        def note(event):
+        def record(event):
             assert isinstance(event, SettingsOffered)
-            node.offers.append(event.settings)
-        monkeypatch.setattr(node, 'dispatch', note)
+            node.offered.append(event.settings)
+        monkeypatch.setattr(node, 'dispatch', record)
         return node
     return make
 
 
-def put(node, **values):
+def set_together(node, **values):
     return node.set_parameters_atomically(
         [Parameter(name, value=value) for name, value in values.items()])
 
 
 def wrong_values(p):
-    """Values that a parameter may not have: of another type, out of range, no choice."""
+    """Yield invalid values of a parameter: of another type, out of range, not a choice."""
     yield {bool: 'yes', int: 2.5, float: 3, str: 17}[type(p.default)]
     if p.low is not None:
         yield type(p.default)(p.high + 1)
@@ -53,22 +53,22 @@ def wrong_values(p):
         yield 'nonsense'
 
 
-@pytest.mark.parametrize(('executable', 'parameter'), HOT,
-                         ids=[f'{executable}-{p.name}' for executable, p in HOT])
-def test_what_was_not_declared_is_refused_with_a_reason(make, executable, parameter):
+@pytest.mark.parametrize(('executable', 'parameter'), DYNAMIC,
+                         ids=[f'{executable}-{p.name}' for executable, p in DYNAMIC])
+def test_an_invalid_value_is_refused_with_a_reason(make, executable, parameter):
     node = make(executable)
     before = node.get_parameter(parameter.name).value
     for wrong in wrong_values(parameter):
-        result = put(node, **{parameter.name: wrong})
+        result = set_together(node, **{parameter.name: wrong})
         assert not result.successful
         assert result.reason.startswith(
             f'{parameter.name}: {wrong!r}, expected {parameter.expected}')
-        # The other way to set one, from within the process.
+        # The node itself may also set parameters one by one.
         (result,) = node.set_parameters([Parameter(parameter.name, value=wrong)])
         assert not result.successful
-    assert not put(node, **{parameter.name: None}).successful
+    assert not set_together(node, **{parameter.name: None}).successful
     assert node.get_parameter(parameter.name).value == before
-    assert node.offers == []
+    assert node.offered == []
 
 
 @pytest.mark.parametrize(('executable', 'values', 'reason'), [
@@ -78,51 +78,51 @@ def test_what_was_not_declared_is_refused_with_a_reason(make, executable, parame
     ('positioner', {'estimator': 'neural', 'model_file': '/no/model.npz'},
      'model_file: /no/model.npz: '),
 ])
-def test_what_contradicts_scenario_files_or_other_parameters_is_refused(
+def test_a_value_that_contradicts_other_parameters_scenario_or_files_is_refused(
         make, executable, values, reason):
     node = make(executable)
-    result = put(node, **values)
+    result = set_together(node, **values)
     assert not result.successful
     assert result.reason.startswith(reason)
-    assert node.offers == []
+    assert node.offered == []
 
 
-def test_what_is_set_together_is_offered_together(make):
+def test_parameters_that_are_set_together_are_offered_together(make):
     node = make('channel')
-    assert put(node, delay_s=0.5, jitter_s=0.25).successful
-    assert put(node, loss_probability=0.125).successful
-    assert [(s.delay_s, s.jitter_s, s.loss_probability) for s in node.offers] == [
+    assert set_together(node, delay_s=0.5, jitter_s=0.25).successful
+    assert set_together(node, loss_probability=0.125).successful
+    assert [(s.delay_s, s.jitter_s, s.loss_probability) for s in node.offered] == [
         (0.5, 0.25, 0.0), (0.5, 0.25, 0.125)]
 
 
-def test_of_what_is_set_together_all_is_refused_or_nothing(make):
+def test_parameters_that_are_set_together_are_accepted_or_refused_together(make):
     node = make('bs')
-    result = put(node, policy='first', rest_s=-1.0)
+    result = set_together(node, policy='first', rest_s=-1.0)
     assert not result.successful
     assert result.reason.startswith('rest_s: -1.0, expected ')
     assert node.get_parameter('policy').value == 'round_robin'
-    result = put(node, policy='first', seed=3)
+    result = set_together(node, policy='first', seed=3)
     assert not result.successful
     assert 'read-only parameter: seed' in result.reason
-    assert put(node, rest_s=0.5).successful
-    assert [(s.policy, s.rest_s) for s in node.offers] == [('round_robin', 0.5)]
+    assert set_together(node, rest_s=0.5).successful
+    assert [(s.policy, s.rest_s) for s in node.offered] == [('round_robin', 0.5)]
 
 
-def test_other_parameters_of_a_node_are_none_of_its_business(make):
+def test_other_parameters_of_a_node_are_ignored(make):
     node = make('bs')
     node.declare_parameter('extra', 1)
-    assert put(node, extra=2).successful
-    assert node.offers == []
+    assert set_together(node, extra=2).successful
+    assert node.offered == []
 
 
-def test_what_is_in_use_can_be_restored_even_if_it_would_be_refused(make):
+def test_parameters_can_be_reverted_to_the_settings_in_use(make):
     node = make('positioner')
-    in_use = node.settings(node.values)
-    assert put(node, estimator='ml').successful
-    node.restore(in_use)
+    in_use = node.make_settings(node.values)
+    assert set_together(node, estimator='ml').successful
+    node.revert_parameters(in_use)
     assert node.get_parameter('estimator').value == 'bayes'
-    assert [s.estimator for s in node.offers] == ['ml']
-    # The next change is of what was restored; a model that nothing needs changes nothing.
-    assert put(node, model_file='somewhere').successful
-    assert node.offers[1:] == [in_use]
+    assert [s.estimator for s in node.offered] == ['ml']
+    # The next change starts from there; a model file has no effect on this estimator.
+    assert set_together(node, model_file='somewhere').successful
+    assert node.offered[1:] == [in_use]
     assert node.get_parameter('model_file').value == 'somewhere'

@@ -1,4 +1,4 @@
-"""Parameters of running nodes change between cycles, and no cycle is lost."""
+"""Parameters of running nodes change between cycles without the loss of a cycle."""
 
 import numpy as np
 import pytest
@@ -13,69 +13,69 @@ from rhs_isac_ros.positioning import Network
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import qos, topics
 
-SPACE = 'hot'
+NAMESPACE = 'dynamic'
 
 
 class Running:
-    """A running network, what its nodes tell, and how to set their parameters."""
+    """A running network: its diagnostics, and the parameters of its nodes."""
 
     def __init__(self, process, watch):
         self.process, self.watch = process, watch
-        self.told = {}
+        self.diagnostics = {}
         self._clients = {}
         watch.node.create_subscription(
-            DiagnosticArray, topics.DIAGNOSTICS, self._keep, qos.EXCHANGE)
+            DiagnosticArray, topics.DIAGNOSTICS, self._store, qos.EXCHANGE)
 
-    def _keep(self, message):
+    def _store(self, message):
         for status in message.status:
-            self.told[status.name.removeprefix(f'{SPACE}/')] = {
+            self.diagnostics[status.name.removeprefix(f'{NAMESPACE}/')] = {
                 pair.key: pair.value for pair in status.values}
 
     def set(self, node, **values):
-        """Set parameters together; the answer."""
+        """Set parameters together and return the result."""
         if node not in self._clients:
             self._clients[node] = AsyncParameterClient(self.watch.node, node)
         parameters = [Parameter(name, value=value) for name, value in values.items()]
-        return self.watch.answer(
+        return self.watch.call(
             self._clients[node],
             lambda client: client.set_parameters_atomically(parameters)).result
 
     def get(self, node, name):
-        (value,) = self.watch.answer(
+        (value,) = self.watch.call(
             self._clients[node], lambda client: client.get_parameters([name])).values
         return value.string_value
 
-    def until_told(self, *nodes, **values):
-        """Wait until nodes tell values from now on, of which None is for not telling any."""
+    def until_reported(self, *nodes, **values):
+        """Wait until new diagnostics of nodes have the given values; None: no value."""
         wanted = {name.replace('__', '.'): value for name, value in values.items()}
-        self.told.clear()
+        self.diagnostics.clear()
         self.watch.until(
-            lambda: all(node in self.told and all(
-                self.told[node].get(name) == value for name, value in wanted.items())
+            lambda: all(node in self.diagnostics and all(
+                self.diagnostics[node].get(name) == value for name, value in wanted.items())
                 for node in nodes),
             f'{wanted} of {nodes}', [self.process])
 
-    def estimators_from_now_on(self):
-        """Names by cycle, after two more cycles; those that were given up are none."""
-        before = len(self.watch.heard[m.PositionEstimate])
+    def next_estimators(self):
+        """Return the estimators, by cycle, of the cycles until two more are served."""
+        before = len(self.watch.received[m.PositionEstimate])
         self.watch.until_served(2, processes=[self.process])
-        return {e.cycle_id: e.estimator for e in self.watch.heard[m.PositionEstimate][before:]}
+        return {e.cycle_id: e.estimator for e in self.watch.received[m.PositionEstimate][before:]}
 
 
 @pytest.fixture(scope='module')
 def running(make_watch, module_processes, small_files):
     process = module_processes.start(
-        'network', namespace=f'/{SPACE}', users=2, rest_s=0.0,
+        'network', namespace=f'/{NAMESPACE}', users=2, rest_s=0.0,
         scenario_file=small_files / 'scenario.yaml',
         codebook_file=small_files / 'first.yaml')
-    running = Running(process, make_watch(f'/{SPACE}'))
+    running = Running(process, make_watch(f'/{NAMESPACE}'))
     running.watch.until_served(2, processes=[process])
     return running
 
 
 @pytest.fixture
 def model(small_files, tmp_path):
-    """Function that writes a model for a codebook and returns its file."""
+    """Return a function that writes a model for a codebook and returns its file."""
     def write(name):
         fields = yaml.safe_load((small_files / 'scenario.yaml').read_text(encoding='utf-8'))
         codebook = Codebook.load(small_files / f'{name}.yaml')
@@ -90,10 +90,10 @@ def model(small_files, tmp_path):
     return write
 
 
-def test_policy_and_noise_change_and_are_told(running):
+def test_changes_of_policy_and_noise_are_reported(running):
     before = len(running.watch.given_up)
     assert running.set('bs', policy='first', receiver_noise=False).successful
-    running.until_told('bs', parameter__policy='first', parameter__receiver_noise='false',
+    running.until_reported('bs', parameter__policy='first', parameter__receiver_noise='false',
                        pending__policy=None, pending__receiver_noise=None)
     assert running.set('bs', policy='round_robin', receiver_noise=True).successful
     running.watch.until_served(2, processes=[running.process])
@@ -111,64 +111,64 @@ def test_policy_and_noise_change_and_are_told(running):
     ('channel', {'loss_probability': 1.5}, 'loss_probability: 1.5, expected a number'),
     ('user_1', {'speed_mps': 2.0}, 'Trying to set a read-only parameter: speed_mps'),
 ])
-def test_what_is_wrong_is_refused_with_the_reason(running, node, values, reason):
+def test_an_invalid_value_is_refused_with_the_reason(running, node, values, reason):
     result = running.set(node, **values)
     assert not result.successful
     assert result.reason.startswith(reason)
 
 
-def test_an_estimator_changes_and_no_cycle_is_lost(running):
+def test_the_estimator_changes_without_the_loss_of_a_cycle(running):
     watch, before = running.watch, len(running.watch.given_up)
     for name in ('ml', 'bayes'):
         assert running.set('positioner', estimator=name).successful
-        running.until_told('positioner', parameter__estimator=name, pending__estimator=None)
-        assert set(running.estimators_from_now_on().values()) == {name}
+        running.until_reported('positioner', parameter__estimator=name, pending__estimator=None)
+        assert set(running.next_estimators().values()) == {name}
     names = {}
-    for estimate in watch.heard[m.PositionEstimate]:
+    for estimate in watch.received[m.PositionEstimate]:
         assert names.setdefault(estimate.cycle_id, estimate.estimator) == estimate.estimator
-    # One change there and one back.
+    # One change to the other estimator and one back.
     order = [names[cycle_id] for cycle_id in sorted(names)]
     assert sum(a != b for a, b in zip(order, order[1:], strict=False)) == 2
     assert len(watch.given_up) == before
 
 
-def test_a_model_that_does_not_fit_leaves_the_old_estimator(running, model):
+def test_a_model_for_another_codebook_keeps_the_old_estimator(running, model):
     before = len(running.watch.given_up)
     assert running.set('positioner', estimator='neural', model_file=model('second')).successful
-    running.until_told('positioner', parameter__estimator='bayes', pending__estimator=None)
-    assert 'trained for codebook' in running.told['positioner']['failed.estimator']
-    assert set(running.estimators_from_now_on().values()) == {'bayes'}
+    running.until_reported('positioner', parameter__estimator='bayes', pending__estimator=None)
+    assert 'trained for codebook' in running.diagnostics['positioner']['failed.estimator']
+    assert set(running.next_estimators().values()) == {'bayes'}
     assert running.get('positioner', 'estimator') == 'bayes'
     assert running.process.log.count('estimator neural not used, bayes stays') == 1
-    # One after the other: the model first.
+    # Set separately, the model comes first.
     assert running.set('positioner', model_file=model('first')).successful
     assert running.set('positioner', estimator='neural').successful
-    running.until_told('positioner', parameter__estimator='neural', failed__estimator=None)
-    assert set(running.estimators_from_now_on().values()) == {'neural'}
+    running.until_reported('positioner', parameter__estimator='neural', failed__estimator=None)
+    assert set(running.next_estimators().values()) == {'neural'}
     assert not running.set('positioner', model_file='').successful
     assert running.set('positioner', estimator='bayes', model_file='').successful
     assert len(running.watch.given_up) == before
 
 
-def test_band_and_air_change(running):
+def test_band_and_impairments_change(running):
     for band in (0, 1):
         assert running.set('transmission', band=band).successful
-        # The beam of a cycle under way may be heard after the answer.
+        # The beam of the present cycle may arrive after the response.
         running.watch.until_served(1, processes=[running.process])
-        before = len(running.watch.heard[m.Beam])
+        before = len(running.watch.received[m.Beam])
         running.watch.until_served(2, processes=[running.process])
-        assert {beam.band for beam in running.watch.heard[m.Beam][before:]} == {band}
+        assert {beam.band for beam in running.watch.received[m.Beam][before:]} == {band}
     assert running.set('transmission', band=-1).successful
     assert running.set('channel', double_probability=1.0, delay_s=0.001).successful
     running.watch.until_served(2, processes=[running.process])
-    running.until_told('channel', parameter__double_probability='1.0',
+    running.until_reported('channel', parameter__double_probability='1.0',
                        parameter__delay_s='0.001', pending__delay_s=None)
-    assert int(running.told['channel']['dropped.emulated_double']) > 0
+    assert int(running.diagnostics['channel']['dropped.emulated_double']) > 0
     assert running.set('channel', double_probability=0.0, delay_s=0.0).successful
 
 
-def test_the_codebook_in_use_is_told(running, small_files):
+def test_the_codebook_in_use_is_reported(running, small_files):
     second = Codebook.load(small_files / 'second.yaml')
     assert running.set('optimizer', **second.to_parameters()).successful
-    running.until_told('optimizer', 'bs', 'rhs_controller', 'positioner', 'transmission',
+    running.until_reported('optimizer', 'bs', 'rhs_controller', 'positioner', 'transmission',
                        codebook_id=second.id, pending__codebook_id=None)

@@ -1,4 +1,4 @@
-"""How nodes get the codebook from the parameters of the optimizer."""
+"""The client of the codebook that the optimizer holds."""
 
 import types
 
@@ -10,23 +10,23 @@ from rclpy.parameter import Parameter
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.ros.codebook_source import CodebookSource
+from rhs_isac_ros.ros.codebook_client import CodebookClient
 
 
 @pytest.fixture
 def follow(bench):
-    """Function that makes a client and returns the list of codebooks that it gets."""
+    """Return a function that creates a client and returns the list of its codebooks."""
     def follow(scenario=None, name='client', **options):
         got = []
         node = bench.add(Node, name, **options)
-        CodebookSource(node, scenario or Scenario(), got.append)
+        CodebookClient(node, scenario or Scenario(), got.append)
         return got
     return follow
 
 
 @pytest.fixture
 def optimizer_of(bench, small_files):
-    """Function that makes an optimizer with a codebook of the small scenario."""
+    """Return a function that creates an optimizer with a codebook of the small scenario."""
     def optimizer_of(name, **options):
         files = {'scenario_file': 'scenario', 'codebook_file': name}
         return bench.add(OptimizerNode, parameter_overrides=[
@@ -50,7 +50,7 @@ def change(optimizer, codebook):
     assert result.successful, result.reason
 
 
-def test_the_codebook_comes_bit_for_bit_and_once(bench, follow, shipped):
+def test_the_codebook_arrives_once_and_bit_for_bit(bench, follow, shipped):
     bench.add(OptimizerNode)
     got = follow()
     bench.until(lambda: got, 'the codebook')
@@ -64,9 +64,9 @@ def test_the_codebook_comes_bit_for_bit_and_once(bench, follow, shipped):
     assert len(got) == len(later) == 1
 
 
-def test_a_client_that_is_first_waits(bench, follow, shipped):
+def test_a_client_waits_for_the_optimizer(bench, follow, shipped):
     got = follow()
-    # It has asked in vain by the time that another client has what it wants.
+    # Its first requests have failed by the time another client has its codebook.
     other = follow(name='other', namespace='/there')
     bench.add(OptimizerNode, namespace='/there')
     bench.until(lambda: other, 'the codebook in the other namespace')
@@ -76,7 +76,7 @@ def test_a_client_that_is_first_waits(bench, follow, shipped):
     assert ids(got) == [shipped.id]
 
 
-def test_changes_are_followed(bench, follow, optimizer_of, stored, small):
+def test_each_change_is_fetched(bench, follow, optimizer_of, stored, small):
     optimizer = optimizer_of('first')
     got = follow(small.scenario)
     bench.until(lambda: len(got) == 1, 'the first codebook')
@@ -87,7 +87,7 @@ def test_changes_are_followed(bench, follow, optimizer_of, stored, small):
     assert ids(got) == [stored[name].id for name in ('first', 'second', 'first')]
 
 
-def test_the_last_of_many_changes_holds(bench, follow, optimizer_of, random_beams, small):
+def test_the_last_of_many_changes_is_fetched(bench, follow, optimizer_of, random_beams, small):
     optimizer = optimizer_of('first')
     got = follow(small.scenario)
     bench.until(lambda: got, 'the first codebook')
@@ -98,38 +98,38 @@ def test_the_last_of_many_changes_holds(bench, follow, optimizer_of, random_beam
     bench.until(lambda: got[-1].id == last.id, 'the last codebook')
 
 
-def test_a_change_that_is_taken_back_while_it_is_fetched_does_not_stay(
+def test_a_change_that_is_reverted_while_it_is_fetched_does_not_stay(
         bench, follow, optimizer_of, stored, small, monkeypatch):
     optimizer = optimizer_of('first')
     got = follow(small.scenario)
     bench.until(lambda: got, 'the first codebook')
     read, done = optimizer.get_parameter, []
 
-    def take_back(name):
-        """Read a parameter; after the last of an answer, change it before the answer leaves."""
+    def revert(name):
+        """Read a parameter; revert the change before the response is sent."""
         value = read(name)
         if name == 'codebook.digital_im' and not done:
             done.append(name)
             change(optimizer, stored['first'])
         return value
     change(optimizer, stored['second'])
-    monkeypatch.setattr(optimizer, 'get_parameter', take_back)
+    monkeypatch.setattr(optimizer, 'get_parameter', revert)
     bench.until(lambda: done, 'the change')
-    # Another client has asked later, so that what was under way has come.
+    # The request of another client was later, so pending responses have arrived.
     other = follow(small.scenario, 'other')
     bench.until(lambda: other, 'the codebook of the other client')
-    bench.until(lambda: got[-1].id == stored['first'].id, 'the codebook that holds')
+    bench.until(lambda: got[-1].id == stored['first'].id, 'the current codebook')
     assert ids(other) == [stored['first'].id]
 
 
-def test_what_does_not_change_the_arrays_is_no_new_codebook(
+def test_a_change_of_other_parameters_is_not_a_new_codebook(
         bench, follow, optimizer_of, stored, small):
     optimizer = optimizer_of('first')
     got = follow(small.scenario)
     bench.until(lambda: got, 'the first codebook')
     result, = optimizer.set_parameters([Parameter('codebook.average_crlb', value=0.5)])
     assert result.successful
-    # By the time that another client has asked, this one has asked again.
+    # This client has sent another request by the time another client has its codebook.
     other = follow(small.scenario, 'other')
     bench.until(lambda: other, 'the first codebook of the other client')
     change(optimizer, stored['second'])
@@ -137,7 +137,7 @@ def test_what_does_not_change_the_arrays_is_no_new_codebook(
     assert ids(got) == [stored['first'].id, stored['second'].id]
 
 
-def test_events_of_other_nodes_are_none_of_its_business(
+def test_optimizers_of_other_namespaces_are_ignored(
         bench, follow, optimizer_of, stored, small):
     here, there = optimizer_of('first'), optimizer_of('first', namespace='/there')
     got = follow(small.scenario)
@@ -150,17 +150,17 @@ def test_events_of_other_nodes_are_none_of_its_business(
     assert ids(got) == ids(far) == [stored['first'].id, stored['second'].id]
 
 
-def test_a_codebook_that_does_not_fit_is_refused_and_the_node_stays(
+def test_a_codebook_that_does_not_fit_is_refused_with_one_error(
         bench, follow, optimizer_of, stored, small, random_beams, capfd):
-    misfit = bench.add(OptimizerNode)
+    unsuitable = bench.add(OptimizerNode)
     got = follow(small.scenario)
     witness = follow(name='witness')
     log = []
 
-    def complaint():
+    def has_error():
         log.append(capfd.readouterr().err)
         return 'not used' in ''.join(log)
-    bench.until(complaint, 'the complaint')
+    bench.until(has_error, 'the error')
     text = next(line for line in ''.join(log).splitlines() if 'not used' in line)
     assert '[ERROR]' in text
     assert 'optimizer' in text
@@ -169,10 +169,10 @@ def test_a_codebook_that_does_not_fit_is_refused_and_the_node_stays(
     assert f'analog: shape (2, 4, 100), expected [N_B, F, N_E] = {expected}' in text
     assert not got
     bench.until(lambda: witness, 'the codebook where it fits')
-    # The same complaint once more is not worth another line.
-    change(misfit, random_beams(Scenario(), np.random.default_rng(0)))
+    # The same error again is not logged.
+    change(unsuitable, random_beams(Scenario(), np.random.default_rng(0)))
     bench.until(lambda: len(witness) == 2, 'the change')
-    bench.remove(misfit)
+    bench.remove(unsuitable)
     optimizer = optimizer_of('first')
     change(optimizer, stored['second'])
     bench.until(lambda: got, 'the codebook that fits')
@@ -182,7 +182,7 @@ def test_a_codebook_that_does_not_fit_is_refused_and_the_node_stays(
                for line in ''.join(log).splitlines()) == 1
 
 
-def test_an_optimizer_that_is_restarted_is_followed(bench, follow, optimizer_of, stored, small):
+def test_a_restarted_optimizer_is_followed(bench, follow, optimizer_of, stored, small):
     optimizer = optimizer_of('first')
     got = follow(small.scenario)
     bench.until(lambda: got, 'the first codebook')
@@ -192,12 +192,12 @@ def test_an_optimizer_that_is_restarted_is_followed(bench, follow, optimizer_of,
     assert ids(got) == [stored['first'].id, stored['second'].id]
 
 
-def test_an_optimizer_in_the_same_process_is_never_taken_for_dead(bench, shipped):
-    """Fast DDS says that it is, once its lease is over."""
+def test_an_optimizer_in_the_same_process_counts_as_present(bench, shipped):
+    """Fast DDS reports it dead when its lease expires."""
     bench.add(OptimizerNode)
-    got, held = [], []
+    got, presence = [], []
     node = bench.add(Node, 'client')
-    source = CodebookSource(node, Scenario(), got.append, held.append)
+    client = CodebookClient(node, Scenario(), got.append, presence.append)
     bench.until(lambda: got, 'the codebook')
-    source._on_liveliness(types.SimpleNamespace(alive_count=0))
-    assert held == []
+    client._on_liveliness(types.SimpleNamespace(alive_count=0))
+    assert presence == []

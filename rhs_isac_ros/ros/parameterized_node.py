@@ -1,0 +1,113 @@
+"""A node with declared parameters, some of which may change while it runs."""
+
+import dataclasses
+import types
+from collections.abc import Iterable
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros.parameter import ParameterError
+
+
+class ParameterizedNode(Node):
+    """A node that checks each change of its parameters as a whole and converts it to settings.
+
+    Parameters
+    ----------
+    executable
+        Name of the executable, which determines the parameters.
+    name
+        Name of the node; by default that of the executable.
+
+    Attributes
+    ----------
+    values
+        Initial values of the parameters, by name.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is wrong.
+    """
+
+    def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
+        super().__init__(name or executable, **node_options)
+        self.values = parameters.declare(self, executable)
+        self._dynamic = {parameter.name: parameter for parameter in parameters.NODES[executable]
+                         if parameter.dynamic}
+        self._current_values = self.values
+        # The settings made by the last check; the change that was checked may still be rejected.
+        self._checked_settings: Any = None
+        self._is_reverting = False
+        self.add_on_set_parameters_callback(self._check)
+        self.add_post_set_parameters_callback(self._on_set)
+
+    def make_settings(self, values: types.SimpleNamespace) -> Any:
+        """Return the settings for parameter values; nodes with dynamic parameters override this.
+
+        Returns
+        -------
+        Any
+            A dataclass whose fields have the names of parameters.
+
+        Raises
+        ------
+        ParameterError
+            If the values contradict each other, the scenario or a file.
+        """
+        return None
+
+    def on_settings_changed(self, settings: Any) -> None:
+        """Handle new settings, made from parameters that were just set."""
+
+    def revert_parameters(self, settings: Any) -> None:
+        """Set the parameters back to the settings in use, which are not checked again."""
+        self._is_reverting = True
+        try:
+            self.set_parameters_atomically([
+                Parameter(name, value=value)
+                for name, value in dataclasses.asdict(settings).items() if name in self._dynamic])
+        finally:
+            self._is_reverting = False
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters together, as the parameter services do.
+
+        The reason of a rejection names value and range, which the reasons of rclpy do not.
+        """
+        try:
+            self._check_each(parameter_list)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return super().set_parameters_atomically(parameter_list)
+
+    def _dynamic_values(self, changes: Iterable[Parameter]) -> dict[str, Any]:
+        return {p.name: p.value for p in changes if p.name in self._dynamic}
+
+    def _check_each(self, changes: Iterable[Parameter]) -> None:
+        for name, value in self._dynamic_values(changes).items():
+            self._dynamic[name].check(value)
+
+    def _with(self, changes: Iterable[Parameter]) -> types.SimpleNamespace:
+        return types.SimpleNamespace(
+            **{**vars(self._current_values), **self._dynamic_values(changes)})
+
+    def _check(self, changes: list[Parameter]) -> SetParametersResult:
+        if self._dynamic_values(changes) and not self._is_reverting:
+            try:
+                self._check_each(changes)
+                self._checked_settings = self.make_settings(self._with(changes))
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _on_set(self, changes: list[Parameter]) -> None:
+        if not self._dynamic_values(changes):
+            return
+        self._current_values = self._with(changes)
+        if not self._is_reverting:
+            self.on_settings_changed(self._checked_settings)
