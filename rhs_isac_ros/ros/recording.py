@@ -20,6 +20,7 @@ from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.subscriptions import subscribe
 
@@ -107,9 +108,10 @@ class Recorder:
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
         try:
-            from mcap.writer import Writer
-        except ImportError:
-            raise RecordingError(_missing('recording')) from None
+            with optional_import('recording', extra='recording'):
+                from mcap.writer import Writer
+        except MissingLibraryError as error:
+            raise RecordingError(str(error)) from None
         self._path = Path(path)
         self._partial = self._path.with_name(f'{self._path.name}.part')
         try:
@@ -211,10 +213,11 @@ def read_scenario(path: str | Path) -> Scenario | None:
 def _opened(path: str | Path) -> Iterator[Any]:
     """Yield a reader and convert its exceptions to `RecordingError`."""
     try:
-        from mcap.exceptions import McapError
-        from mcap.reader import make_reader
-    except ImportError:
-        raise RecordingError(_missing('reading a recording')) from None
+        with optional_import('reading a recording', extra='recording'):
+            from mcap.exceptions import McapError
+            from mcap.reader import make_reader
+    except MissingLibraryError as error:
+        raise RecordingError(str(error)) from None
     try:
         with Path(path).open('rb') as stream:
             yield make_reader(stream)
@@ -222,7 +225,3 @@ def _opened(path: str | Path) -> Iterator[Any]:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except McapError as error:
         raise RecordingError(f'{path}: not a complete recording: {error!r}') from None
-
-
-def _missing(purpose: str) -> str:
-    return f'{purpose} needs mcap, which is not installed (pip install mcap)'

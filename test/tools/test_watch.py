@@ -110,4 +110,4 @@ def test_a_missing_library_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'rich', None)
     assert main(['--once']) == 1
     assert capsys.readouterr().err == (
-        'error: watch needs rich, which is not installed (pip install rich)\n')
+        "error: watch needs rich, which is not installed (pip install 'rhs_isac_ros[watch]')\n")
