@@ -285,7 +285,7 @@ class Network:
         """What the roles that are there have counted, without those that counted nothing."""
         return {name: dict(role.counters) for name, role in self._roles.items() if role.counters}
 
-    def said(self, name: str) -> list[str]:
+    def logged(self, name: str) -> list[str]:
         return [said.note.text for said in self.notes if said.speaker == name]
 
     def verify(self) -> None:

@@ -49,7 +49,8 @@ class Radio(PlainRole):
                 configuration = self._applied[pilot.band][pilot.frame]
                 feeds = self._measure(pilot.band, configuration, pilot)
                 answers.append(Send(m.FeedSignals(
-                    pilot.cycle_id, pilot.user, pilot.band, pilot.frame, feeds)))
+                    cycle_id=pilot.cycle_id, user=pilot.user, band=pilot.band, frame=pilot.frame,
+                    signals=feeds)))
             else:
                 # Of a cycle that nobody finished, these fall out at the other end.
                 self._waiting.append(pilot)

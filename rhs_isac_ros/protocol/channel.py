@@ -156,7 +156,8 @@ class Channel(PlainRole):
             cycle.los[band], cycle.multipath[band][:, pilot.frame],
             complex(pilot.symbol_re, pilot.symbol_im))
         feeds = feed_signals(self._scenario, band, applied[pilot.frame], elements)
-        return m.FeedSignals(pilot.cycle_id, pilot.user, band, pilot.frame, feeds)
+        return m.FeedSignals(
+            cycle_id=pilot.cycle_id, user=pilot.user, band=band, frame=pilot.frame, signals=feeds)
 
     def _deliver(self, data: m.Data, cycle: _Cycle) -> m.Data | None:
         """Pass on what the true channel's capacity carries, and drop the rest."""

@@ -44,7 +44,7 @@ class Phase(enum.IntEnum):
     TRANSMITTING = 3
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Message:
     """Anything that travels between the nodes."""
 
@@ -84,28 +84,28 @@ def same(one: Message, other: Message) -> bool:
         for field in dataclasses.fields(one))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Beacon(Message):
     """The base station invites users to a cycle."""
 
     attempt: int
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Ack(Message):
     """A user wants to be served."""
 
     user: int = number(1, _LAST_USER)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Grant(Message):
     """The cycle belongs to a user."""
 
     user: int = number(1, _LAST_USER)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class RhsCommand(Message):
     """The surface is to apply the codebook's configurations of a band."""
 
@@ -113,7 +113,7 @@ class RhsCommand(Message):
     codebook_id: str
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class RhsConfiguration(Message):
     """What the surface applies."""
 
@@ -138,7 +138,7 @@ class RhsConfiguration(Message):
         return {'FRAMES': sizes['F'] if self.mode is Mode.POSITIONING else 1}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PilotRequest(Message):
     """The user is to send the pilots of a band."""
 
@@ -147,7 +147,7 @@ class PilotRequest(Message):
     n_frames: int = size('F')
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Pilot(Message):
     """One unit symbol of the user."""
 
@@ -158,7 +158,7 @@ class Pilot(Message):
     symbol_im: float
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class FeedSignals(Message):
     """The signals at the feeds for one pilot."""
 
@@ -168,7 +168,7 @@ class FeedSignals(Message):
     signals: np.ndarray = array('N_SB K', complex)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class ReceivedSignals(Message):
     """The combined signals of a positioning phase."""
 
@@ -177,7 +177,7 @@ class ReceivedSignals(Message):
     signals: np.ndarray = array('N_B N_SB F', complex)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PositionEstimate(Message):
     """Where the user is."""
 
@@ -190,7 +190,7 @@ class PositionEstimate(Message):
     latency_s: float = number(0, 3600)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class NoFix(Message):
     """The received signals tell no position."""
 
@@ -199,7 +199,7 @@ class NoFix(Message):
     reason: str
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Beam(Message):
     """The beam of the transmission phase."""
 
@@ -211,7 +211,7 @@ class Beam(Message):
     expected_bps: float = number(0, _MOST_BITS)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Data(Message):
     """Payload of the transmission phase."""
 
@@ -222,7 +222,7 @@ class Data(Message):
     bits: float = number(0, _MOST_BITS)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Capacity(Message):
     """What the beam of a cycle carries."""
 
@@ -237,7 +237,7 @@ class Capacity(Message):
     at_estimate_bps: float = number(0, _MOST_BITS)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CapacityStatistics(Message):
     """Lower quartile, median and upper quartile of what the newest beams carry."""
 
@@ -249,7 +249,7 @@ class CapacityStatistics(Message):
     loss_percent: np.ndarray = array('3')
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class GroundTruth(Message):
     """Where the user really is."""
 
@@ -258,7 +258,7 @@ class GroundTruth(Message):
     velocity: np.ndarray = array('3')
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class ProtocolState(Message):
     """A change of phase."""
 

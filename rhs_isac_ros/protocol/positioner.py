@@ -132,7 +132,7 @@ class Positioner(PlainRole):
     def _take_settings(self, settings: PositionerSettings) -> list[Action]:
         self._settings.newest, self._failure = settings, ''
         if self._codebook is None:
-            return self._settings.settle()
+            return self._settings.apply()
         return self._want(_Job(self._codebook, settings))
 
     def _want(self, job: _Job) -> list[Action]:
@@ -210,13 +210,15 @@ class Positioner(PlainRole):
         self._is_lost = False
         bound = float(crlb(self._scenario, job.codebook, estimate.mean[None], factors)[0])
         return [Send(m.PositionEstimate(
-            received.cycle_id, received.user, received.codebook_id,
-            np.array(estimate.mean), np.array(estimate.covariance), bound, estimator.name,
-            latency_s))]
+            cycle_id=received.cycle_id, user=received.user, codebook_id=received.codebook_id,
+            position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
+            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))]
 
     def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
         self.counters['no_fix'] += 1
-        sent = Send(m.NoFix(received.cycle_id, received.user, received.codebook_id, reason))
+        sent = Send(m.NoFix(
+            cycle_id=received.cycle_id, user=received.user, codebook_id=received.codebook_id,
+            reason=reason))
         note = LogMessage(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)
         said, self._is_lost = self._is_lost, True
         return [sent] if said else [sent, note]

@@ -77,7 +77,7 @@ class Transmission(PlainRole):
             case SettingsOffered(settings):
                 # What belongs to a cycle that has a beam stays with its bands.
                 self._settings.newest = settings
-                return self._settings.settle()
+                return self._settings.apply()
             case m.GroundTruth() if event.cycle_id:
                 _put(self._truths, event.cycle_id, event)
             case m.PositionEstimate() if event.codebook_id not in self._codebooks:
@@ -115,8 +115,9 @@ class Transmission(PlainRole):
         choice = choose_beam(self._scenario, estimate.position, estimate.covariance_m2, bands)
         beam = choice.beam
         sent = m.Beam(
-            estimate.cycle_id, estimate.user, estimate.codebook_id, beam.band, beam.analog,
-            beam.digital, choice.expected_bps)
+            cycle_id=estimate.cycle_id, user=estimate.user, codebook_id=estimate.codebook_id,
+            band=beam.band, analog=beam.analog, digital=beam.digital,
+            expected_bps=choice.expected_bps)
         at_estimate_bps = float(capacity(self._scenario, beam, estimate.position[None])[0])
         _put(self._estimates, estimate.cycle_id, estimate)
         _put(self._beams, estimate.cycle_id, _Steered(sent, at_estimate_bps, bands))
@@ -136,9 +137,10 @@ class Transmission(PlainRole):
             used = Beam(applied.analog[0], beam.digital, beam.band)
             result = outcome(self._scenario, used, truth.position, bands)
         report = m.Capacity(
-            beam.cycle_id, beam.user, beam.codebook_id, beam.band, beam.expected_bps,
-            result.actual_bps, result.perfect_bps, result.loss_bps, result.loss_percent,
-            at_estimate_bps)
+            cycle_id=beam.cycle_id, user=beam.user, codebook_id=beam.codebook_id, band=beam.band,
+            expected_bps=beam.expected_bps, actual_bps=result.actual_bps,
+            perfect_bps=result.perfect_bps, loss_bps=result.loss_bps,
+            loss_percent=result.loss_percent, at_estimate_bps=at_estimate_bps)
         return [Send(report), *self._summarise(report)]
 
     def _summarise(self, report: m.Capacity) -> list[Action]:
@@ -148,7 +150,8 @@ class Transmission(PlainRole):
         _put(self._counted, report.cycle_id, True)
         self._quartiles.add([getattr(report, name) for name in _FIGURES])
         figures = dict(zip(_FIGURES, self._quartiles.quartiles(), strict=True))
-        return [Send(m.CapacityStatistics(report.cycle_id, len(self._quartiles), **figures))]
+        return [Send(m.CapacityStatistics(
+            cycle_id=report.cycle_id, n_reports=len(self._quartiles), **figures))]
 
 
 def _put(items: dict, cycle_id: int, item: Any) -> None:

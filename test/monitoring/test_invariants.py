@@ -10,7 +10,7 @@ from rhs_isac_ros.monitoring.invariants import RECEIVES, InvariantChecker
 from rhs_isac_ros.protocol import messages as m
 
 # Of a cycle without results: what came before it is judged.
-END = m.Grant(0, 1)
+END = m.Grant(cycle_id=0, user=1)
 
 
 @pytest.fixture
@@ -58,9 +58,9 @@ def test_a_result_is_judged_when_nothing_more_can_come(heard):
     for message in sorted(first, key=lambda message: not isinstance(message, m.PositionEstimate)):
         promises.add(message, 5.0)
     assert promises.checked == 0
-    promises.add(m.Grant(2, 1), 5.9)
+    promises.add(m.Grant(cycle_id=2, user=1), 5.9)
     assert promises.checked == 0
-    promises.add(m.Grant(2, 1), 6.1)
+    promises.add(m.Grant(cycle_id=2, user=1), 6.1)
     assert promises.checked == 2
     assert promises.broken == []
 
@@ -145,5 +145,5 @@ def test_what_a_new_publisher_said_before_it_was_heard_is_not_missed(heard):
 def test_it_forgets_old_cycles(heard):
     promises = InvariantChecker(heard.scenario)
     for cycle_id in range(1000):
-        promises.add(m.Grant(cycle_id, 1), 0.0)
+        promises.add(m.Grant(cycle_id=cycle_id, user=1), 0.0)
     assert len(promises._cycles) <= 64

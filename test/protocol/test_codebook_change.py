@@ -3,7 +3,7 @@
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 
 IN_A_CYCLE = [State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING,
               State.STEERING, State.TRANSMITTING]
@@ -92,7 +92,7 @@ def test_a_role_that_has_the_new_codebook_late_costs_one_cycle(network, codebook
 def test_the_base_station_waits_for_a_codebook(network, codebooks, scenario):
     net = network(codebook=None)
     net.run(limit_s=10.0)
-    assert net.said('bs') == ['waiting for codebook']
+    assert net.logged('bs') == ['waiting for codebook']
     assert net.sent(m.Beacon) == []
     net.offer(codebooks[1])
     net.run_cycles(1)
@@ -102,16 +102,16 @@ def test_the_base_station_waits_for_a_codebook(network, codebooks, scenario):
 
 def test_without_role_and_codebook_both_are_named(network):
     net = network(codebook=None, absent=['channel'])
-    assert net.said('bs') == ['waiting for channel, codebook']
+    assert net.logged('bs') == ['waiting for channel, codebook']
     net.add('channel')
-    assert net.said('bs')[1:] == ['waiting for codebook']
+    assert net.logged('bs')[1:] == ['waiting for codebook']
 
 
 def test_the_positioner_tells_when_it_is_ready(network, codebooks):
     net = network()
     net.offer(codebooks[1])
     net.offer(codebooks[1])
-    assert net.said('positioner') == [
+    assert net.logged('positioner') == [
         f'centre is ready for codebook {c.id} after 0.0 s' for c in codebooks[:2]]
 
 

@@ -11,7 +11,7 @@ from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, st
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 
 PACKAGE = Path(rhs_isac_ros.__file__).parent
 # What one cycle puts on the bus, for two bands of two frames.
@@ -273,7 +273,9 @@ def test_the_position_is_estimated_without_the_true_one(network, places):
     """Only what the user radiates tells where it is: a false report changes nothing but losses."""
     def lie_to_transmission(message, recipient):
         if isinstance(message, m.GroundTruth) and recipient == 'transmission':
-            return [(1e-3, m.GroundTruth(message.cycle_id, message.user, places[4], np.zeros(3)))]
+            return [(1e-3, m.GroundTruth(
+                cycle_id=message.cycle_id, user=message.user, position=places[4],
+                velocity=np.zeros(3)))]
         return [(1e-3, message)]
 
     honest, deceived = network(), network(transport=lie_to_transmission)

@@ -10,7 +10,7 @@ from rhs_isac_ros.model import mobility
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.events import PeersChanged
 
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
@@ -383,7 +383,7 @@ def test_one_complaint_for_a_codebook_that_the_surface_does_not_know(network, ex
     for _ in range(3):
         net.publish(example(m.RhsCommand, cycle_id=2, codebook_id='strange'))
     net.run_cycles(1)
-    complaints = [text for text in net.said('rhs_controller') if 'strange' in text]
+    complaints = [text for text in net.logged('rhs_controller') if 'strange' in text]
     assert len(complaints) == 1
     assert net['rhs_controller'].counters == {'wrong_codebook': 3}
 
@@ -510,16 +510,16 @@ def test_the_base_station_waits_for_a_role_and_says_so_once(network, role):
     net.run(limit_s=30.0)
     assert net.sent(m.Beacon) == []
     assert net['bs'].state is State.WAITING
-    assert net.said('bs') == [f'waiting for {role}']
+    assert net.logged('bs') == [f'waiting for {role}']
     net.add(role)
     net.run_cycles(2)
     assert net.served() == [1, 1]
-    assert net.said('bs') == [f'waiting for {role}']
+    assert net.logged('bs') == [f'waiting for {role}']
     if role == 'channel':
         assert net.counters() == {}
     else:
         assert net.counters() == {'user1': {'no_beacon': 1}}
-        assert net.said('user1')[1:] == ['no beacon for 3 s', 'called again']
+        assert net.logged('user1')[1:] == ['no beacon for 3 s', 'beacons resumed']
 
 
 def test_every_change_of_what_is_missing_is_said_once(network):
@@ -531,13 +531,13 @@ def test_every_change_of_what_is_missing_is_said_once(network):
     net.run(limit_s=5.0)
     net.add('positioner')
     net.add('transmission')
-    assert net.said('bs') == [
+    assert net.logged('bs') == [
         'waiting for channel, positioner', 'waiting for positioner',
         'waiting for positioner, transmission', 'waiting for transmission']
     net.run_cycles(1)
     net.remove('transmission')
     net.run(limit_s=5.0)
-    assert net.said('bs')[4:] == ['waiting for transmission']
+    assert net.logged('bs')[4:] == ['waiting for transmission']
 
 
 def test_what_is_missing_is_not_said_again_for_news_that_change_nothing(network, codebooks):
@@ -545,7 +545,7 @@ def test_what_is_missing_is_not_said_again_for_news_that_change_nothing(network,
     for codebook in codebooks:
         net.offer(codebook)
         net.dispatch('bs', PeersChanged(('positioner',)))
-    assert net.said('bs') == ['waiting for positioner']
+    assert net.logged('bs') == ['waiting for positioner']
 
 
 def test_a_role_that_is_missing_for_a_moment_between_cycles_costs_nothing(network):
@@ -554,21 +554,21 @@ def test_a_role_that_is_missing_for_a_moment_between_cycles_costs_nothing(networ
     net.restart('positioner', noticed=True)
     net.run_cycles(2)
     assert net.served() == [1, 1, 1]
-    assert net.said('bs') == []
+    assert net.logged('bs') == []
 
 
 def test_a_user_without_a_base_station_waits_and_says_so_once(network):
     net = network(absent=['bs'])
     net.run(limit_s=30.0)
-    assert net.said('user1') == ['waiting for bs']
+    assert net.logged('user1') == ['waiting for bs']
     assert net['user1'].state is user_role.State.DISCONNECTED
-    net.publish(m.Beacon(7, 0))
+    net.publish(m.Beacon(cycle_id=7, attempt=0))
     net.run(limit_s=1.0)
     assert net.sent(m.Ack) == []
     net.add('bs')
     net.run_cycles(1)
     assert net.served() == [1]
-    assert net.said('user1') == ['waiting for bs', 'listening for beacons']
+    assert net.logged('user1') == ['waiting for bs', 'listening for beacons']
 
 
 @pytest.mark.parametrize('noticed', [True, False])
@@ -612,7 +612,7 @@ def test_a_base_station_that_is_gone_leaves_the_users_alone(network):
     net.remove('bs')
     assert [net[u].state for u in ('user1', 'user2')] == [user_role.State.DISCONNECTED] * 2
     net.run(limit_s=5.0)
-    assert net.said('user1')[-1] == 'waiting for bs'
+    assert net.logged('user1')[-1] == 'waiting for bs'
 
 
 @pytest.mark.parametrize(('loss', 'seed'), [(0.05, 1), (0.2, 2), (0.2, 3)])
@@ -712,7 +712,7 @@ def test_a_base_station_that_nobody_answers_notices_that_a_role_dies(network):
     net.remove('positioner')
     net.run(limit_s=2.0)
     assert net['bs'].state is State.WAITING
-    assert net.said('bs') == ['waiting for positioner']
+    assert net.logged('bs') == ['waiting for positioner']
     net.add('positioner')
     net.run(limit_s=2.0)
     assert net['bs'].state is State.BEACONING
@@ -724,9 +724,9 @@ def test_a_user_that_answers_no_more_is_told_of_once(network):
     net.remove('user2', noticed=False)
     net.run_cycles(8)
     # It may be in the middle of a cycle of its own when it dies.
-    assert net.said('bs') == ['user 2 answers no more']
+    assert net.logged('bs') == ['user 2 no longer answers']
     assert net['bs'].counters['user_lost'] == 1
     net.add('user2')
     net.run_cycles(4)
     assert set(net.served()[-2:]) == {1, 2}
-    assert net.said('bs') == ['user 2 answers no more']
+    assert net.logged('bs') == ['user 2 no longer answers']

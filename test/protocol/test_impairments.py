@@ -27,7 +27,8 @@ def impaired():
 
 def through(role, n):
     """Cycle numbers in the order of their arrival, of n messages sent at time 0."""
-    arrived = [action for cycle in range(n) for action in role.handle(m.Beacon(cycle, 0), 0.0)]
+    arrived = [action for cycle in range(n) for action in role.handle(m.Beacon(
+        cycle_id=cycle, attempt=0), 0.0)]
     while (due_s := role.next_deadline()) is not None:
         arrived += role.handle(Tick(), due_s)
     assert sum(isinstance(action, LogMessage) for action in arrived) == n
@@ -37,7 +38,7 @@ def through(role, n):
 def test_an_ideal_air_changes_nothing(impaired):
     role = impaired()
     (sent, note) = sorted(
-        role.handle(m.Beacon(5, 0), 1.0), key=lambda a: isinstance(a, LogMessage))
+        role.handle(m.Beacon(cycle_id=5, attempt=0), 1.0), key=lambda a: isinstance(a, LogMessage))
     assert (sent.message.cycle_id, note.text) == (5, 'heard')
     assert role.next_deadline() is None
     assert role.counters == {}
@@ -57,7 +58,7 @@ def test_losses_and_doubles_are_as_probable_as_told_and_counted(impaired):
 
 def test_each_takes_its_time_and_they_overtake_each_other(impaired):
     role = impaired(delay_s=0.5, jitter_s=0.2)
-    role.handle(m.Beacon(1, 0), 10.0)
+    role.handle(m.Beacon(cycle_id=1, attempt=0), 10.0)
     due_s = role.next_deadline()
     assert 10.5 <= due_s <= 10.7
     assert role.handle(Tick(), due_s - 1e-6) == []

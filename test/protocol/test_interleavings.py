@@ -14,7 +14,7 @@ from rhs_isac_ros.link import Beam, Outcome
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import transmission
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 
 STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
 # Faults end after so long; then everyone has to be served within the other.

@@ -109,10 +109,12 @@ def test_steps_that_are_slow_but_in_time_lose_nothing(network, slow):
 
 def test_what_another_user_got_in_an_older_cycle_does_not_matter(network):
     user = network()['user1']
-    user.handle(m.Beacon(8, 0), 0.0)
-    user.handle(m.Data(7, 2, m.Direction.DOWNLINK, m.Stage.DELIVERED, 1e-3, 1e3), 0.1)
+    user.handle(m.Beacon(cycle_id=8, attempt=0), 0.0)
+    user.handle(m.Data(
+        cycle_id=7, user=2, direction=m.Direction.DOWNLINK, stage=m.Stage.DELIVERED,
+        duration_s=1e-3, bits=1e3), 0.1)
     assert user.state is State.ACKNOWLEDGED
-    (send,) = user.handle(m.Grant(8, 1), 0.2)
+    (send,) = user.handle(m.Grant(cycle_id=8, user=1), 0.2)
     assert isinstance(send.message, m.GroundTruth)
 
 

@@ -38,39 +38,48 @@ def feed(role, events):
 
 @pytest.fixture
 def truth():
-    return m.GroundTruth(3, 1, PLACE, np.zeros(3))
+    return m.GroundTruth(cycle_id=3, user=1, position=PLACE, velocity=np.zeros(3))
 
 
 @pytest.fixture
 def configuration(codebooks):
-    return m.RhsConfiguration(3, m.Mode.POSITIONING, 0, codebooks[0].id, codebooks[0].analog[0])
+    return m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.POSITIONING, band=0, codebook_id=codebooks[0].id,
+        analog=codebooks[0].analog[0])
 
 
 @pytest.fixture
 def pilots():
-    return [m.Pilot(3, 1, 0, frame, 1.0, 0.0) for frame in (0, 1)]
+    return [m.Pilot(
+        cycle_id=3, user=1, band=0, frame=frame, symbol_re=1.0, symbol_im=0.0) for frame in (0, 1)]
 
 
 @pytest.fixture
 def beam(scenario):
     found = steer(scenario, PLACE)
-    return m.Beam(3, 1, 'x', 0, found.analog, found.digital, 5e6)
+    return m.Beam(
+        cycle_id=3, user=1, codebook_id='x', band=0, analog=found.analog, digital=found.digital,
+        expected_bps=5e6)
 
 
 @pytest.fixture
 def applied(beam):
-    return m.RhsConfiguration(3, m.Mode.TRANSMISSION, 0, 'x', beam.analog[None])
+    return m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=beam.analog[None])
 
 
 def configured(beam):
     """What the surface reports once it has applied a beam."""
     return m.RhsConfiguration(
-        beam.cycle_id, m.Mode.TRANSMISSION, beam.band, beam.codebook_id, beam.analog[None])
+        cycle_id=beam.cycle_id, mode=m.Mode.TRANSMISSION, band=beam.band,
+        codebook_id=beam.codebook_id, analog=beam.analog[None])
 
 
 @pytest.fixture
 def downlink():
-    return m.Data(3, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1e-3, 1e9)
+    return m.Data(
+        cycle_id=3, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED, duration_s=1e-3,
+        bits=1e9)
 
 
 def test_they_wait_for_messages_only(scenario):
@@ -98,8 +107,10 @@ def test_the_channel_answers_pilots_in_whatever_order_things_come(
 
 def test_feed_signals_follow_configuration_and_symbol(scenario, truth, configuration, pilots):
     def signals(analog, symbol):
-        report = m.RhsConfiguration(3, m.Mode.POSITIONING, 0, 'x', analog)
-        pilot = m.Pilot(3, 1, 0, 0, symbol.real, symbol.imag)
+        report = m.RhsConfiguration(
+            cycle_id=3, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=analog)
+        pilot = m.Pilot(
+            cycle_id=3, user=1, band=0, frame=0, symbol_re=symbol.real, symbol_im=symbol.imag)
         (feeds,) = feed(Channel(scenario, 0), [truth, report, pilot])[-1]
         return feeds.signals
 
@@ -116,9 +127,12 @@ def test_feed_signals_follow_configuration_and_symbol(scenario, truth, configura
 def test_the_multipath_has_no_mean_and_the_line_of_sight_is_one(scenario, configuration, pilots):
     sums, n = 0, 400
     for cycle_id in range(1, n + 1):
-        events = [m.GroundTruth(cycle_id, 1, PLACE, np.zeros(3)),
-                  m.RhsConfiguration(cycle_id, m.Mode.POSITIONING, 0, 'x', np.ones((2, 16))),
-                  m.Pilot(cycle_id, 1, 0, 0, 1.0, 0.0)]
+        events = [m.GroundTruth(cycle_id=cycle_id, user=1, position=PLACE, velocity=np.zeros(3)),
+                  m.RhsConfiguration(
+                      cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0, codebook_id='x',
+                      analog=np.ones((2, 16))),
+                  m.Pilot(
+                      cycle_id=cycle_id, user=1, band=0, frame=0, symbol_re=1.0, symbol_im=0.0)]
         ((feeds,),) = feed(Channel(scenario, 0), events)[-1:]
         sums = sums + np.array([feeds.signals, np.abs(feeds.signals)**2])
     mean, power = sums / n
@@ -141,16 +155,18 @@ def test_a_pilot_of_another_cycle_is_not_answered_and_forgotten_with_the_cycle(
         scenario, truth, configuration, example, cycle_id):
     channel = Channel(scenario, 0)
     pilot = example(m.Pilot, cycle_id=cycle_id, user=1)
-    later = m.GroundTruth(5, 1, PLACE, np.zeros(3))
+    later = m.GroundTruth(cycle_id=5, user=1, position=PLACE, velocity=np.zeros(3))
     assert feed(channel, [truth, configuration, pilot, later]) == [[]] * 4
     assert channel.counters == {'stale': 1}
 
 
 def test_a_pilot_of_the_next_cycle_waits_for_it(scenario, truth, configuration, codebooks):
     channel = Channel(scenario, 0)
-    later = m.RhsConfiguration(4, m.Mode.POSITIONING, 0, 'x', configuration.analog)
-    events = [truth, configuration, m.Pilot(4, 1, 0, 0, 1.0, 0.0), later,
-              m.GroundTruth(4, 1, PLACE, np.zeros(3))]
+    later = m.RhsConfiguration(
+        cycle_id=4, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=configuration.analog)
+    events = [truth, configuration, m.Pilot(
+        cycle_id=4, user=1, band=0, frame=0, symbol_re=1.0, symbol_im=0.0), later,
+              m.GroundTruth(cycle_id=4, user=1, position=PLACE, velocity=np.zeros(3))]
     sent = feed(channel, events)
     assert sent[:4] == [[]] * 4
     assert [f.cycle_id for f in sent[4]] == [4]
@@ -171,14 +187,17 @@ def test_the_channel_carries_what_the_capacity_at_the_true_position_allows(
     ((delivered,),) = feed(channel, [downlink])
     assert delivered.bits == math.floor(rate * 1e-3)
     assert (delivered.direction, delivered.stage) == (m.Direction.DOWNLINK, m.Stage.DELIVERED)
-    few = m.Data(3, 1, m.Direction.UPLINK, m.Stage.OFFERED, 1e-3, 10.0)
+    few = m.Data(
+        cycle_id=3, user=1, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED, duration_s=1e-3,
+        bits=10.0)
     ((delivered,),) = feed(channel, [few])
     assert (delivered.direction, delivered.bits) == (m.Direction.UPLINK, 10.0)
 
 
 def test_the_channel_carries_what_the_surface_reports_not_what_was_asked(
         scenario, truth, beam, downlink):
-    off = m.RhsConfiguration(3, m.Mode.TRANSMISSION, 0, 'x', np.zeros((1, 16)))
+    off = m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=np.zeros((1, 16)))
     (_, _, _, (delivered,)) = feed(Channel(scenario, 0), [truth, beam, off, downlink])
     assert delivered.bits == 0
 
@@ -372,7 +391,8 @@ def test_the_transmission_reports_what_the_applied_beam_carries(
     ((beam,),) = feed(transmission, [estimate])
     assert (beam.cycle_id, beam.user, beam.codebook_id) == (3, 1, estimate.codebook_id)
     weaker = m.RhsConfiguration(
-        3, m.Mode.TRANSMISSION, beam.band, beam.codebook_id, beam.analog[None] / 2)
+        cycle_id=3, mode=m.Mode.TRANSMISSION, band=beam.band, codebook_id=beam.codebook_id,
+        analog=beam.analog[None] / 2)
     (_, (report, _)) = feed(transmission, [truth, weaker])
     used = Beam(beam.analog / 2, beam.digital)
     assert report.actual_bps == pytest.approx(capacity(scenario, used, PLACE[None])[0])
@@ -388,7 +408,7 @@ def test_no_beam_is_better_than_the_perfect_one(transmission, scenario, codebook
         estimate = example(m.PositionEstimate, cycle_id=cycle_id, user=1, position=near,
                            codebook_id=codebooks[0].id)
         ((beam,),) = feed(transmission, [estimate])
-        truth = m.GroundTruth(cycle_id, 1, place, np.zeros(3))
+        truth = m.GroundTruth(cycle_id=cycle_id, user=1, position=place, velocity=np.zeros(3))
         applied = configured(beam)
         (_, (report, _)) = feed(transmission, [truth, applied])
         assert -0.05 <= report.loss_percent < 100
@@ -449,8 +469,10 @@ def reported(transmission, scenario, example, codebook, places, cycle_id=1):
                            position=place + [0.0, 0.5, 0.0], covariance_m2=0.1 * np.eye(3))
         ((beam,),) = feed(transmission, [estimate])
         applied = m.RhsConfiguration(
-            n, m.Mode.TRANSMISSION, beam.band, codebook.id, beam.analog[None])
-        sent.append(feed(transmission, [m.GroundTruth(n, 1, place, np.zeros(3)), applied])[1])
+            cycle_id=n, mode=m.Mode.TRANSMISSION, band=beam.band, codebook_id=codebook.id,
+            analog=beam.analog[None])
+        sent.append(feed(transmission, [m.GroundTruth(
+            cycle_id=n, user=1, position=place, velocity=np.zeros(3)), applied])[1])
     return sent
 
 
@@ -472,7 +494,8 @@ def test_a_report_that_is_repeated_counts_once(transmission, scenario, example, 
     ((report, statistics),) = reported(transmission, scenario, example, codebooks[0], [place])
     assert statistics.n_reports == 1
     applied = m.RhsConfiguration(
-        1, m.Mode.TRANSMISSION, report.band, report.codebook_id, np.ones((1, 16)))
+        cycle_id=1, mode=m.Mode.TRANSMISSION, band=report.band, codebook_id=report.codebook_id,
+        analog=np.ones((1, 16)))
     ((again,),) = feed(transmission, [applied])
     assert isinstance(again, m.Capacity)
     ((_, statistics),) = reported(

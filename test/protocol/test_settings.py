@@ -39,15 +39,15 @@ def test_what_is_no_list_of_users_is_refused(users):
         BaseStationSettings(allowed_users=users)
 
 
-def test_the_newest_settings_wait_until_they_are_settled():
+def test_the_newest_settings_are_pending_until_they_are_applied():
     old, new = PositionerSettings(), PositionerSettings('ml')
-    standing = PendingSettings(old)
-    assert standing.settle() == []
-    standing.newest = PositionerSettings('neural')
-    standing.newest = new
-    assert standing.in_use == old
-    assert standing.describe()['pending.estimator'] == 'ml'
-    assert standing.settle() == [LogMessage("from now on: estimator 'ml'")]
-    assert standing.in_use == new
-    assert 'pending.estimator' not in standing.describe()
-    assert standing.settle() == []
+    pending = PendingSettings(old)
+    assert pending.apply() == []
+    pending.newest = PositionerSettings('neural')
+    pending.newest = new
+    assert pending.in_use == old
+    assert pending.describe()['pending.estimator'] == 'ml'
+    assert pending.apply() == [LogMessage("from now on: estimator 'ml'")]
+    assert pending.in_use == new
+    assert 'pending.estimator' not in pending.describe()
+    assert pending.apply() == []

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
@@ -41,7 +41,7 @@ def test_noise_holds_for_whole_cycles(network, state):
     net.run_cycles(3)
     assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
     assert told(net, 'bs', 'pending') == {}
-    assert net.said('bs') == ["from now on: receiver_noise 'false'"]
+    assert net.logged('bs') == ["from now on: receiver_noise 'false'"]
     # The reference signals are with the noise that held at the grant.
     net.verify()
     first = 4 if waits else 3
@@ -152,7 +152,7 @@ def test_an_estimator_that_cannot_be_made_leaves_the_old_one(network, make_s):
     assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
     assert set(estimators(net).values()) == {'centre'}
     assert net.kept == [PositionerSettings()]
-    assert net.said('positioner')[1:] == [
+    assert net.logged('positioner')[1:] == [
         'estimator neural not used, bayes stays: model_file: unfit']
     assert told(net, 'positioner', 'pending') == {}
     assert told(net, 'positioner', 'failed') == {
@@ -190,7 +190,7 @@ def test_that_an_estimator_fails_which_nobody_wants_any_more_is_not_told(network
     net.run(limit_s=5.0)
     assert list(estimators(net).values())[-1] == 'ml'
     assert net.kept == []
-    assert not [text for text in net.said('positioner') if 'not used' in text]
+    assert not [text for text in net.logged('positioner') if 'not used' in text]
     assert told(net, 'positioner', 'failed') == {}
 
 

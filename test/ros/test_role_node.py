@@ -100,18 +100,19 @@ def test_a_babbling_sender_does_not_fill_the_log(bench, start, probe, capfd):
     outlet = bench.outlet(probe, m.RhsCommand)
     for part in range(10):
         for band in range(50):
-            message = m.RhsCommand(1, 2 + 50 * part + band, '')
+            message = m.RhsCommand(cycle_id=1, band=2 + 50 * part + band, codebook_id='')
             outlet.publish(convert.to_ros(message, None))
         bench.until(lambda part=part: role.counters['malformed'] == 50 * (part + 1), 'them all')
     assert 1 <= capfd.readouterr().err.count('dropped: ') <= 100
 
 
 def test_a_wrong_message_of_the_role_is_not_published(each_bench, start, capfd):
-    bad, good = m.FeedSignals(1, 1, 0, 0, NAN), feed_signals(user=2)
+    bad, good = m.FeedSignals(
+        cycle_id=1, user=1, band=0, frame=0, signals=NAN), feed_signals(user=2)
     role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)])
     node = start(each_bench, role, sends=(m.FeedSignals,))
     heard = each_bench.hear(each_bench.add(Node, 'probe'), m.FeedSignals)
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: heard, 'the good message')
     assert [message.user for message in heard] == [2]
     log = capfd.readouterr().err
@@ -122,7 +123,7 @@ def test_a_wrong_message_of_the_role_is_not_published(each_bench, start, capfd):
 def test_notes_go_to_the_log(bench, start, capfd):
     role = Scripted(
         lambda role, event, now_s: [LogMessage('all is well'), LogMessage('beware', True)])
-    start(bench, role).dispatch(m.Ack(1, 1))
+    start(bench, role).dispatch(m.Ack(cycle_id=1, user=1))
     first, second = capfd.readouterr().err.strip().splitlines()
     assert '[INFO]' in first
     assert first.endswith('[scripted]: all is well')
@@ -132,13 +133,15 @@ def test_notes_go_to_the_log(bench, start, capfd):
 
 def test_messages_go_through_in_their_order(each_bench, start):
     role = Scripted(lambda role, event, now_s: [
-        Send(m.Grant(event.cycle_id, event.user)), Send(m.Grant(event.cycle_id, 99))])
+        Send(m.Grant(
+            cycle_id=event.cycle_id,
+            user=event.user)), Send(m.Grant(cycle_id=event.cycle_id, user=99))])
     start(each_bench, role, sends=(m.Grant,), receives=(m.Ack,))
     probe = each_bench.add(Node, 'probe')
     heard = each_bench.hear(probe, m.Grant)
     outlet = each_bench.outlet(probe, m.Ack)
     for user in range(1, 51):
-        outlet.publish(convert.to_ros(m.Ack(3, user), None))
+        outlet.publish(convert.to_ros(m.Ack(cycle_id=3, user=user), None))
     each_bench.until(lambda: len(heard) == 100, 'the last grant')
     assert [message.user for message in heard] == [
         user for number in range(1, 51) for user in (number, 99)]
@@ -184,7 +187,7 @@ def deadlines(*delays_s):
 def test_a_tick_comes_when_it_is_due(each_bench, start):
     role = deadlines(0.05, 0.02, 0.1)
     node = start(each_bench, role)
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     assert not role.ticks_s
     each_bench.until(lambda: len(role.ticks_s) == 3, 'the last tick')
     for asked_s, tick_s in zip(role.asked_s[:3], role.ticks_s, strict=True):
@@ -195,8 +198,8 @@ def test_a_tick_comes_when_it_is_due(each_bench, start):
 def test_a_deadline_that_moves_ahead_is_met(each_bench, start):
     role = deadlines(3000.0, 0.05)
     node = start(each_bench, role)
-    node.dispatch(m.Ack(1, 1))
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
     assert role.ticks_s[0] >= role.asked_s[1]
 
@@ -204,8 +207,8 @@ def test_a_deadline_that_moves_ahead_is_met(each_bench, start):
 def test_a_deadline_that_moves_back_is_met_once(each_bench, start):
     role = deadlines(0.02, 0.3)
     node = start(each_bench, role)
-    node.dispatch(m.Ack(1, 1))
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
     assert role.ticks_s[0] >= role.asked_s[1]
     assert len(role.told) == 3
@@ -214,21 +217,21 @@ def test_a_deadline_that_moves_back_is_met_once(each_bench, start):
 def test_a_deadline_that_is_lifted_brings_no_tick(each_bench, start):
     lifted, later = deadlines(0.02, None), deadlines(0.2)
     node = start(each_bench, lifted)
-    node.dispatch(m.Ack(1, 1))
-    node.dispatch(m.Ack(1, 1))
-    start(each_bench, later, name='later').dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    start(each_bench, later, name='later').dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: later.ticks_s, 'the later tick')
     assert not lifted.ticks_s
     # And the node takes a new one.
     lifted._script = deadlines(0.02)._script
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: lifted.ticks_s, 'the tick')
 
 
 def test_a_deadline_in_the_past_brings_its_tick_at_once(bench, start):
     role = deadlines(-1.0, 0.0, -5.0, 0.02)
     node = start(bench, role)
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     assert [type(event) for event, _ in role.told] == [m.Ack, Tick, Tick, Tick]
     bench.until(lambda: len(role.ticks_s) == 4, 'the tick that was not due')
 
@@ -250,7 +253,7 @@ def test_deadlines_go_on_while_messages_come(each_bench, start):
     start(each_bench, role, receives=(m.Ack,))
     outlet = each_bench.outlet(each_bench.add(Node, 'probe'), m.Ack)
     for number in range(120):
-        outlet.publish(convert.to_ros(m.Ack(1, 1 + number), None))
+        outlet.publish(convert.to_ros(m.Ack(cycle_id=1, user=1 + number), None))
         # Those messages that set a short deadline get time to see it pass.
         each_bench.until(lambda number=number: len(asked_s) > number and (
             number % 2 or role.deadline_s is None or number % 6 == 4), 'message or tick')
@@ -267,8 +270,10 @@ def test_topic_of_every_message_is_the_listed_one(bench, start, probe):
 def test_who_joins_late_hears_the_present_statistics(bench, start):
     node = start(bench, Scripted(), sends=(m.CapacityStatistics,))
     for n in (1, 2):
-        assert node.publish(m.CapacityStatistics(
-            n, n, *(number * np.arange(3.0) for number in (3, 2, 4, 1, 5))))
+        figures = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
+        assert node.publish(m.CapacityStatistics(cycle_id=n, n_reports=n, **{
+            name: number * np.arange(3.0)
+            for name, number in zip(figures, (3, 2, 4, 1, 5), strict=True)}))
     late, heard = bench.add(Node, 'late'), []
     late.create_subscription(
         convert.ros_type(m.CapacityStatistics), topics.NAMES[m.CapacityStatistics], heard.append,
