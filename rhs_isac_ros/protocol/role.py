@@ -1,13 +1,65 @@
-"""What all roles have in common."""
+"""The interface of the roles, and what all of them have in common."""
 
 import collections
+import enum
 from collections.abc import Mapping
+from typing import Protocol
 
+from rhs_isac_ros.protocol.events import Action, Event
+from rhs_isac_ros.protocol.messages import Message
 from rhs_isac_ros.protocol.outcomes import Outcome
 
 
+class Role(Protocol):
+    """A role of the protocol: it turns events into actions and reads no clock.
+
+    Attributes
+    ----------
+    counters
+        Number of occurrences of each outcome and of each kind of unexpected event.
+    """
+
+    counters: collections.Counter[str]
+
+    @property
+    def SENDS(self) -> tuple[type[Message], ...]:
+        """Messages that the role sends."""
+        ...
+
+    @property
+    def RECEIVES(self) -> tuple[type[Message], ...]:
+        """Messages that the role handles."""
+        ...
+
+    @property
+    def LACKING(self) -> frozenset[enum.Enum]:
+        """States in which something that the role needs is missing."""
+        ...
+
+    @property
+    def state(self) -> enum.Enum | None:
+        """Present state; None if the role has no state machine."""
+        ...
+
+    def handle(self, event: Event, now_s: float) -> list[Action]:
+        """Process an event at a time [s] of a monotonic clock and return actions, in order."""
+        ...
+
+    def next_deadline(self) -> float | None:
+        """Return when the role expects a `Tick` [s], on the clock of `handle`, or None."""
+        ...
+
+    def status(self) -> Mapping[str, str]:
+        """Return the values in use and those pending by name, for the diagnostics.
+
+        Examples of names are ``parameter.policy``, ``pending.policy`` and ``codebook_id``; the
+        result is empty if the role has no settings.
+        """
+        ...
+
+
 class CountingRole:
-    """A role that counts outcomes.
+    """Base of all roles: counts outcomes and has no settings.
 
     Attributes
     ----------
@@ -24,19 +76,15 @@ class CountingRole:
             self.counters[outcome.value] += n
 
     def status(self) -> Mapping[str, str]:
-        """Return the values in use and those pending, for the diagnostics.
-
-        Returns
-        -------
-        Mapping
-            Values by name, such as ``parameter.policy``, ``pending.policy`` and ``codebook_id``;
-            empty if the role has no settings.
-        """
+        """Return an empty mapping: nothing in the role can change."""
         return {}
 
 
 class PlainRole(CountingRole):
-    """A role without states or time-outs: it only answers messages."""
+    """Base of the roles that only answer messages, without states or deadlines."""
+
+    LACKING: frozenset[enum.Enum] = frozenset()
+    state: enum.Enum | None = None
 
     def next_deadline(self) -> float | None:
         """Return None: the role needs no `Tick`."""

@@ -117,7 +117,7 @@ ARRAYS = [(kind, field) for kind in KINDS for field in dataclasses.fields(kind)
 def test_an_array_with_something_not_finite_is_named(example, scenario, kind, field, bad):
     message = example(kind)
     getattr(message, field.name).flat[-1] = bad
-    if field.metadata['may_lack'] and math.isnan(bad):
+    if field.metadata['nan_allowed'] and math.isnan(bad):
         m.check(message, scenario.sizes)
         return
     with pytest.raises(m.MessageError) as caught:

@@ -153,7 +153,7 @@ def test_an_estimator_that_cannot_be_made_leaves_the_old_one(network, make_s):
     assert set(estimators(net).values()) == {'centre'}
     assert net.kept == [PositionerSettings()]
     assert net.logged('positioner')[1:] == [
-        'estimator neural not used, bayes stays: model_file: unfit']
+        'estimator neural not used, keeping bayes: model_file: unfit']
     assert told(net, 'positioner', 'pending') == {}
     assert told(net, 'positioner', 'failed') == {
         'failed.estimator': 'neural: model_file: unfit'}
