@@ -39,6 +39,8 @@ nitpick_ignore_regex = [
     ('py:.*', r'(?!rhs_isac_ros\.).*'),
     ('py:.*', r'rhs_isac_ros\.(.*\.)?_.*'),
     # Type variables.
-    ('py:.*', r'rhs_isac_ros\.(protocol\.codebook_cache\.Item|ros\.background\.Result)'),
+    ('py:.*', r'rhs_isac_ros\.(protocol\.codebook_cache\.Item|protocol\.newest\.(Key|Value)|'
+             r'protocol\.pending_settings\.SettingsT|protocol\.state_machine\.\w+T|'
+             r'ros\.background\.Result)'),
     ('py:.*', r'rhs_isac_ros\.ros\.parameters\.Settings'),
 ]

@@ -18,8 +18,8 @@ DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}
 OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
 
-# What follows if the first message of a kind does not reach one that listens to it: outcome of
-# the cycle and counters besides it, by role. The user notices at the next beacon or by itself.
+# The result if the first message of a class does not reach one of its recipients: the outcome of
+# the cycle, and other counters by role. The user detects it by the next beacon or by a time-out.
 LOST = [
     (m.Beacon, {}, 'user1', 'served', {'bs': {'unanswered': 1}}),
     (m.Ack, {}, 'bs', 'served', {'bs': {'unanswered': 1}}),
@@ -64,7 +64,7 @@ def matches(message, kind, fields):
 
 
 class LosesFirst:
-    """Loses the first message of a kind on its way to one recipient, or to all."""
+    """Loses the first message of a class to one recipient, or to all."""
 
     def __init__(self, kind, fields, recipient=''):
         self.kind, self.fields, self.recipient = kind, fields, recipient
@@ -79,7 +79,7 @@ class LosesFirst:
 
 
 class Adds:
-    """Puts an altered copy after, or before, the first message of a kind to a recipient."""
+    """Sends an altered copy after, or before, the first message of a class to a recipient."""
 
     def __init__(self, kind, fields, recipient, alter, before=False):
         self.kind, self.fields, self.recipient = kind, fields, recipient
@@ -117,11 +117,11 @@ def test_one_lost_message_ends_one_cycle_at_most(
 
 
 @pytest.mark.parametrize(('kind', 'fields', 'recipient'), [row[:3] for row in LOST], ids=IDS)
-def test_one_lost_message_ends_no_cycle_that_may_ask_again(network, kind, fields, recipient):
+def test_one_lost_message_ends_no_cycle_with_retries(network, kind, fields, recipient):
     lost = []
 
     def loses_once(message, to):
-        # What is sent again may be the same object.
+        # A repeated message may be the same object.
         if not lost and to == recipient and matches(message, kind, fields):
             lost.append(message)
             return []
@@ -137,7 +137,7 @@ def test_one_lost_message_ends_no_cycle_that_may_ask_again(network, kind, fields
 
 
 @pytest.mark.parametrize(('retries', 'outcome'), [(1, 'user_gone'), (2, 'served')])
-def test_a_step_is_asked_for_again_so_often_and_no_more(network, retries, outcome):
+def test_a_step_is_repeated_at_most_as_often_as_configured(network, retries, outcome):
     heard = []
 
     def deaf(message, recipient):
@@ -151,13 +151,13 @@ def test_a_step_is_asked_for_again_so_often_and_no_more(network, retries, outcom
     assert net.outcomes() == [(1, 1, outcome)]
     assert net.counters()['bs']['retry_band'] == retries
     if outcome != 'served':
-        # All of it within the time of one step.
+        # All attempts within the time of one step.
         assert 1.0 < net.now_s - begin_s < 1.2
     net.verify()
 
 
-def test_frames_that_have_come_are_not_lost_by_asking_again(network):
-    """Of each band's frames the first is lost at the first time, the second at the second."""
+def test_a_repeated_request_keeps_the_frames_received(network):
+    """The first attempt loses the first frame of each band, the second one the second."""
     requests = []
 
     def loses(message, recipient):
@@ -176,7 +176,7 @@ def test_frames_that_have_come_are_not_lost_by_asking_again(network):
 
 def test_every_subscription_is_among_the_lost_messages(subscriptions):
     lost = {(kind, recipient.rstrip('1')) for kind, _, recipient, _, _ in LOST}
-    # That of a message which no good cycle has is lost in a test of its own.
+    # NoFix does not occur in a served cycle; its loss has a separate test.
     lost.add((m.NoFix, 'bs'))
     assert lost == {(kind, role) for role, kinds in subscriptions.items() for kind in kinds}
 
@@ -194,10 +194,10 @@ def test_a_message_lost_for_everybody_ends_one_cycle_at_most(network, kind):
     net.verify()
 
 
-def test_a_cycle_that_is_given_up_is_told(network):
+def test_a_lost_cycle_is_published(network):
     net = network(transport=LosesFirst(m.ReceivedSignals, {}))
     net.run_cycles(1)
-    warnings = [s.note.text for s in net.notes if s.speaker == 'bs' and s.note.warning]
+    warnings = [s.message.text for s in net.logs if s.role == 'bs' and s.message.warning]
     assert warnings == ['cycle 1: user 1 given up: positioner_silent']
     (last,) = net.sent(m.ProtocolState, phase=m.Phase.BEACONING)
     assert (last.cycle_id, last.user, last.outcome) == (1, 1, 'positioner_silent')
@@ -216,7 +216,7 @@ def test_a_lost_truth_leaves_the_capacities_unknown(network):
     assert second.actual_bps > 0
 
 
-def test_a_grant_that_does_not_come_is_counted(network):
+def test_a_missing_grant_is_counted(network):
     net = network()
     net.run_to(user_role.State.ACKNOWLEDGED, 'user1')
     net.remove('bs', noticed=False)
@@ -224,7 +224,7 @@ def test_a_grant_that_does_not_come_is_counted(network):
     assert net['user1'].counters == {'not_granted': 1}
 
 
-def test_a_base_station_that_falls_silent_is_counted(network):
+def test_a_silent_base_station_is_counted(network):
     net = network()
     net.run_to(user_role.State.GRANTED, 'user1')
     net.remove('bs', noticed=False)
@@ -242,7 +242,7 @@ def replace(**changes):
     return alter
 
 
-# What does not belong to the cycle is dropped and counted; cycle_id is relative.
+# Messages that do not belong to the cycle and are dropped and counted; cycle_id is relative.
 WRONG = [
     (m.Ack, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
     (m.Ack, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
@@ -295,7 +295,7 @@ WRONG = [
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'transmission', {'cycle_id': -1},
      'wrong_cycle'),
 ]
-# What would be valid by itself comes after the real message only.
+# Copies that are valid by themselves are sent after the original only.
 WRONG_CASES = [(*case, before) for case in WRONG for before in (False, True)
                if not before or case[3] and case[4] != 'late_ack']
 WRONG_IDS = ['-'.join([kind.__name__, *map(str, fields.values()), recipient,
@@ -306,9 +306,9 @@ WRONG_IDS = ['-'.join([kind.__name__, *map(str, fields.values()), recipient,
 
 @pytest.mark.parametrize(
     ('kind', 'fields', 'recipient', 'changes', 'counter', 'before'), WRONG_CASES, ids=WRONG_IDS)
-def test_what_does_not_belong_is_dropped_and_counted(
+def test_altered_messages_are_dropped_and_counted(
         network, places, kind, fields, recipient, changes, counter, before):
-    """The cycle goes on as if the altered copy, whose content is another, had never come."""
+    """The cycle continues as if the altered copy had not arrived."""
     net = network(
         transport=Adds(kind, fields, recipient, replace(**changes), before), seed=5)
     plain = network(seed=5)
@@ -327,7 +327,7 @@ def test_what_does_not_belong_is_dropped_and_counted(
         assert len(net.sent(kind)) == len(plain.sent(kind))
 
 
-def test_a_doubled_beacon_is_answered_once(network):
+def test_a_duplicate_beacon_is_answered_once(network):
     net = network(transport=Adds(m.Beacon, {}, 'user1', replace()))
     net.run_cycles(2)
     assert net.served() == [1, 1]
@@ -336,7 +336,7 @@ def test_a_doubled_beacon_is_answered_once(network):
 
 
 @pytest.mark.parametrize(('late_s', 'counter'), [(2.5e-3, 'duplicate'), (0.05, 'stale_command')])
-def test_a_doubled_command_is_answered_again_unless_it_is_out_of_date(network, late_s, counter):
+def test_a_duplicate_command_is_answered_again_unless_it_is_stale(network, late_s, counter):
     def doubles(message, recipient):
         again = recipient == 'rhs_controller' and matches(message, m.RhsCommand, {'band': 1})
         return [(1e-3, message), *([(late_s, message)] if again else [])]
@@ -350,8 +350,8 @@ def test_a_doubled_command_is_answered_again_unless_it_is_out_of_date(network, l
 
 
 @pytest.mark.parametrize('late_s', [0.03, 0.11])
-def test_a_doubled_grant_that_comes_late_moves_nobody(network, scenario, late_s):
-    """Neither the user, which is done, nor the channel, which is with the next cycle."""
+def test_a_late_duplicate_grant_changes_no_position(network, scenario, late_s):
+    """The user has finished the cycle, and the channel has begun the next one."""
     def doubles(message, recipient):
         again = [(late_s, message)] if isinstance(message, m.Grant) else []
         return [(1e-3, message), *again]
@@ -367,7 +367,7 @@ def test_a_doubled_grant_that_comes_late_moves_nobody(network, scenario, late_s)
 
 
 def test_a_late_user_is_waited_for_in_the_next_cycle(network):
-    """The first answer ends the first cycle's beaconing; who comes later is known from then on."""
+    """The first ack ends the beaconing of the first cycle; later acks register their users."""
     net = network(2)
     net.run_cycles(1)
     assert net.served() == [1]
@@ -377,7 +377,7 @@ def test_a_late_user_is_waited_for_in_the_next_cycle(network):
     assert net['bs'].counters == {'late_ack': 1}
 
 
-def test_one_complaint_for_a_codebook_that_the_surface_does_not_know(network, example):
+def test_an_unknown_codebook_is_logged_once_by_the_rhs_controller(network, example):
     net = network()
     net.run_cycles(1)
     for _ in range(3):
@@ -389,7 +389,7 @@ def test_one_complaint_for_a_codebook_that_the_surface_does_not_know(network, ex
 
 
 @pytest.mark.parametrize('kind', [m.Pilot, m.Beam, m.RhsConfiguration], ids=lambda k: k.__name__)
-def test_what_waits_for_nothing_does_not_pile_up(network, example, kind):
+def test_messages_of_incomplete_cycles_do_not_accumulate(network, example, kind):
     net = network()
     net.run_cycles(1)
     for n in range(300):
@@ -405,7 +405,7 @@ def beacon_to_grant_s(network, cycle_id):
     return times[m.Grant] - times[m.Beacon]
 
 
-def test_a_user_that_is_gone_in_mid_positioning_is_not_waited_for(network):
+def test_a_user_lost_while_positioning_is_not_waited_for(network):
     net = network(2)
     net.run_cycles(2)
     net.run_to(State.SOUNDING)
@@ -421,7 +421,7 @@ def test_a_user_that_is_gone_in_mid_positioning_is_not_waited_for(network):
     net.verify()
 
 
-def test_a_user_that_leaves_between_cycles_is_waited_for_three_times(network):
+def test_a_user_lost_between_cycles_is_waited_for_three_times(network):
     net = network(2)
     net.run_cycles(4)
     net.remove('user2')
@@ -431,8 +431,8 @@ def test_a_user_that_leaves_between_cycles_is_waited_for_three_times(network):
     assert waits == [True] * 3 + [False] * 3
 
 
-def test_waiting_for_one_user_does_not_cost_the_other_its_cycle(network):
-    """The window for acks may be longer than a user waits for its grant."""
+def test_waiting_for_a_lost_user_does_not_cost_another_its_cycle(network):
+    """The time to wait for acks may exceed the time that a user waits for its grant."""
     net = network(2, ack_timeout_s=3.0)
     net.run_cycles(4)
     net.remove('user2')
@@ -442,7 +442,7 @@ def test_waiting_for_one_user_does_not_cost_the_other_its_cycle(network):
 
 
 @pytest.mark.parametrize('state', [State.ESTIMATING, State.STEERING, State.TRANSMITTING])
-def test_a_user_that_is_gone_after_positioning_loses_its_data_only(network, state):
+def test_a_user_lost_after_positioning_loses_only_its_data(network, state):
     net = network(2)
     net.run_cycles(2)
     net.run_to(state)
@@ -464,7 +464,7 @@ ROLE_FAULTS = [
 
 @pytest.mark.parametrize(('role', 'state', 'reason'), ROLE_FAULTS)
 @pytest.mark.parametrize('noticed', [True, False])
-def test_a_role_that_is_gone_is_timed_out_and_welcome_back(network, role, state, reason, noticed):
+def test_a_lost_role_causes_a_timeout_and_may_return(network, role, state, reason, noticed):
     net = network()
     net.run_cycles(1)
     net.run_to(state)
@@ -505,7 +505,7 @@ def test_a_role_that_restarts_costs_one_cycle_at_most(network, role, state):
 
 
 @pytest.mark.parametrize('role', ['rhs_controller', 'channel', 'positioner', 'transmission'])
-def test_the_base_station_waits_for_a_role_and_says_so_once(network, role):
+def test_the_base_station_waits_for_a_role_and_logs_it_once(network, role):
     net = network(absent=[role])
     net.run(limit_s=30.0)
     assert net.sent(m.Beacon) == []
@@ -522,7 +522,7 @@ def test_the_base_station_waits_for_a_role_and_says_so_once(network, role):
         assert net.logged('user1')[1:] == ['no beacon for 3 s', 'beacons resumed']
 
 
-def test_every_change_of_what_is_missing_is_said_once(network):
+def test_every_change_of_the_missing_roles_is_logged_once(network):
     net = network(absent=['positioner', 'channel'])
     net.run(limit_s=5.0)
     net.add('channel')
@@ -540,7 +540,7 @@ def test_every_change_of_what_is_missing_is_said_once(network):
     assert net.logged('bs')[4:] == ['waiting for transmission']
 
 
-def test_what_is_missing_is_not_said_again_for_news_that_change_nothing(network, codebooks):
+def test_missing_roles_are_not_logged_again_without_a_change(network, codebooks):
     net = network(absent=['positioner'])
     for codebook in codebooks:
         net.offer(codebook)
@@ -548,7 +548,7 @@ def test_what_is_missing_is_not_said_again_for_news_that_change_nothing(network,
     assert net.logged('bs') == ['waiting for positioner']
 
 
-def test_a_role_that_is_missing_for_a_moment_between_cycles_costs_nothing(network):
+def test_a_role_missing_briefly_between_cycles_costs_no_cycle(network):
     net = network()
     net.run_cycles(1)
     net.restart('positioner', noticed=True)
@@ -557,7 +557,7 @@ def test_a_role_that_is_missing_for_a_moment_between_cycles_costs_nothing(networ
     assert net.logged('bs') == []
 
 
-def test_a_user_without_a_base_station_waits_and_says_so_once(network):
+def test_a_user_without_a_base_station_waits_and_logs_it_once(network):
     net = network(absent=['bs'])
     net.run(limit_s=30.0)
     assert net.logged('user1') == ['waiting for bs']
@@ -576,7 +576,7 @@ def test_a_user_without_a_base_station_waits_and_says_so_once(network):
 @pytest.mark.parametrize('state', [
     State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
     State.TRANSMITTING, State.RESTING])
-def test_a_base_station_that_restarts_is_answered_again(network, state, cycles, noticed):
+def test_a_restarted_base_station_is_answered(network, state, cycles, noticed):
     net = network(2)
     net.run_cycles(cycles)
     net.run_to(state)
@@ -591,8 +591,8 @@ def test_a_base_station_that_restarts_is_answered_again(network, state, cycles, 
 
 
 @pytest.mark.parametrize('state', [State.SOUNDING, State.STEERING])
-def test_a_base_station_that_restarts_takes_the_user_where_it_is_now(network, scenario, state):
-    """No cycle has the number of the one that was cut short."""
+def test_a_restarted_base_station_uses_the_present_position_of_the_user(network, scenario, state):
+    """The number of the interrupted cycle is not used again."""
     walk = mobility.RandomWalk(scenario, 50.0, np.random.default_rng(0))
     net = network({1: walk})
     net.run_to(state)
@@ -605,7 +605,7 @@ def test_a_base_station_that_restarts_takes_the_user_where_it_is_now(network, sc
     net.verify()
 
 
-def test_a_base_station_that_is_gone_leaves_the_users_alone(network):
+def test_users_wait_without_a_base_station(network):
     net = network(2)
     net.run_cycles(2)
     net.run_to(State.SOUNDING)
@@ -616,8 +616,8 @@ def test_a_base_station_that_is_gone_leaves_the_users_alone(network):
 
 
 @pytest.mark.parametrize(('loss', 'seed'), [(0.05, 1), (0.2, 2), (0.2, 3)])
-def test_the_network_serves_on_while_messages_are_lost_at_random(network, noisy, loss, seed):
-    """At 20 % only one cycle in 200 gets all of its 24 messages through, but none is mixed up."""
+def test_users_are_served_while_messages_are_lost_at_random(network, noisy, loss, seed):
+    """With 20 % loss only one cycle in 200 is complete, but no cycles are mixed."""
     net = network(2, transport=noisy(seed, loss=loss), step_timeout_s=0.1)
     duration_s = 60.0 if loss < 0.1 else 300.0
     for half in range(2):
@@ -642,7 +642,7 @@ def test_the_network_serves_on_while_messages_are_lost_at_random(network, noisy,
 
 
 @pytest.mark.parametrize('seed', [1, 2])
-def test_nothing_is_mixed_while_messages_are_lost_doubled_and_overtaken(network, noisy, seed):
+def test_cycles_are_not_mixed_under_loss_duplication_and_reordering(network, noisy, seed):
     net = network(3, ordered=False, step_timeout_s=0.2, rest_s=0.0, transport=noisy(
         seed, loss=0.03, doubles=0.2, jitter_s=0.01))
     net.run(limit_s=30.0)
@@ -651,7 +651,7 @@ def test_nothing_is_mixed_while_messages_are_lost_doubled_and_overtaken(network,
 
 
 class Blind:
-    """An estimator that finds nobody in the cycles that it is told."""
+    """An estimator without a fix in the given cycles."""
 
     name = 'blind'
 
@@ -665,7 +665,7 @@ class Blind:
         return Estimate(np.array([10.0, 0.0, 0.0]), np.eye(3))
 
 
-def test_without_a_fix_the_cycle_ends_at_once_and_no_position_is_told(network):
+def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
     net = network(make=lambda codebook: Blind({2}))
     net.run_cycles(3)
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'no_fix'), (3, 1, 'served')]
@@ -683,7 +683,7 @@ def test_without_a_fix_the_cycle_ends_at_once_and_no_position_is_told(network):
     net.verify()
 
 
-def test_a_lost_no_fix_costs_the_patience_of_one_step(network):
+def test_a_lost_no_fix_costs_the_timeout_of_one_step(network):
     net = network(make=lambda codebook: Blind({2}), transport=LosesFirst(m.NoFix, {}))
     net.run_cycles(3)
     assert net.transport.lost is not None
@@ -692,7 +692,7 @@ def test_a_lost_no_fix_costs_the_patience_of_one_step(network):
 
 
 @pytest.mark.parametrize('changes', [{'cycle_id': 1}, {'user': 2}, {'codebook_id': 'x'}], ids=str)
-def test_another_no_fix_does_not_end_the_cycle(network, codebooks, changes):
+def test_a_no_fix_of_another_cycle_does_not_end_the_cycle(network, codebooks, changes):
     net = network()
     net.run_cycles(1)
     net.run_to(State.ESTIMATING)
@@ -703,7 +703,7 @@ def test_another_no_fix_does_not_end_the_cycle(network, codebooks, changes):
     assert sum(net['bs'].counters.values()) == 1
 
 
-def test_a_base_station_that_nobody_answers_notices_that_a_role_dies(network):
+def test_a_base_station_without_acks_detects_a_missing_role(network):
     net = network()
     net.run_cycles(1)
     net.remove('user1')
@@ -718,12 +718,12 @@ def test_a_base_station_that_nobody_answers_notices_that_a_role_dies(network):
     assert net['bs'].state is State.BEACONING
 
 
-def test_a_user_that_answers_no_more_is_told_of_once(network):
+def test_a_user_that_stops_answering_is_logged_once(network):
     net = network(2)
     net.run_cycles(2)
     net.remove('user2', noticed=False)
     net.run_cycles(8)
-    # It may be in the middle of a cycle of its own when it dies.
+    # The user may be removed in the middle of one of its cycles.
     assert net.logged('bs') == ['user 2 no longer answers']
     assert net['bs'].counters['user_lost'] == 1
     net.add('user2')

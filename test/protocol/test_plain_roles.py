@@ -1,4 +1,4 @@
-"""The roles that are no state machines: channel, positioner and transmission."""
+"""The roles without states: channel, positioner and transmission."""
 
 import dataclasses
 import itertools
@@ -31,7 +31,7 @@ PLACE = np.array([8.0, -2.0, 0.5])
 
 
 def feed(role, events):
-    """What a role sends, one list for each event."""
+    """Return the messages that a role sends, one list for each event."""
     return [[action.message for action in role.handle(event, float(n))
              if isinstance(action, Send)] for n, event in enumerate(events)]
 
@@ -69,7 +69,7 @@ def applied(beam):
 
 
 def configured(beam):
-    """What the surface reports once it has applied a beam."""
+    """The report of the surface after it has applied a beam."""
     return m.RhsConfiguration(
         cycle_id=beam.cycle_id, mode=m.Mode.TRANSMISSION, band=beam.band,
         codebook_id=beam.codebook_id, analog=beam.analog[None])
@@ -82,18 +82,18 @@ def downlink():
         bits=1e9)
 
 
-def test_they_wait_for_messages_only(scenario):
+def test_they_have_no_deadlines(scenario):
     for role in (Channel(scenario, 0), Transmission(scenario),
                  Positioner(scenario, None)):
         assert role.next_deadline() is None
 
 
-def test_the_channel_answers_pilots_in_whatever_order_things_come(
+def test_the_channel_answers_pilots_for_any_order_of_messages(
         scenario, truth, configuration, pilots):
     answers = []
     for order in itertools.permutations([truth, configuration, *pilots]):
         sent = feed(Channel(scenario, 0), order)
-        # Nothing before all that an answer needs is there.
+        # No answer before all messages that it needs have arrived.
         known = max(order.index(truth), order.index(configuration))
         assert all(not s for s in sent[:known])
         answers.append({f.frame: f for batch in sent for f in batch})
@@ -119,12 +119,12 @@ def test_feed_signals_follow_configuration_and_symbol(scenario, truth, configura
     np.testing.assert_allclose(signals(analog, 0.6 - 0.8j), (0.6 - 0.8j) * plain)
     np.testing.assert_allclose(signals(analog / 2, 1 + 0j), plain / 2)
     assert (signals(0 * analog, 1 + 0j) == 0).all()
-    # One element at a time: its path, board included.
+    # Element by element: the path, including on-board propagation.
     single = [signals(np.eye(16)[m_][None] * np.ones((2, 1)), 1 + 0j) for m_ in range(16)]
     np.testing.assert_allclose(signals(np.ones((2, 16)), 1 + 0j), sum(single))
 
 
-def test_the_multipath_has_no_mean_and_the_line_of_sight_is_one(scenario, configuration, pilots):
+def test_the_multipath_has_zero_mean_and_the_line_of_sight_is_1(scenario, configuration, pilots):
     sums, n = 0, 400
     for cycle_id in range(1, n + 1):
         events = [m.GroundTruth(cycle_id=cycle_id, user=1, position=PLACE, velocity=np.zeros(3)),
@@ -151,7 +151,7 @@ def test_a_pilot_of_another_user_is_not_answered(scenario, truth, configuration,
 
 
 @pytest.mark.parametrize('cycle_id', [2, 4])
-def test_a_pilot_of_another_cycle_is_not_answered_and_forgotten_with_the_cycle(
+def test_a_pilot_of_another_cycle_is_discarded_with_the_next_cycle(
         scenario, truth, configuration, example, cycle_id):
     channel = Channel(scenario, 0)
     pilot = example(m.Pilot, cycle_id=cycle_id, user=1)
@@ -172,14 +172,14 @@ def test_a_pilot_of_the_next_cycle_waits_for_it(scenario, truth, configuration, 
     assert [f.cycle_id for f in sent[4]] == [4]
 
 
-def test_the_channel_delivers_data_in_whatever_order_things_come(
+def test_the_channel_delivers_data_for_any_order_of_messages(
         scenario, truth, beam, applied, downlink):
     for order in itertools.permutations([truth, beam, applied, downlink]):
         sent = [s for batch in feed(Channel(scenario, 0), order) for s in batch]
         assert [(s.stage, s.bits) for s in sent] == [(m.Stage.DELIVERED, sent[0].bits)]
 
 
-def test_the_channel_carries_what_the_capacity_at_the_true_position_allows(
+def test_the_channel_delivers_the_capacity_at_the_true_position(
         scenario, truth, beam, applied, downlink):
     channel = Channel(scenario, 0)
     feed(channel, [truth, beam, applied])
@@ -194,7 +194,7 @@ def test_the_channel_carries_what_the_capacity_at_the_true_position_allows(
     assert (delivered.direction, delivered.bits) == (m.Direction.UPLINK, 10.0)
 
 
-def test_the_channel_carries_what_the_surface_reports_not_what_was_asked(
+def test_the_channel_uses_the_reported_configuration_of_the_surface(
         scenario, truth, beam, downlink):
     off = m.RhsConfiguration(
         cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=np.zeros((1, 16)))
@@ -203,7 +203,7 @@ def test_the_channel_carries_what_the_surface_reports_not_what_was_asked(
 
 
 class Fixed:
-    """An estimator that finds one place and knows its codebook."""
+    """An estimator with a fixed result that holds its codebook."""
 
     def __init__(self, codebook):
         self.name = f'fixed {codebook.id}'
@@ -214,14 +214,14 @@ class Fixed:
 
 @pytest.fixture
 def positioner(scenario):
-    """A positioner whose watch ticks in seconds."""
+    """A positioner whose stopwatch advances by a second at each call."""
     watch = itertools.count(10.0)
     return Positioner(scenario, lambda: next(watch))
 
 
 @pytest.fixture
 def signals(codebooks, example):
-    """Function that makes received signals of a cycle with one of the codebooks."""
+    """Function that returns received signals of a cycle with one of the codebooks."""
     def make(cycle_id, number=0):
         return example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
                        codebook_id=codebooks[number].id)
@@ -233,11 +233,11 @@ def made(codebook, estimator=None):
 
 
 def wanted(actions):
-    """Ids of the codebooks that estimators are asked for."""
+    """Return the ids of the codebooks for which estimators are requested."""
     return [action.codebook.id for action in actions if isinstance(action, BuildEstimator)]
 
 
-def test_the_positioner_uses_the_estimator_of_the_signals_codebook(
+def test_the_codebook_of_the_signals_selects_the_estimator(
         positioner, scenario, codebooks, signals):
     for codebook in codebooks[:2]:
         assert wanted(positioner.handle(CodebookOffered(codebook), 0.0)) == [codebook.id]
@@ -255,7 +255,7 @@ def test_the_positioner_uses_the_estimator_of_the_signals_codebook(
         assert estimate.latency_s == 1.0
 
 
-def test_signals_that_come_twice_are_answered_twice_and_estimated_once(
+def test_duplicate_signals_are_answered_twice_and_estimated_once(
         positioner, codebooks, signals):
     feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0])])
     (first,), (again,), (other,) = feed(positioner, [signals(5), signals(5), signals(6)])
@@ -264,7 +264,7 @@ def test_signals_that_come_twice_are_answered_twice_and_estimated_once(
     assert positioner.counters == {'duplicate': 1}
 
 
-def test_the_positioner_drops_signals_of_a_codebook_that_it_does_not_know(
+def test_the_positioner_drops_signals_of_an_unknown_codebook(
         positioner, codebooks, signals):
     assert feed(positioner, [signals(1)]) == [[]]
     feed(positioner, [CodebookOffered(codebooks[1]), made(codebooks[1])])
@@ -272,14 +272,14 @@ def test_the_positioner_drops_signals_of_a_codebook_that_it_does_not_know(
     assert positioner.counters == {'wrong_codebook': 2}
 
 
-def test_the_positioner_wants_one_estimator_for_a_codebook(positioner, codebooks):
+def test_the_positioner_requests_one_estimator_for_a_codebook(positioner, codebooks):
     offers = [positioner.handle(CodebookOffered(codebooks[0]), 0.0) for _ in range(3)]
     assert list(map(wanted, offers)) == [[codebooks[0].id], [], []]
     positioner.handle(made(codebooks[0]), 0.0)
     assert positioner.handle(CodebookOffered(codebooks[0]), 0.0) == []
 
 
-def test_the_positioner_goes_on_with_the_old_codebook_while_it_makes_the_new_one(
+def test_the_old_estimator_is_used_while_the_new_one_is_built(
         positioner, codebooks, signals):
     feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0]),
                       CodebookOffered(codebooks[1])])
@@ -291,7 +291,7 @@ def test_the_positioner_goes_on_with_the_old_codebook_while_it_makes_the_new_one
     assert positioner.counters == {}
 
 
-def test_of_signals_that_wait_the_newest_are_used(positioner, codebooks, signals):
+def test_the_newest_of_waiting_signals_are_used(positioner, codebooks, signals):
     *before, (estimate,), after = feed(
         positioner, [CodebookOffered(codebooks[0]), signals(1), signals(2), made(codebooks[0]),
                      CodebookOffered(codebooks[0])])
@@ -300,7 +300,7 @@ def test_of_signals_that_wait_the_newest_are_used(positioner, codebooks, signals
     assert after == []
 
 
-def test_one_estimator_is_made_at_a_time_and_the_newest_codebook_comes_next(
+def test_estimators_are_built_one_at_a_time_the_newest_next(
         positioner, codebooks, signals):
     first, second, third = codebooks
     offers = [wanted(positioner.handle(CodebookOffered(c), 0.0)) for c in (first, second, third)]
@@ -313,25 +313,25 @@ def test_one_estimator_is_made_at_a_time_and_the_newest_codebook_comes_next(
     assert positioner.counters == {'wrong_codebook': 1}
 
 
-def test_a_codebook_that_is_taken_back_is_not_made(positioner, codebooks):
+def test_no_estimator_is_built_for_a_codebook_replaced_meanwhile(positioner, codebooks):
     first, second, _ = codebooks
     feed(positioner, [CodebookOffered(c) for c in (first, second, first)])
     assert wanted(positioner.handle(made(first), 0.0)) == []
 
 
-def test_an_estimator_that_cannot_be_made_leaves_the_old_one(positioner, codebooks, signals):
+def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(positioner, codebooks, signals):
     feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0]),
                       CodebookOffered(codebooks[1]), signals(4, 1)])
     assert positioner.handle(EstimatorFailed(codebooks[1], 'no model'), 0.0) == [
         LogMessage(f'no estimator for codebook {codebooks[1].id}: no model', warning=True)]
     assert [len(sent) for sent in feed(positioner, [signals(5), signals(6, 1)])] == [1, 0]
     assert positioner.counters == {'wrong_codebook': 2}
-    # It may be offered again.
+    # The codebook may be offered again.
     assert wanted(positioner.handle(CodebookOffered(codebooks[1]), 0.0)) == [codebooks[1].id]
 
 
 class Lost(Fixed):
-    """An estimator without a fix: it says so, or finds the signals unusable."""
+    """An estimator that returns no fix, or raises an error."""
 
     def __init__(self, codebook, error=False):
         super().__init__(codebook)
@@ -344,7 +344,7 @@ class Lost(Fixed):
 
 
 @pytest.mark.parametrize('error', [False, True])
-def test_without_a_fix_the_positioner_says_so_and_why(positioner, codebooks, signals, error):
+def test_without_a_fix_the_positioner_reports_the_reason(positioner, codebooks, signals, error):
     lost = Lost(codebooks[0], error)
     feed(positioner, [CodebookOffered(codebooks[0]), made(codebooks[0], lost)])
     send, note = positioner.handle(signals(9), 0.0)
@@ -357,7 +357,7 @@ def test_without_a_fix_the_positioner_says_so_and_why(positioner, codebooks, sig
 
 
 @pytest.mark.parametrize('error', [ValueError('bad model'), OSError('disk full'), MemoryError()])
-def test_what_goes_wrong_while_an_estimator_is_made_is_an_event(codebooks, error):
+def test_an_error_while_an_estimator_is_built_is_an_event(codebooks, error):
     def make(codebook):
         raise error
     event = build_estimator(codebooks[0], make, lambda: 0.0)
@@ -366,7 +366,7 @@ def test_what_goes_wrong_while_an_estimator_is_made_is_an_event(codebooks, error
     assert event.reason == (str(error) or 'MemoryError')
 
 
-def test_an_estimator_that_was_made_comes_with_its_time(codebooks):
+def test_a_built_estimator_is_returned_with_its_duration(codebooks):
     watch = iter([3.0, 5.5])
     event = build_estimator(codebooks[0], Fixed, lambda: next(watch))
     assert (event.codebook, event.elapsed_s) == (codebooks[0], 2.5)
@@ -386,7 +386,7 @@ def estimate(codebooks, example):
                    position=PLACE + [0.5, 0.5, 0.0])
 
 
-def test_the_transmission_reports_what_the_applied_beam_carries(
+def test_the_transmission_reports_the_capacity_of_the_applied_beam(
         transmission, scenario, truth, estimate):
     ((beam,),) = feed(transmission, [estimate])
     assert (beam.cycle_id, beam.user, beam.codebook_id) == (3, 1, estimate.codebook_id)
@@ -400,8 +400,8 @@ def test_the_transmission_reports_what_the_applied_beam_carries(
     assert report.loss_bps == report.perfect_bps - report.actual_bps
 
 
-def test_no_beam_is_better_than_the_perfect_one(transmission, scenario, codebooks, example):
-    """Steering finds one of many maxima, but never one that is much below another."""
+def test_no_beam_exceeds_the_perfect_one(transmission, scenario, codebooks, example):
+    """The search may find a local maximum, but never one much below another."""
     rng = np.random.default_rng(0)
     for cycle_id, place in enumerate(scenario.sample_positions(20, rng), 1):
         near = place + rng.normal(scale=0.2, size=3)
@@ -415,7 +415,7 @@ def test_no_beam_is_better_than_the_perfect_one(transmission, scenario, codebook
 
 
 @pytest.mark.parametrize('other', [{'cycle_id': 2}, {'cycle_id': 4}, {'user': 2}])
-def test_the_truth_of_another_cycle_or_user_is_not_used(
+def test_the_position_of_another_cycle_or_user_is_not_used(
         transmission, example, estimate, other):
     truth = example(m.GroundTruth, **{'cycle_id': 3, 'user': 1} | other)
     ((beam,), _) = feed(transmission, [estimate, truth])
@@ -426,7 +426,7 @@ def test_the_truth_of_another_cycle_or_user_is_not_used(
     assert report.expected_bps == beam.expected_bps
 
 
-def test_an_estimate_that_comes_twice_is_steered_to_once(
+def test_a_duplicate_estimate_is_answered_with_the_same_beam(
         transmission, estimate, truth, monkeypatch):
     ((beam,),) = feed(transmission, [estimate])
     monkeypatch.setattr('rhs_isac_ros.protocol.transmission.choose_beam', None)
@@ -450,7 +450,7 @@ def test_a_report_of_another_beam_is_counted(transmission, estimate, changes, re
     assert transmission.counters == {reason: 1}
 
 
-def test_what_comes_late_from_an_older_cycle_does_not_hide_the_present_one(
+def test_late_messages_of_an_older_cycle_do_not_replace_the_present_one(
         transmission, estimate, truth):
     later = dataclasses.replace(estimate, cycle_id=4)
     place = dataclasses.replace(truth, cycle_id=4)
@@ -462,7 +462,7 @@ def test_what_comes_late_from_an_older_cycle_does_not_hide_the_present_one(
 
 
 def reported(transmission, scenario, example, codebook, places, cycle_id=1):
-    """What it sends for one cycle at each of the places, the estimates being half a metre off."""
+    """Return the messages of one cycle for each position, with estimates off by half a metre."""
     sent = []
     for n, place in enumerate(places, cycle_id):
         estimate = example(m.PositionEstimate, cycle_id=n, user=1, codebook_id=codebook.id,
@@ -489,7 +489,7 @@ def test_the_statistics_are_the_quartiles_of_the_reports(
     assert sent[-1][1].loss_percent[1] > 0
 
 
-def test_a_report_that_is_repeated_counts_once(transmission, scenario, example, codebooks):
+def test_a_repeated_report_is_counted_once(transmission, scenario, example, codebooks):
     (place,) = scenario.sample_positions(1, np.random.default_rng(5))
     ((report, statistics),) = reported(transmission, scenario, example, codebooks[0], [place])
     assert statistics.n_reports == 1
@@ -523,7 +523,7 @@ def test_the_transmission_chooses_the_band_by_the_posterior(scenario, codebooks,
             assert expected_capacity(scenario, other, position, covariance) <= beam.expected_bps
 
 
-def test_the_perfect_position_has_the_choice_of_the_same_bands(
+def test_the_perfect_beam_is_chosen_from_the_same_bands(
         scenario, codebooks, truth, estimate):
     for band in (-1, 0, 1):
         role = Transmission(scenario, TransmissionSettings(band))
@@ -535,7 +535,7 @@ def test_the_perfect_position_has_the_choice_of_the_same_bands(
             capacity(scenario, steer(scenario, PLACE, b), PLACE[None])[0] for b in bands))
 
 
-def test_the_transmission_takes_its_band(scenario, codebooks, estimate):
+def test_the_transmission_uses_the_configured_band(scenario, codebooks, estimate):
     role = Transmission(scenario, TransmissionSettings(1))
     (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
     expected = steer(scenario, estimate.position, 1)
@@ -544,7 +544,7 @@ def test_the_transmission_takes_its_band(scenario, codebooks, estimate):
     assert beam.expected_bps == capacity(scenario, expected, estimate.position[None])[0]
 
 
-def test_a_cycle_stays_in_its_bands_when_others_are_to_be_used(
+def test_a_cycle_keeps_its_bands_when_the_settings_change(
         scenario, codebooks, truth, estimate):
     role = Transmission(scenario, TransmissionSettings(1))
     (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
@@ -563,7 +563,7 @@ def test_a_cycle_stays_in_its_bands_when_others_are_to_be_used(
 
 @pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('name', ['channel', 'positioner', 'transmission'])
-def test_no_sequence_of_messages_breaks_them(
+def test_no_sequence_of_messages_raises_an_error(
         scenario, codebooks, subscriptions, example, name, seed):
     role = {'channel': lambda: Channel(scenario, 0),
             'positioner': lambda: Positioner(scenario, lambda: 0.0),

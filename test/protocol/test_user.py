@@ -1,4 +1,4 @@
-"""The user by itself: what the whole network seldom shows."""
+"""The user alone, in situations that are rare in a network."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
 
 @pytest.fixture
 def user():
-    """User 4, connected; waits 2 s for a grant and 3 s when granted."""
+    """User 4, connected, with time-outs of 2 s for a grant and 3 s after it."""
     way = mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)
     made = User(4, way, {State.ACKNOWLEDGED: 2.0, State.GRANTED: 3.0})
     made.handle(PeersChanged(()), 0.0)
@@ -37,7 +37,7 @@ def test_a_beacon_is_answered(user):
     assert user.next_deadline() == 12.0
 
 
-def test_a_late_beacon_and_grant_of_a_cycle_do_not_move_the_user_within_it(user):
+def test_a_late_beacon_or_grant_of_a_cycle_keeps_its_position(user):
     (truth,) = grant(user)
     user.handle(m.Data(
         cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
@@ -51,7 +51,7 @@ def test_a_late_beacon_and_grant_of_a_cycle_do_not_move_the_user_within_it(user)
 
 
 @pytest.mark.parametrize('cycle_id', [7, 8])
-def test_every_further_beacon_is_answered_and_starts_the_time_out_afresh(user, cycle_id):
+def test_every_further_beacon_is_answered_and_restarts_the_timeout(user, cycle_id):
     user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
     (ack,) = answers(user, m.Beacon(cycle_id=cycle_id, attempt=1), 11.5)
     assert ack.cycle_id == cycle_id
@@ -59,7 +59,7 @@ def test_every_further_beacon_is_answered_and_starts_the_time_out_afresh(user, c
     assert user.counters == {}
 
 
-def test_a_grant_is_answered_with_the_position_of_the_moment(user):
+def test_a_grant_is_answered_with_the_present_position(user):
     user.ground_truth(8.0)
     (truth,) = grant(user)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
@@ -68,13 +68,13 @@ def test_a_grant_is_answered_with_the_position_of_the_moment(user):
     assert user.next_deadline() == 13.0
 
 
-def test_whereabouts_belong_to_no_cycle_unless_told(user):
+def test_a_true_position_has_cycle_0_unless_given(user):
     assert user.ground_truth(0.0).cycle_id == 0
     assert user.ground_truth(0.0, 9).cycle_id == 9
     assert user.ground_truth(0.0).user == 4
 
 
-def test_a_pilot_request_is_answered_frame_by_frame_and_starts_the_time_out_afresh(user):
+def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
     grant(user)
     pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=1, n_frames=3), 12.5)
     assert [(p.cycle_id, p.user, p.band, p.frame) for p in pilots] == [
@@ -83,7 +83,7 @@ def test_a_pilot_request_is_answered_frame_by_frame_and_starts_the_time_out_afre
     assert user.next_deadline() == 15.5
 
 
-def test_the_downlink_is_answered_in_kind_and_ends_the_cycle(user):
+def test_the_downlink_is_answered_with_equal_uplink_and_ends_the_cycle(user):
     grant(user)
     (data,) = answers(user, m.Data(
         cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
@@ -94,7 +94,7 @@ def test_the_downlink_is_answered_in_kind_and_ends_the_cycle(user):
 
 
 @pytest.mark.parametrize(('direction', 'stage'), [(DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED)])
-def test_data_on_their_way_are_none_of_its_business(user, direction, stage):
+def test_other_data_are_ignored(user, direction, stage):
     grant(user)
     assert user.handle(m.Data(
         cycle_id=7, user=4, direction=direction, stage=stage, duration_s=0.25,
@@ -103,8 +103,8 @@ def test_data_on_their_way_are_none_of_its_business(user, direction, stage):
     assert user.counters == {}
 
 
-def test_a_late_beacon_of_the_cycle_that_it_was_granted_is_counted_only(user):
-    """Another beacon of a cycle may be on its way while the first answer is granted."""
+def test_a_late_beacon_of_the_granted_cycle_is_only_counted(user):
+    """Another beacon of a cycle may be in transit while the first ack is granted."""
     grant(user)
     assert user.handle(m.Beacon(cycle_id=7, attempt=1), 11.0) == []
     assert user.state is State.GRANTED
@@ -112,7 +112,7 @@ def test_a_late_beacon_of_the_cycle_that_it_was_granted_is_counted_only(user):
     assert user.counters == {'stale_beacon': 1}
 
 
-def test_a_beacon_of_another_cycle_tells_that_its_own_was_given_up(user):
+def test_a_beacon_of_another_cycle_ends_the_granted_one(user):
     grant(user)
     (ack,) = answers(user, m.Beacon(cycle_id=8, attempt=0), 11.0)
     assert ack.cycle_id == 8
@@ -120,7 +120,7 @@ def test_a_beacon_of_another_cycle_tells_that_its_own_was_given_up(user):
     assert user.counters == {'abandoned': 1}
 
 
-def test_the_grant_of_another_user_ends_its_hope(user):
+def test_a_grant_to_another_user_ends_the_wait(user):
     user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
     assert user.handle(m.Grant(cycle_id=7, user=5), 10.5) == []
     assert user.state is State.LISTENING
@@ -131,7 +131,7 @@ def test_the_grant_of_another_user_ends_its_hope(user):
     m.Grant(cycle_id=6, user=5), m.PilotRequest(cycle_id=7, user=5, band=0, n_frames=2), m.Data(
         cycle_id=6, user=5, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0)],
     ids=['grant of another cycle', 'request', 'data'])
-def test_what_else_goes_to_another_user_is_none_of_its_business(user, other):
+def test_other_messages_to_another_user_are_ignored(user, other):
     for event, state in ((m.Beacon(
         cycle_id=7, attempt=0), State.ACKNOWLEDGED), (m.Grant(cycle_id=7, user=4), State.GRANTED)):
         user.handle(event, 10.0)
@@ -140,7 +140,7 @@ def test_what_else_goes_to_another_user_is_none_of_its_business(user, other):
     assert user.counters == {}
 
 
-def test_a_pilot_request_that_overtakes_the_grant_stands_for_it(user):
+def test_a_pilot_request_that_overtakes_the_grant_implies_it(user):
     user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
     truth, *pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=0, n_frames=2), 10.5)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
@@ -151,8 +151,8 @@ def test_a_pilot_request_that_overtakes_the_grant_stands_for_it(user):
     assert user.counters == {}
 
 
-def test_a_granted_user_outlasts_the_steps_that_it_hears_nothing_of():
-    """Sounding of the last band, estimating and steering, each just within its time-out."""
+def test_the_timeout_of_a_granted_user_covers_the_steps_without_messages_to_it():
+    """These are sounding of the last band, estimating and steering."""
     waits = timeouts(0.5, 7.0)
     assert waits[State.GRANTED] > 3 * 0.5
     assert waits.keys() == {State.LISTENING, State.ACKNOWLEDGED, State.GRANTED}
@@ -161,7 +161,7 @@ def test_a_granted_user_outlasts_the_steps_that_it_hears_nothing_of():
 
 @pytest.mark.parametrize(('granted', 'deadline_s', 'reason'), [
     (False, 12.0, 'not_granted'), (True, 13.0, 'bs_silent')])
-def test_waiting_in_vain_ends_with_listening(user, granted, deadline_s, reason):
+def test_a_timeout_leads_back_to_listening(user, granted, deadline_s, reason):
     user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
     if granted:
         user.handle(m.Grant(cycle_id=7, user=4), 10.0)
@@ -173,7 +173,7 @@ def test_waiting_in_vain_ends_with_listening(user, granted, deadline_s, reason):
 
 
 @pytest.mark.parametrize('state', State)
-def test_a_user_that_is_cut_off_says_so_and_is_silent(user, state):
+def test_a_disconnected_user_logs_it_and_sends_nothing(user, state):
     user.state = state
     assert user.handle(PeersChanged(('channel', 'bs')), 1.0) == [
         LogMessage('waiting for channel, bs', warning=True)]
@@ -184,7 +184,7 @@ def test_a_user_that_is_cut_off_says_so_and_is_silent(user, state):
 
 
 @pytest.mark.parametrize('state', [State.LISTENING, State.ACKNOWLEDGED, State.GRANTED])
-def test_a_user_that_is_connected_stays_as_it_is(user, state):
+def test_a_connected_user_keeps_its_state(user, state):
     user.state = state
     assert user.handle(PeersChanged(()), 1.0) == []
     assert user.state is state
