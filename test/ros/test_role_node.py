@@ -154,7 +154,7 @@ def test_listening_twice_hears_once(bench, start, probe):
     acks, grants = bench.outlet(probe, m.Ack), bench.outlet(probe, m.Grant)
     assert acks.get_subscription_count() == 1
     for outlet, kind in ((acks, m.Ack), (acks, m.Ack), (grants, m.Grant)):
-        outlet.publish(convert.to_ros(kind(1, 1), None))
+        outlet.publish(convert.to_ros(kind(cycle_id=1, user=1), None))
     bench.until(lambda: len(role.told) == 3, 'all messages')
     assert collections.Counter(type(event) for event, _ in role.told) == {m.Ack: 2, m.Grant: 1}
 
