@@ -1,4 +1,4 @@
-"""All roles on one bus in memory: virtual clock, transport with faults, record of everything."""
+"""All roles on one bus in memory, with a virtual clock, faults and a log of all messages."""
 
 import dataclasses
 import enum
@@ -44,15 +44,15 @@ PEERS = {
     'bs': ('rhs_controller', 'channel', 'positioner', 'transmission'),
     'user': ('channel', 'bs'),
 }
-TAKE_CODEBOOKS = ('bs', 'rhs_controller', 'positioner', 'transmission')
+USE_CODEBOOKS = ('bs', 'rhs_controller', 'positioner', 'transmission')
 LATENCY_S = 1e-3
 DATA_DURATION_S = 1e-3
-# A model file that fits no codebook.
+# A model file that does not match any codebook.
 UNFIT = 'unfit'
 
 
 class Centre:
-    """An estimator that always finds the middle of the region."""
+    """An estimator that always returns the center of the region."""
 
     def __init__(self, scenario: Scenario, name: str = 'centre') -> None:
         self._position, self.name = np.array(scenario.roi_center_m), name
@@ -67,22 +67,22 @@ class Sent(NamedTuple):
     message: m.Message
 
 
-class Said(NamedTuple):
+class Logged(NamedTuple):
     time_s: float
-    speaker: str
-    note: LogMessage
+    role: str
+    message: LogMessage
 
 
 Transport = Callable[[m.Message, str], Iterable[tuple[float, m.Message]]]
 
 
 def on_time(message: m.Message, recipient: str) -> list[tuple[float, m.Message]]:
-    """Deliver a message once; a transport returns delays and what arrives after them."""
+    """Deliver a message once; a transport returns delays and messages that arrive after them."""
     return [(LATENCY_S, message)]
 
 
 class Noisy:
-    """Loses, doubles and delays messages at random; a lost message is lost for everybody."""
+    """Loses, duplicates and delays messages at random; a lost message reaches no recipient."""
 
     def __init__(
             self, seed: int, loss: float = 0.0, doubles: float = 0.0,
@@ -103,9 +103,9 @@ class Noisy:
 class Network:
     """The roles, coupled by a bus.
 
-    `users` maps numbers to positions or mobilities; `make` makes the positioner's estimator of a
-    codebook, which takes `make_s`; `ordered` keeps the order of what one role sends to another
-    under one name.
+    `users` maps user numbers to positions or mobilities; `make` builds the estimator of a
+    codebook, which takes `make_s`; `ordered` keeps the order of messages of a class from one role
+    to another.
     """
 
     def __init__(
@@ -123,10 +123,10 @@ class Network:
             retries=retries, rest_s=rest_s, data_duration_s=DATA_DURATION_S,
             allowed_users=allowed_users, ack_rate_hz=ack_rate_hz)
         self._beacon_timeout_s = beacon_timeout_s
-        # Whether the base station was to add noise, by cycle.
+        # Whether the base station adds noise, by cycle.
         self._noise: dict[int, bool] = {}
         self.log: list[Sent] = []
-        self.notes: list[Said] = []
+        self.logs: list[Logged] = []
         self.kept: list[Any] = []
         self._ends: list[tuple[int, int, str]] = []
         self.codebooks = {} if codebook is None else {codebook.id: codebook}
@@ -139,15 +139,15 @@ class Network:
         self._mobilities = {}
         self._make = make
         self._make_s = make_s
-        self._lives = 0
-        self._awake = False
+        self._n_starts = 0
+        self._started = False
         for user, place in users.items():
             self.add_user(user, place)
         for name in (*PEERS['bs'], 'bs'):
             if name not in absent:
                 self.add(name)
-        self._awake = True
-        self._look_around()
+        self._started = True
+        self._report_missing()
 
     def __getitem__(self, name: str):
         return self._roles[name]
@@ -161,33 +161,33 @@ class Network:
         self.add(f'user{user}')
 
     def add(self, name: str) -> None:
-        """Start a role afresh."""
+        """Start a role anew."""
         role = self._roles[name] = self._build(name)
-        if name in TAKE_CODEBOOKS and self._codebook is not None:
+        if name in USE_CODEBOOKS and self._codebook is not None:
             self.dispatch(name, CodebookOffered(self._codebook))
         self._reported.pop(role, None)
-        self._look_around()
+        self._report_missing()
 
     def remove(self, name: str, noticed: bool = True) -> None:
-        """Crash a role; unless noticed, its peers are told at the next change only."""
+        """Crash a role; if not noticed, its peers detect it at the next change only."""
         del self._roles[name]
         if noticed:
-            self._look_around()
+            self._report_missing()
 
     def restart(self, name: str, noticed: bool = False) -> None:
         self.remove(name, noticed)
         self.add(name)
 
     def offer(self, codebook) -> None:
-        """Offer a codebook to all that take one, at once."""
+        """Offer a codebook to all roles that use one, at the same time."""
         self._codebook = codebook
         self.codebooks[codebook.id] = codebook
-        for name in TAKE_CODEBOOKS:
+        for name in USE_CODEBOOKS:
             if name in self._roles:
                 self.dispatch(name, CodebookOffered(codebook))
 
     def change(self, name: str, **values) -> None:
-        """Offer a role other settings: those offered last, but for these values."""
+        """Offer new settings to a role: those offered last, with these values replaced."""
         role = self._roles[name]
         self.dispatch(name, SettingsOffered(dataclasses.replace(role._settings.newest, **values)))
 
@@ -200,14 +200,14 @@ class Network:
             elif isinstance(action, SettingsReverted):
                 self.kept.append(action.settings)
             else:
-                self.notes.append(Said(self.now_s, name, action))
+                self.logs.append(Logged(self.now_s, name, action))
 
     def _make_estimator(self, name: str, action: BuildEstimator) -> None:
-        """At once, or as something that arrives when it is done."""
+        """Build an estimator, at once or with a delay."""
         def centre(codebook):
             if action.settings.model_file == UNFIT:
                 raise ModelError('model_file: unfit')
-            # The usual one has a name of its own.
+            # The default estimator has a name of its own.
             usual = action.settings == PositionerSettings()
             return Centre(self.scenario, 'centre' if usual else action.settings.estimator)
         event = build_estimator(
@@ -238,12 +238,12 @@ class Network:
                     self._queue, (time_s, next(self._serial), name, role, arriving))
 
     def run(self, until: Callable[[], bool] | None = None, limit_s: float = 60.0) -> None:
-        """Let time pass: for `limit_s`, or until something is so, which then must happen."""
+        """Run for `limit_s`, or until a condition holds, which must happen within that time."""
         end_s = self.now_s + limit_s
         since_s, events = self.now_s, 0
         while until is None or not until():
             since_s, events = (since_s, events + 1) if self.now_s == since_s else (self.now_s, 0)
-            assert events < 10_000, f'time stands still; counters {self.counters()}'
+            assert events < 10_000, f'time does not advance; counters {self.counters()}'
             due_s, name = min(
                 ((role.next_deadline(), name) for name, role in self._roles.items()
                  if role.next_deadline() is not None), default=(np.inf, ''))
@@ -262,7 +262,7 @@ class Network:
                     self.dispatch(name, message)
 
     def run_cycles(self, n: int, limit_s: float = 60.0) -> None:
-        """Run until so many more cycles have ended, one way or the other."""
+        """Run until `n` more cycles have ended, with or without service."""
         wanted = len(self._ends) + n
         self.run(lambda: len(self._ends) >= wanted, limit_s)
 
@@ -270,23 +270,23 @@ class Network:
         self.run(lambda: self._roles[name].state is state, limit_s)
 
     def sent(self, kind: type[m.Message], since: int = 0, **fields) -> list:
-        """Messages of a kind whose fields have these values, from an index of the log on."""
+        """Return messages of a class with these field values, from an index of the log on."""
         return [sent.message for sent in self.log[since:] if type(sent.message) is kind
                 and all(getattr(sent.message, k) == v for k, v in fields.items())]
 
     def outcomes(self) -> list[tuple[int, int, str]]:
-        """Cycle, user and outcome of the cycles that have ended."""
+        """Return cycle, user and outcome of the cycles that have ended."""
         return list(self._ends)
 
     def served(self) -> list[int]:
         return [user for _, user, outcome in self.outcomes() if outcome == 'served']
 
     def counters(self) -> dict[str, dict[str, int]]:
-        """What the roles that are there have counted, without those that counted nothing."""
+        """Return the counters of the roles that have counted something."""
         return {name: dict(role.counters) for name, role in self._roles.items() if role.counters}
 
-    def said(self, name: str) -> list[str]:
-        return [said.note.text for said in self.notes if said.speaker == name]
+    def logged(self, name: str) -> list[str]:
+        return [logged.message.text for logged in self.logs if logged.role == name]
 
     def verify(self) -> None:
         """Check that no result mixes cycles, users, codebooks or positions."""
@@ -317,7 +317,7 @@ class Network:
 
     def expected_signals(
             self, cycle_id: int, user: int, codebook_id: str, position: np.ndarray) -> np.ndarray:
-        """The received signals by the matrix form of the model, [N_B, N_SB, F]."""
+        """Return the received signals by the matrix form of the model, [N_B, N_SB, F]."""
         scenario = self.scenario
         shape = (scenario.n_bands, scenario.n_subbands, scenario.n_frames)
         noise = complex_normal(
@@ -341,9 +341,9 @@ class Network:
         match self._kind(name):
             case 'bs':
                 rng = streams.generator(self.seed, streams.BASE_STATION)
-                # No number comes twice, as with the clock of the node.
-                first = 1_000_000 * self._lives + 1
-                self._lives += 1
+                # Cycle ids are never repeated, as with the clock of the node.
+                first = 1_000_000 * self._n_starts + 1
+                self._n_starts += 1
                 return BaseStation(scenario, self.settings, rng, self._receive, first)
             case 'user':
                 return user_role.User(
@@ -363,9 +363,9 @@ class Network:
         rng = streams.generator(self.seed, streams.RECEIVER, user, cycle_id)
         return receive_feeds(self.scenario, codebook, feeds, rng if noise else None)
 
-    def _look_around(self) -> None:
-        """Tell those that watch their peers who is missing, where that has changed."""
-        for name in list(self._roles) if self._awake else ():
+    def _report_missing(self) -> None:
+        """Report changes of the missing roles to the roles that need them."""
+        for name in list(self._roles) if self._started else ():
             role = self._roles[name]
             missing = tuple(p for p in PEERS.get(self._kind(name), ()) if p not in self._roles)
             if self._kind(name) in PEERS and self._reported.get(role) != missing:
@@ -375,13 +375,13 @@ class Network:
 
 @pytest.fixture(scope='session')
 def scenario() -> Scenario:
-    """A scenario so small that a cycle takes milliseconds."""
+    """A small scenario; a cycle takes milliseconds."""
     return Scenario(n_subbands=3, n_frames=2, n_feeds=2, elements_per_side=4)
 
 
 @pytest.fixture(scope='session')
 def codebooks(scenario):
-    """Three codebooks for it."""
+    """Three codebooks for the small scenario."""
     return [random_codebook(scenario, np.random.default_rng(seed)) for seed in range(3)]
 
 
@@ -393,7 +393,7 @@ def places(scenario) -> np.ndarray:
 
 @pytest.fixture
 def network(scenario, codebooks, places):
-    """Function that makes a network; `users` is a number of users or a mapping."""
+    """Function that returns a network; `users` is a number of users or a mapping."""
     def make(users=1, codebook=codebooks[0], **options) -> Network:
         if isinstance(users, int):
             users = {user: places[user - 1] for user in range(1, users + 1)}
@@ -418,7 +418,7 @@ def subscriptions() -> dict[str, tuple[type[m.Message], ...]]:
 
 @pytest.fixture(scope='session')
 def example(scenario):
-    """Function that makes a message of a kind: zeros, or random numbers, except what is given."""
+    """Function that returns a message of a class with zeros or random numbers, or given values."""
     def make(kind: type[m.Message], rng: np.random.Generator | None = None, **given) -> m.Message:
         sizes, values = scenario.sizes, {}
         fields = dataclasses.fields(kind)

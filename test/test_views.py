@@ -69,9 +69,11 @@ def test_rviz_lists_the_namespaces_of_all_markers(rviz, small):
     scenario, position, stamp = small.scenario, np.array([9.0, 1.0, 0.0]), Time()
     scene = [
         markers.board(scenario, None, stamp), markers.region(scenario, stamp),
-        markers.truth(m.GroundTruth(0, 1, position, np.zeros(3)), stamp),
+        markers.truth(m.GroundTruth(cycle_id=0, user=1, position=position, velocity=np.zeros(3)),
+            stamp),
         markers.estimate(m.PositionEstimate(
-            1, 1, 'cb', position, np.eye(3), 0.1, 'bayes', 0.01), stamp),
+            cycle_id=1, user=1, codebook_id='cb', position=position, covariance_m2=np.eye(3),
+                crlb_m2=0.1, estimator='bayes', latency_s=0.01), stamp),
         markers.beam(beam_pattern(scenario, steer(scenario, position), 10.0), 1, stamp)]
     (display,) = [one for one in rviz['Displays'] if one['Class'].endswith('/MarkerArray')]
     assert set(display['Namespaces']) == {marker.ns for marker in scene}

@@ -52,7 +52,8 @@ class Radio(PlainRole):
                 configuration = self._applied[pilot.band][pilot.frame]
                 feeds = self._measure(pilot.band, configuration, pilot)
                 answers.append(Send(m.FeedSignals(
-                    pilot.cycle_id, pilot.user, pilot.band, pilot.frame, feeds)))
+                    cycle_id=pilot.cycle_id, user=pilot.user, band=pilot.band, frame=pilot.frame,
+                    signals=feeds)))
             else:
                 # Pilots of unfinished cycles leave the queue at its other end.
                 self._waiting.append(pilot)

@@ -1,7 +1,7 @@
-"""The directive ``generated``: parts of pages that the code itself writes.
+"""The directive ``generated``: parts of pages that are generated from the code.
 
-``.. generated:: parameters`` calls the function of that name below; what it returns is
-reStructuredText, or SVG.
+``.. generated:: parameters`` calls the function of that name below, which returns
+reStructuredText or SVG.
 """
 
 import ast
@@ -17,17 +17,18 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 from visualization_msgs.msg import MarkerArray
 
-from rhs_isac_ros.monitoring import role_statistics as health
-from rhs_isac_ros.protocol import base_station_table as bs_table
 from rhs_isac_ros.protocol import diagram
+from rhs_isac_ros.protocol.outcomes import Kind, Outcome
 from rhs_isac_ros.ros import parameters, qos, recording, topics
 
 ROOT = Path(__file__).parents[2]
 MESSAGES = ROOT / 'msg_defs' / 'msg'
+KINDS = {Kind.DROPPED: 'dropped message', Kind.REPEATED: 'repeated step',
+         Kind.LOST: 'lost cycle', Kind.IDLE: 'idle'}
 
 
 def table(head, rows, widths):
-    """Write a table; cells are reStructuredText of one line."""
+    """Return a table; each cell is one line of reStructuredText."""
     lines = ['.. list-table::', '   :header-rows: 1', f'   :widths: {widths}', '']
     for row in (head, *rows):
         for number, cell in enumerate(row):
@@ -36,12 +37,12 @@ def table(head, rows, widths):
 
 
 def code(text):
-    """Write a name as code; nothing for nothing."""
+    """Return a name as code; empty for an empty name."""
     return f'``{text}``' if text else ''
 
 
 def parameter_table():
-    """Every ROS parameter, from its one declaration."""
+    """Return all ROS parameters, from their declaration."""
     owners = {}
     for executable, group in parameters.NODES.items():
         for parameter in group:
@@ -57,11 +58,11 @@ def parameter_table():
 
 
 def topic_table():
-    """Every topic with type and quality of service."""
-    # Markers are for the eye, and not recorded.
-    outlets = {topics.MARKERS: (MarkerArray, qos.EXCHANGE), **recording.recorded_topics()}
+    """Return all topics with type and quality of service."""
+    # Markers are published but not recorded.
+    publishers = {topics.MARKERS: (MarkerArray, qos.EXCHANGE), **recording.recorded_topics()}
     rows = []
-    for name, (kind, profile) in sorted(outlets.items()):
+    for name, (kind, profile) in sorted(publishers.items()):
         kept = 'latched' if profile is qos.LATCHED else f'last {profile.depth}'
         text = recording.type_name(kind).replace('/msg/', '/')
         shown = f':ref:`{text} <message-{kind.__name__.lower()}>`' if text.startswith(
@@ -71,49 +72,49 @@ def topic_table():
 
 
 def message_list():
-    """Every message of the protocol, as its file says it."""
+    """Return the definitions of all messages, from their files."""
     parts = []
     for path in sorted(MESSAGES.glob('*.msg')):
         text = path.read_text(encoding='utf-8').rstrip()
         head = re.match(r'((?:#.*\n)*)', text)[1]
-        told = ' '.join(line.lstrip('# ').strip() for line in head.splitlines())
+        description = ' '.join(line.lstrip('# ').strip() for line in head.splitlines())
         title = path.stem
         body = '\n'.join(f'   {line}'.rstrip() for line in text[len(head):].splitlines())
         parts.append(f'.. _message-{title.lower()}:\n\n{title}\n{"^" * len(title)}\n\n'
-                     f'{told.replace("`", "``")}\n\n.. code-block:: none\n\n{body}\n')
+                     f'{description.replace("`", "``")}\n\n.. code-block:: none\n\n{body}\n')
     return '\n'.join(parts)
 
 
 def state_picture(role):
-    """The state diagram of a role."""
+    """Return the state diagram of a role."""
     return diagram.svg(role)
 
 
 def state_table(role):
-    """All rows of the table of a role."""
-    rows = [tuple(code(cell) if number not in (0, 2) or cell not in ('any', 'the same') else cell
-                  for number, cell in enumerate(row)) for row in diagram.rows(role)]
-    return table(('state', 'input', 'next state', 'actions', 'counts'), rows, '18 22 18 27 15')
+    """Return all rows of the table of a role."""
+    def cell(number, text):
+        plain = number == 0 or text == 'the same'
+        return text if plain else code(text)
+    rows = [tuple(cell(number, text) for number, text in enumerate(row))
+            for row in diagram.rows(role)]
+    return table(diagram.HEAD, rows, '14 17 17 14 24 14')
 
 
 def cycle_sequence():
-    """The messages of one cycle, as the roles exchange them."""
+    """Return a sequence diagram of one cycle."""
     return sequence.svg()
 
 
 def outcome_table():
-    """What can end a cycle without service, and what is counted besides."""
-    rows = [(code(name), 'ends the cycle') for name in sorted(health.CYCLE_ENDS)]
-    rows.append((code(bs_table.TABLE[bs_table.State.BEACONING, bs_table.Input.TIMEOUT].counts),
-                 'a beacon that nobody answered'))
-    others = {row[4] for role in diagram.ROLES for row in diagram.rows(role)} - {
-        '', *health.CYCLE_ENDS, health.UNANSWERED}
-    rows += [(code(name), 'a message that was dropped') for name in sorted(others)]
-    return table(('counter', 'what it counts'), rows, '40 60')
+    """Return every outcome that a role counts, with its kind."""
+    rows = [(code(f'{kind.value}.{outcome.value}'), KINDS[kind])
+            for kind in Kind for outcome in sorted(Outcome, key=lambda outcome: outcome.value)
+            if outcome.kind is kind]
+    return table(('counter', 'kind'), rows, '40 60')
 
 
 def dependency_table():
-    """What pip must install, by what it is for: the extras of the package without a rosdep key."""
+    """Return the extras of the package that have no rosdep key: pip must install them."""
     tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
     (extras,) = [ast.literal_eval(node.value) for node in ast.walk(tree)
                  if isinstance(node, ast.keyword) and node.arg == 'extras_require']
@@ -129,16 +130,16 @@ def dependency_table():
 
 
 def module_list(package):
-    """What a package offers, then each of its modules in full."""
+    """Return the public names of a package, then each of its modules in full."""
     home = importlib.import_module(package)
     parts = []
-    offered = [getattr(home, name) for name in getattr(home, '__all__', ())]
-    own = [f'* :py:obj:`~{item.__module__}.{item.__qualname__}`' for item in offered
+    public = [getattr(home, name) for name in getattr(home, '__all__', ())]
+    entries = [f'* :py:obj:`~{item.__module__}.{item.__qualname__}`' for item in public
            if getattr(item, '__module__', '').startswith('rhs_isac_ros')
            and hasattr(item, '__qualname__')]
-    if own:
-        parts.append(f'``from {package} import`` one of:\n\n' + '\n'.join(own) + '\n')
-    parts += [f'.. autofunction:: {package}.{item.__name__}\n' for item in offered
+    if entries:
+        parts.append(f'``from {package} import`` one of:\n\n' + '\n'.join(entries) + '\n')
+    parts += [f'.. autofunction:: {package}.{item.__name__}\n' for item in public
               if getattr(item, '__module__', '') == package]
     for info in pkgutil.iter_modules(home.__path__):
         if info.ispkg or info.name.startswith('_'):
@@ -155,7 +156,7 @@ FUNCTIONS = {function.__name__: function for function in (
 
 
 class Generated(SphinxDirective):
-    """Calls a function, and puts in its place what it returns."""
+    """Replaced by the result of a function."""
 
     required_arguments = 1
     optional_arguments = 1

@@ -1,4 +1,4 @@
-"""A picture of one cycle: the roles themselves exchange the messages that it shows."""
+"""A sequence diagram of one cycle, from the messages that the roles exchange."""
 
 import collections
 import html
@@ -28,7 +28,7 @@ from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros.topics import NAMES
 
-# The roles in the order of the picture.
+# Roles, in the order of the columns.
 RECEIVES = {'user': User.RECEIVES, 'channel': Channel.RECEIVES, 'bs': BaseStation.RECEIVES,
             'rhs_controller': RhsController.RECEIVES, 'positioner': Positioner.RECEIVES,
             'transmission': Transmission.RECEIVES}
@@ -38,7 +38,7 @@ _STYLE = ('text{font:11px monospace;fill:#222}.role{font-weight:bold;font-size:1
 
 
 class _Centre:
-    """An estimator that needs no time: the picture shows messages, not positions."""
+    """A fast estimator: the diagram does not show positions."""
 
     name = 'centre'
 
@@ -50,7 +50,7 @@ class _Centre:
 
 
 def cycle():
-    """Run the roles until a user is served; return (sender, message) in order."""
+    """Run the roles until a user is served; return pairs (sender, message) in order."""
     scenario = Scenario(n_subbands=2, n_frames=2, n_feeds=2, elements_per_side=4)
     codebook = random_codebook(scenario, np.random.default_rng(0))
     roles = {
@@ -66,31 +66,31 @@ def cycle():
     }
     sent, queue, now_s = [], collections.deque(), 0.0
 
-    def tell(name, event):
+    def dispatch(name, event):
         for action in roles[name].handle(event, now_s):
             if isinstance(action, BuildEstimator):
-                tell(name, build_estimator(
+                dispatch(name, build_estimator(
                     action.codebook, lambda codebook: _Centre(scenario), lambda: 0.0))
             elif isinstance(action, Send):
                 sent.append((name, action.message))
                 queue.extend((other, action.message) for other, kinds in RECEIVES.items()
                              if other != name and type(action.message) in kinds)
     for name in ('rhs_controller', 'transmission', 'positioner', 'bs'):
-        tell(name, CodebookOffered(codebook))
+        dispatch(name, CodebookOffered(codebook))
     for name in ('user', 'bs'):
-        tell(name, PeersChanged(()))
+        dispatch(name, PeersChanged(()))
     while not any(getattr(message, 'outcome', '') for _, message in sent):
         if queue:
-            tell(*queue.popleft())
+            dispatch(*queue.popleft())
         else:
             now_s = roles['bs'].next_deadline()
-            tell('bs', Tick())
+            dispatch('bs', Tick())
     assert sent[-1][1].outcome == 'served', sent[-1]
     return sent
 
 
 def svg():
-    """Draw the cycle: a column for each role, a row for each message; runs of equals are one."""
+    """Return an SVG document: a column for each role, a row for each run of equal messages."""
     rows = [(sender, kind, list(run)) for (sender, kind), run in itertools.groupby(
         cycle(), key=lambda item: (item[0], type(item[1])))]
     place = {name: _LEFT + _COLUMN * number for number, name in enumerate(RECEIVES)}
@@ -103,12 +103,12 @@ def svg():
     for number, (sender, kind, run) in enumerate(rows):
         y = _TOP + _ROW * (number + 1)
         label = NAMES[kind] + _detail([message for _, message in run])
-        takers = [name for name, kinds in RECEIVES.items() if kind in kinds and name != sender]
+        recipients = [name for name, kinds in RECEIVES.items() if kind in kinds and name != sender]
         if kind is m.Data:
-            takers = (['channel'] if run[0][1].stage is m.Stage.OFFERED else
+            recipients = (['channel'] if run[0][1].stage is m.Stage.OFFERED else
                       ['user' if run[0][1].direction is m.Direction.DOWNLINK else 'bs'])
         last = sender == list(RECEIVES)[-1]
-        parts += _arrows(place[sender], [place[name] for name in takers], y, label, last)
+        parts += _arrows(place[sender], [place[name] for name in recipients], y, label, last)
     return (f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
             f'viewBox="0 0 {width} {height}" role="img"><title>One cycle</title>'
             f'<style>{_STYLE}</style>{"".join(parts)}</svg>')
@@ -125,7 +125,7 @@ def _detail(messages):
 
 
 def _arrows(begin, ends, y, label, last):
-    """From a sender to all that take it; the label stands at the sender, left of the last one."""
+    """Return arrows from a sender to all recipients, with a label next to the sender."""
     parts = [f'<circle cx="{begin}" cy="{y}" r="3"/>']
     for end in ends:
         tip = 7 if end < begin else -7

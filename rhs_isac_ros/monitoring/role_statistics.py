@@ -7,32 +7,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rhs_isac_ros.protocol import base_station_table as bs_table
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol import user
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, PeersChanged, Send
-from rhs_isac_ros.protocol.state_machine import Transition
+from rhs_isac_ros.protocol.outcomes import Outcome, kind_of
 
 # Percentiles are computed over this number of newest durations.
 _MAX_DURATIONS = 512
 _PERCENTS = (50, 95, 99)
-# Of the counters of a role: beacons without an ack, or none at all; steps that were asked for
-# again; and what ends a cycle, as base station or user see it. All else was dropped.
-UNANSWERED = bs_table.TABLE[bs_table.State.BEACONING, bs_table.Input.TIMEOUT].counts
-USER_LOST = 'user_lost'
-NO_BEACON = user.TABLE[user.State.LISTENING, user.Input.TIMEOUT].counts
-RETRIES = frozenset(
-    step.counts for table, name in ((bs_table.TABLE, 'retry'), (user.TABLE, 'same_request'))
-    for (_, event), step in table.items() if event.value == name)
-
-
-def _ends(table: Mapping[tuple, Transition]) -> frozenset[str]:
-    """Counters of the rows that give a cycle up."""
-    return frozenset(step.counts for (_, event), step in table.items() if step.counts and (
-        event.value in ('timeout', 'no_fix') or step.counts == 'abandoned'))
-
-
-CYCLE_ENDS = (_ends(bs_table.TABLE) | _ends(user.TABLE)) - {UNANSWERED, NO_BEACON}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,11 +127,12 @@ class RoleStatistics:
         if self._served:
             values['cycles.served'] = str(self._served)
         for reason, count in sorted(counters.items()):
-            values[f'{_section(reason)}.{reason}'] = str(count)
+            values[f'{kind_of(reason).value}.{reason}'] = str(count)
         for section, counts in (('received', self._received), ('sent', self._sent)):
             values |= {f'{section}.{name}': str(count) for name, count in sorted(counts.items())}
         values |= self._percentiles()
-        total = sum(count for reason, count in counters.items() if reason != UNANSWERED)
+        total = sum(count for reason, count in counters.items()
+                    if reason != Outcome.UNANSWERED.value)
         new_faults, self._faults = total - self._faults, total
         if self._missing_roles:
             return Report(True, f'waiting for {", ".join(self._missing_roles)}', values)
@@ -176,12 +158,3 @@ class RoleStatistics:
                 for name, durations_s in self._durations_s.items()
                 for percent, value in zip(
                     _PERCENTS, np.percentile(durations_s, _PERCENTS), strict=True)}
-
-
-def _section(reason: str) -> str:
-    """What a counter is about."""
-    if reason in (UNANSWERED, NO_BEACON, USER_LOST):
-        return 'beacons'
-    if reason in RETRIES:
-        return 'retries'
-    return 'cycles' if reason in CYCLE_ENDS else 'dropped'

@@ -1,4 +1,4 @@
-"""Whose acks a base station takes, and how many of them."""
+"""Restrictions on the acks that a base station accepts."""
 
 import collections
 import math
@@ -9,69 +9,63 @@ _LAST_USER = 2**32 - 1
 
 
 class AckFilter:
-    """Refuses acks of users that are not allowed, and of those that send too many.
+    """Restricts acks to a list of users, and the number of acks of each user in a second.
 
     Parameters
     ----------
     allowed
-        Numbers of the users, as `parse_users` returns them; empty: all.
+        Numbers of the users, as returned by `parse_users`; empty: all.
     rate_hz
-        Acks that it takes of each user in a second.
+        Maximum number of acks of each user in a second.
     """
 
     def __init__(self, allowed: tuple[range, ...] = (), rate_hz: float = math.inf) -> None:
         self._allowed, self._rate_hz = allowed, rate_hz
-        # Acks by user in the present second; the next one forgets them, whoever they are of.
+        # Acks by user in one second; all are discarded with the next, which bounds the memory.
         self._acks: collections.Counter[int] = collections.Counter()
         self._second: int | None = None
 
-    def refusal(self, user: int, now_s: float) -> str:
-        """Count an ack, and tell why it is refused.
+    def allows(self, user: int) -> bool:
+        """Return whether acks of a user may be accepted at all."""
+        return not self._allowed or any(user in numbers for numbers in self._allowed)
+
+    def within_rate(self, user: int, now_s: float) -> bool:
+        """Return whether another ack of a user is within the rate.
 
         Parameters
         ----------
-        user
-            Whose ack it is.
         now_s
-            The time, on any clock that only goes forward [s].
-
-        Returns
-        -------
-        str
-            ``not_allowed`` or ``too_often``; empty if it is taken.
+            Time on any monotonic clock [s].
         """
-        if self._allowed and not any(user in numbers for numbers in self._allowed):
-            return 'not_allowed'
+        counted = self._acks[user] if math.floor(now_s) == self._second else 0
+        return counted + 1 <= self._rate_hz
+
+    def count(self, user: int, now_s: float) -> None:
+        """Count an ack of a user, at a time on the clock of `within_rate` [s]."""
         second = math.floor(now_s)
         if second != self._second:
             self._second = second
             self._acks.clear()
         self._acks[user] += 1
-        return 'too_often' if self._acks[user] > self._rate_hz else ''
 
 
 def parse_users(text: str) -> tuple[range, ...]:
-    """Read a list of users, such as ``1, 4, 10-20``.
+    """Parse a list of users, such as ``1, 4, 10-20``.
 
     Parameters
     ----------
     text
-        Numbers from 1 and ranges of them, with commas; or nothing.
-
-    Returns
-    -------
-    tuple of range
-        The numbers; none for an empty text.
+        Numbers from 1 and ranges, separated by commas; may be empty.
 
     Raises
     ------
     ValueError
-        If a part is neither a number nor a range that goes up.
+        If a part is neither a number nor an ascending range.
     """
-    return tuple(_range_of(part) for part in text.split(',')) if text.strip() else ()
+    return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
 
 
-def _range_of(part: str) -> range:
+def _parse_range(part: str) -> range:
     match = _RANGE.fullmatch(part)
     first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, 0)
     if not 1 <= first <= last <= _LAST_USER:

@@ -1,152 +1,175 @@
-"""States, inputs and transitions of the base station."""
+"""The table of the base station: every event, in the order in which its rows are tried."""
 
-import enum
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Callable, Iterable
 
-from rhs_isac_ros.protocol.settings import BaseStationSettings
-from rhs_isac_ros.protocol.state_machine import ANY, SAME, Transition
-
-
-class State(enum.Enum):
-    """States of the base station."""
-
-    WAITING = 'waiting'            # for a codebook and for the other roles
-    RESTING = 'resting'            # between cycles
-    BEACONING = 'beaconing'        # for acks
-    CONFIGURING = 'configuring'    # for the surface to take a band's configurations
-    SOUNDING = 'sounding'          # for the feed signals of a band
-    ESTIMATING = 'estimating'      # for the position
-    STEERING = 'steering'          # for the beam, and the surface to take it
-    TRANSMITTING = 'transmitting'  # for the uplink data
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_states import NOT_BEACONING, State
+from rhs_isac_ros.protocol.base_station_steps import BaseStationSteps as Steps
+from rhs_isac_ros.protocol.events import (
+    Action,
+    CodebookOffered,
+    PeersChanged,
+    SettingsOffered,
+    Tick,
+)
+from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.state_machine import EventT, Transition
 
 
-class Input(enum.Enum):
-    """Names of what can happen to the base station."""
-
-    READY = 'ready'
-    NOT_READY = 'not_ready'
-    CODEBOOK = 'codebook'
-    SETTINGS = 'settings'
-    PEERS = 'peers'
-    RETRY = 'retry'
-    TIMEOUT = 'timeout'
-    WINDOW_OVER = 'window_over'
-    ACK = 'ack'
-    LAST_ACK = 'last_ack'
-    LATE_ACK = 'late_ack'
-    CONFIGURED = 'configured'
-    FRAME = 'frame'
-    LAST_FRAME_OF_BAND = 'last_frame_of_band'
-    LAST_FRAME = 'last_frame'
-    ESTIMATE = 'estimate'
-    NO_FIX = 'no_fix'
-    BEAM = 'beam'
-    BEAM_APPLIED = 'beam_applied'
-    BEAM_READY = 'beam_ready'
-    DELIVERED = 'delivered'
-    OTHER_DATA = 'other_data'
-    DUPLICATE = 'duplicate'
-    WRONG_CYCLE = 'wrong_cycle'
-    WRONG_USER = 'wrong_user'
-    WRONG_BAND = 'wrong_band'
-    WRONG_CODEBOOK = 'wrong_codebook'
-    NOT_ALLOWED = 'not_allowed'
-    TOO_OFTEN = 'too_often'
-    CROWDED = 'crowded'
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Row(Transition[State, Steps, EventT]):
+    """A row of the base station's table."""
 
 
-# States that are part of a granted cycle: each waits for an answer, and may ask for it again.
-STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
+def give_up(
+        source: State, event: type[EventT], outcome: Outcome,
+        before: tuple[Callable[[Steps, EventT, float], Iterable[Action] | None], ...] = (),
+) -> Row[EventT]:
+    """Return a row that ends the cycle without service; `outcome` is counted and published."""
+    def abandon(role: Steps, event: EventT, now_s: float) -> list[Action]:
+        return role.abandon(outcome, now_s)
+
+    return Row(source=(source,), event=event, actions=(*before, abandon), target=State.RESTING,
+               outcome=outcome)
 
 
-def timeouts(settings: BaseStationSettings) -> dict[State, float]:
-    """Return the time-outs of the base station.
+TABLE = (
+    # Offers and presence. A codebook and settings apply from the next cycle on.
+    Row(source=(State.WAITING,), event=CodebookOffered, guard=Steps.peers_present,
+        actions=(Steps.store_codebook, Steps.begin_cycle), target=State.BEACONING),
+    Row(source=(State.WAITING,), event=CodebookOffered,
+        actions=(Steps.store_codebook, Steps.log_not_ready)),
+    Row(event=CodebookOffered, actions=(Steps.store_codebook,)),
 
-    Parameters
-    ----------
-    settings
-        How it works.
+    Row(source=(State.WAITING,), event=PeersChanged, guard=Steps.ready_with_peers,
+        actions=(Steps.store_peers, Steps.begin_cycle), target=State.BEACONING),
+    Row(source=(State.WAITING,), event=PeersChanged,
+        actions=(Steps.store_peers, Steps.log_not_ready)),
+    Row(event=PeersChanged, actions=(Steps.store_peers,)),
 
-    Returns
-    -------
-    dict
-        Time-outs by state [s].
-    """
-    patience_s = settings.step_timeout_s / (settings.retries + 1)
-    return {State.RESTING: settings.rest_s, State.BEACONING: settings.ack_timeout_s,
-            **dict.fromkeys(STEPS, patience_s)}
+    Row(source=(State.WAITING,), event=SettingsOffered,
+        actions=(Steps.store_settings, Steps.apply_settings)),
+    Row(source=(State.RESTING,), event=SettingsOffered,
+        actions=(Steps.store_settings, Steps.apply_settings), restart_timeout=True),
+    Row(event=SettingsOffered, actions=(Steps.store_settings,)),
 
+    # Time-outs.
+    Row(source=(State.RESTING,), event=Tick, guard=Steps.not_ready,
+        actions=(Steps.log_not_ready,), target=State.WAITING),
+    Row(source=(State.RESTING,), event=Tick, actions=(Steps.begin_cycle,),
+        target=State.BEACONING),
 
-S, I = State, Input  # noqa: E741
+    Row(source=(State.BEACONING,), event=Tick, guard=Steps.some_acks,
+        actions=(Steps.grant, Steps.command_next_band, Steps.announce_positioning),
+        target=State.CONFIGURING),
+    Row(source=(State.BEACONING,), event=Tick, guard=Steps.not_ready,
+        actions=(Steps.log_not_ready,), target=State.WAITING),
+    Row(source=(State.BEACONING,), event=Tick,
+        actions=(Steps.apply_settings, Steps.beacon_again), outcome=Outcome.UNANSWERED,
+        restart_timeout=True),
 
-TABLE: Mapping[tuple[State | None, Input], Transition] = {
-    # Between cycles.
-    (S.WAITING, I.READY): Transition(S.BEACONING, ('keep', 'begin_cycle')),
-    (S.WAITING, I.NOT_READY): Transition(SAME, ('keep', 'complain')),
-    (S.RESTING, I.TIMEOUT): Transition(S.BEACONING, ('begin_cycle',)),
-    (S.RESTING, I.NOT_READY): Transition(S.WAITING, ('complain',)),
-    (ANY, I.CODEBOOK): Transition(SAME, ('keep',)),
-    # Settings hold from the end of the present cycle on.
-    (S.WAITING, I.SETTINGS): Transition(SAME, ('keep_settings', 'settle')),
-    (S.RESTING, I.SETTINGS): Transition(SAME, ('keep_settings', 'settle'), rearm=True),
-    (ANY, I.SETTINGS): Transition(SAME, ('keep_settings',)),
-    (ANY, I.PEERS): Transition(SAME, ('keep',)),
-    # Beaconing.
-    (S.BEACONING, I.ACK): Transition(SAME, ('note_ack',)),
-    (S.BEACONING, I.LAST_ACK): Transition(
-        S.CONFIGURING, ('note_ack', 'grant', 'command_band', 'announce_positioning')),
-    (S.BEACONING, I.WINDOW_OVER): Transition(
-        S.CONFIGURING, ('grant', 'command_band', 'announce_positioning')),
-    (S.BEACONING, I.NOT_READY): Transition(S.WAITING, ('complain',)),
-    (S.BEACONING, I.TIMEOUT): Transition(
-        SAME, ('settle', 'beacon_again'), counts='unanswered', rearm=True),
-    (ANY, I.LATE_ACK): Transition(SAME, ('welcome',), counts='late_ack'),
-    # Positioning.
-    (S.CONFIGURING, I.CONFIGURED): Transition(S.SOUNDING, ('request_pilots',)),
-    (S.CONFIGURING, I.RETRY): Transition(SAME, ('command_again',), counts='retry_rhs', rearm=True),
-    (S.CONFIGURING, I.TIMEOUT): Transition(S.RESTING, ('abandon',), counts='rhs_silent'),
-    (S.SOUNDING, I.CONFIGURED): Transition(SAME),
-    (S.SOUNDING, I.FRAME): Transition(SAME, ('keep_frame',)),
-    (S.SOUNDING, I.LAST_FRAME_OF_BAND): Transition(S.CONFIGURING, ('keep_frame', 'command_band')),
-    (S.SOUNDING, I.LAST_FRAME): Transition(S.ESTIMATING, ('keep_frame', 'deliver')),
-    # The surface too: the channel may not have heard what it reported.
-    (S.SOUNDING, I.RETRY): Transition(
-        SAME, ('command_again', 'request_pilots'), counts='retry_band', rearm=True),
-    (S.SOUNDING, I.TIMEOUT): Transition(S.RESTING, ('forget_user', 'abandon'), counts='user_gone'),
-    (S.ESTIMATING, I.ESTIMATE): Transition(S.STEERING),
-    (S.ESTIMATING, I.NO_FIX): Transition(S.RESTING, ('abandon',), counts='no_fix'),
-    (S.ESTIMATING, I.RETRY): Transition(
-        SAME, ('deliver_again',), counts='retry_position', rearm=True),
-    (S.ESTIMATING, I.TIMEOUT): Transition(S.RESTING, ('abandon',), counts='positioner_silent'),
-    # Transmission. Beam and configuration come from two nodes, in either order.
-    (S.ESTIMATING, I.BEAM): Transition(S.STEERING, ('keep_beam',)),
-    (S.STEERING, I.ESTIMATE): Transition(SAME),
-    (S.STEERING, I.BEAM): Transition(SAME, ('keep_beam',)),
-    (S.ESTIMATING, I.BEAM_APPLIED): Transition(S.STEERING, ('keep_applied',)),
-    (S.STEERING, I.BEAM_APPLIED): Transition(SAME, ('keep_applied',)),
-    (S.STEERING, I.BEAM_READY): Transition(S.TRANSMITTING, ('keep_beam', 'offer_data')),
-    # From the start: who heard its part already answers the same again.
-    (S.STEERING, I.RETRY): Transition(SAME, ('deliver_again',), counts='retry_beam', rearm=True),
-    (S.STEERING, I.TIMEOUT): Transition(S.RESTING, ('abandon',), counts='transmission_silent'),
-    (S.RESTING, I.DELIVERED): Transition(SAME, counts='duplicate'),
-    (S.TRANSMITTING, I.DELIVERED): Transition(S.RESTING, ('finish',)),
-    # The channel may not have heard the beam, or that the surface took it.
-    (S.TRANSMITTING, I.RETRY): Transition(
-        SAME, ('deliver_again', 'offer_again'), counts='retry_data', rearm=True),
-    # What was asked for twice may be answered twice.
-    (S.TRANSMITTING, I.ESTIMATE): Transition(SAME, counts='duplicate'),
-    (S.TRANSMITTING, I.BEAM): Transition(SAME, counts='duplicate'),
-    (S.TRANSMITTING, I.BEAM_READY): Transition(SAME, counts='duplicate'),
-    (S.TRANSMITTING, I.TIMEOUT): Transition(S.RESTING, ('abandon',), counts='data_lost'),
-    (ANY, I.OTHER_DATA): Transition(SAME),
-    # What belongs to no step is dropped.
-    (ANY, I.DUPLICATE): Transition(SAME, counts='duplicate'),
-    (ANY, I.WRONG_CYCLE): Transition(SAME, counts='wrong_cycle'),
-    (ANY, I.WRONG_USER): Transition(SAME, counts='wrong_user'),
-    (ANY, I.WRONG_BAND): Transition(SAME, counts='wrong_band'),
-    (ANY, I.WRONG_CODEBOOK): Transition(SAME, counts='wrong_codebook'),
-    # Acks that the gate or the roster refuses.
-    (ANY, I.NOT_ALLOWED): Transition(SAME, counts='not_allowed'),
-    (ANY, I.TOO_OFTEN): Transition(SAME, counts='too_often'),
-    (ANY, I.CROWDED): Transition(SAME, counts='crowded'),
-}
+    Row(source=(State.CONFIGURING,), event=Tick, guard=Steps.may_retry,
+        actions=(Steps.command_band,), outcome=Outcome.RETRY_RHS, restart_timeout=True),
+    give_up(State.CONFIGURING, Tick, Outcome.RHS_SILENT),
+
+    # The command too: the channel may have missed the report of the RHS.
+    Row(source=(State.SOUNDING,), event=Tick, guard=Steps.may_retry,
+        actions=(Steps.command_band, Steps.request_pilots), outcome=Outcome.RETRY_BAND,
+        restart_timeout=True),
+    give_up(State.SOUNDING, Tick, Outcome.USER_GONE, before=(Steps.remove_user,)),
+
+    Row(source=(State.ESTIMATING,), event=Tick, guard=Steps.may_retry,
+        actions=(Steps.resend_signals,), outcome=Outcome.RETRY_POSITION, restart_timeout=True),
+    give_up(State.ESTIMATING, Tick, Outcome.POSITIONER_SILENT),
+
+    # From the start of the chain: roles repeat their replies to repeated messages.
+    Row(source=(State.STEERING,), event=Tick, guard=Steps.may_retry,
+        actions=(Steps.resend_signals,), outcome=Outcome.RETRY_BEAM, restart_timeout=True),
+    give_up(State.STEERING, Tick, Outcome.TRANSMISSION_SILENT),
+
+    # The channel may have missed the beam or its configuration.
+    Row(source=(State.TRANSMITTING,), event=Tick, guard=Steps.may_retry,
+        actions=(Steps.resend_signals, Steps.send_downlink), outcome=Outcome.RETRY_DATA,
+        restart_timeout=True),
+    give_up(State.TRANSMITTING, Tick, Outcome.DATA_LOST),
+
+    # Acks. All but the refused ones count towards the user's rate.
+    Row(event=m.Ack, guard=Steps.not_allowed, outcome=Outcome.NOT_ALLOWED),
+    Row(event=m.Ack, guard=Steps.too_often, outcome=Outcome.TOO_OFTEN),
+    Row(event=m.Ack, guard=Steps.wrong_cycle, actions=(Steps.count_ack,),
+        outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.Ack, guard=Steps.duplicate_ack, actions=(Steps.count_ack,),
+        outcome=Outcome.DUPLICATE),
+    Row(event=m.Ack, guard=Steps.crowded, actions=(Steps.count_ack,), outcome=Outcome.CROWDED),
+    # A late ack: the cycle is granted, and the next one waits for the user too.
+    Row(source=NOT_BEACONING, event=m.Ack, actions=(Steps.count_ack, Steps.register_user),
+        outcome=Outcome.LATE_ACK),
+    Row(source=(State.BEACONING,), event=m.Ack, guard=Steps.last_ack,
+        actions=(Steps.count_ack, Steps.accept_ack, Steps.grant, Steps.command_next_band,
+                 Steps.announce_positioning),
+        target=State.CONFIGURING),
+    Row(source=(State.BEACONING,), event=m.Ack, actions=(Steps.count_ack, Steps.accept_ack)),
+
+    # Reports of the RHS: a band's configurations, or the configuration of the beam.
+    Row(event=m.RhsConfiguration, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.RhsConfiguration, guard=Steps.wrong_codebook, outcome=Outcome.WRONG_CODEBOOK),
+    Row(event=m.RhsConfiguration, guard=Steps.configures_other_band,
+        outcome=Outcome.WRONG_BAND),
+    Row(source=(State.CONFIGURING,), event=m.RhsConfiguration, guard=Steps.for_positioning,
+        actions=(Steps.request_pilots,), target=State.SOUNDING),
+    Row(source=(State.SOUNDING,), event=m.RhsConfiguration, guard=Steps.for_positioning),
+    # The beam and its configuration come from two roles, in either order.
+    Row(source=(State.ESTIMATING,), event=m.RhsConfiguration, guard=Steps.for_beam,
+        actions=(Steps.store_beam_applied,), target=State.STEERING),
+    Row(source=(State.STEERING,), event=m.RhsConfiguration, guard=Steps.for_known_beam,
+        actions=(Steps.begin_transmission,), target=State.TRANSMITTING),
+    Row(source=(State.STEERING,), event=m.RhsConfiguration, guard=Steps.for_beam,
+        actions=(Steps.store_beam_applied,)),
+    # A repeated request may be answered twice.
+    Row(source=(State.TRANSMITTING,), event=m.RhsConfiguration, guard=Steps.for_beam,
+        outcome=Outcome.DUPLICATE),
+
+    # Feed signals.
+    Row(event=m.FeedSignals, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.FeedSignals, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(event=m.FeedSignals, guard=Steps.wrong_band, outcome=Outcome.WRONG_BAND),
+    Row(event=m.FeedSignals, guard=Steps.duplicate_frame, outcome=Outcome.DUPLICATE),
+    Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_frame,
+        actions=(Steps.store_frame, Steps.send_signals), target=State.ESTIMATING),
+    Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_frame_of_band,
+        actions=(Steps.store_frame, Steps.command_next_band), target=State.CONFIGURING),
+    Row(source=(State.SOUNDING,), event=m.FeedSignals, actions=(Steps.store_frame,)),
+
+    # Position estimates.
+    Row(event=m.PositionEstimate, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.PositionEstimate, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(event=m.PositionEstimate, guard=Steps.wrong_codebook, outcome=Outcome.WRONG_CODEBOOK),
+    Row(source=(State.ESTIMATING,), event=m.PositionEstimate, target=State.STEERING),
+    Row(source=(State.STEERING,), event=m.PositionEstimate),
+    Row(source=(State.TRANSMITTING,), event=m.PositionEstimate, outcome=Outcome.DUPLICATE),
+
+    Row(event=m.NoFix, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.NoFix, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(event=m.NoFix, guard=Steps.wrong_codebook, outcome=Outcome.WRONG_CODEBOOK),
+    give_up(State.ESTIMATING, m.NoFix, Outcome.NO_FIX),
+
+    # Beams.
+    Row(event=m.Beam, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.Beam, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(event=m.Beam, guard=Steps.wrong_codebook, outcome=Outcome.WRONG_CODEBOOK),
+    Row(source=(State.ESTIMATING,), event=m.Beam, actions=(Steps.store_beam,),
+        target=State.STEERING),
+    Row(source=(State.STEERING,), event=m.Beam, guard=Steps.beam_applied,
+        actions=(Steps.store_beam, Steps.begin_transmission), target=State.TRANSMITTING),
+    Row(source=(State.STEERING,), event=m.Beam, actions=(Steps.store_beam,)),
+    Row(source=(State.TRANSMITTING,), event=m.Beam, outcome=Outcome.DUPLICATE),
+
+    # Data. Delivered uplink data end the cycle.
+    Row(event=m.Data, guard=Steps.not_delivered_uplink),
+    Row(event=m.Data, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.Data, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(source=(State.TRANSMITTING,), event=m.Data, actions=(Steps.finish,),
+        target=State.RESTING),
+    Row(source=(State.RESTING,), event=m.Data, outcome=Outcome.DUPLICATE),
+)

@@ -1,7 +1,7 @@
-"""The emulated world: air, multipath, surface and on-board propagation."""
+"""The emulated channel: line of sight, multipath, surface and on-board propagation."""
 
-import collections
 import dataclasses
+import itertools
 
 import numpy as np
 
@@ -12,21 +12,30 @@ from rhs_isac_ros.model.multipath import draw_multipath
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Send
+from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import PlainRole
 
-# Pilots and data that wait for what they need; more belong to no cycle that can be complete.
-_MOST_PENDING = 256
-# Cycles whose true position is known again when it comes late or doubled.
-_MOST_BEGUN = 8
+# Messages of each kind that wait for others; the cycle of an older one can no longer be complete.
+_MAX_PENDING = 256
+# Cycles that are remembered, to recognize late and duplicate positions.
+_MAX_REMEMBERED = 8
 
 
 class _Cycle:
-    """A user's cycle: the true position, and what the air does to its signals."""
+    """The true position of a cycle and the channel that results from it.
+
+    Attributes
+    ----------
+    los
+        Line-of-sight gains of each band, complex128 [N_SB, N_E].
+    multipath
+        Multipath gains of each band, complex128 [N_SB, F, N_E].
+    """
 
     def __init__(self, scenario: Scenario, truth: m.GroundTruth, seed: int) -> None:
         self.truth = truth
-        # Line of sight [N_SB, N_E] and multipath [N_SB, F, N_E] of each band. They are drawn now,
-        # while the others prepare, and not when the first pilot waits for them.
+        # Computed here rather than on the first pilot, while other roles prepare the cycle.
         self.los, self.multipath = [], []
         for band in range(scenario.n_bands):
             rng = streams.generator(seed, streams.CHANNEL, truth.user, truth.cycle_id, band)
@@ -38,16 +47,14 @@ class _Cycle:
 class Channel(PlainRole):
     """The role of the channel.
 
-    A pilot or a packet is answered as soon as the user's true position and the configuration that
-    the surface reports are known, in whatever order they come. The position holds for the whole
-    cycle: the network is slower than the air that it emulates.
+    It answers a pilot or a data packet once it has received the true position of the user and the
+    configuration of the surface, in any order. The position applies to the whole cycle: messages
+    take longer in the network than the signals that they emulate.
 
     Parameters
     ----------
-    scenario
-        The scenario.
     seed
-        Seed of the multipath, which depends on it, the user and the cycle alone.
+        Seed of the multipath, which depends on the seed, the user and the cycle only.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -57,98 +64,79 @@ class Channel(PlainRole):
         super().__init__()
         self._scenario, self._seed = scenario, seed
         self._cycle: _Cycle | None = None
-        # The first draw factors covariances: now, not while a user waits.
+        # The first draw factorizes covariances, which would delay the first cycle.
         draw_multipath(scenario, 0, 1, np.random.default_rng(0))
-        self._begun: collections.deque[tuple] = collections.deque(maxlen=_MOST_BEGUN)
-        # What the surface reports and which beam it holds, of any cycle that may be coming.
-        self._reports: dict[tuple[int, m.Mode, int], np.ndarray] = {}
-        self._beams: dict[tuple[int, int], m.Beam] = {}
-        self._pending: collections.deque[m.Pilot | m.Data] = collections.deque()
+        # Cycle, user and position of the cycles begun.
+        self._begun: NewestDict[tuple[float, ...], None] = NewestDict(_MAX_REMEMBERED)
+        # Configurations and beams of the present and of future cycles.
+        self._configurations: NewestDict[tuple[int, m.Mode, int], np.ndarray] = NewestDict(
+            _MAX_PENDING)
+        self._beams: NewestDict[tuple[int, int], m.Beam] = NewestDict(_MAX_PENDING)
+        # Messages to answer, in order, by serial number.
+        self._pending: NewestDict[int, m.Pilot | m.Data] = NewestDict(_MAX_PENDING)
+        self._serial = itertools.count()
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Take a message.
-
-        Parameters
-        ----------
-        event
-            The message.
-        now_s
-            The time [s].
-
-        Returns
-        -------
-        list of Action
-            Feed signals and delivered data.
-        """
+        """Process a message and return feed signals and delivered data."""
+        discarded = 0
         match event:
             case m.GroundTruth() if event.cycle_id:
                 self._begin(event)
             case m.RhsConfiguration():
-                self._reports[event.cycle_id, event.mode, event.band] = event.analog
+                discarded = self._configurations.put(
+                    (event.cycle_id, event.mode, event.band), event.analog)
             case m.Beam():
-                self._beams[event.cycle_id, event.user] = event
+                discarded = self._beams.put((event.cycle_id, event.user), event)
             case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
-                self._pending.append(event)
+                discarded = self._pending.put(next(self._serial), event)
             case _:
                 return []
-        self._forget_overflow()
-        return self._answer_pending()
+        self.count(Outcome.OVERFLOW, discarded)
+        return self._answer_pending(self._cycle) if self._cycle else []
 
     def _begin(self, truth: m.GroundTruth) -> None:
-        # The same cycle at another place is one of a base station that has started anew.
+        # A restarted base station may repeat a cycle id, with the user at another position.
         key = truth.cycle_id, truth.user, *truth.position.tolist()
         if key in self._begun:
-            self.counters['duplicate'] += 1
+            self.count(Outcome.DUPLICATE)
             return
-        self._begun.append(key)
+        self._begun.put(key, None)
         self._cycle = _Cycle(self._scenario, truth, self._seed)
-        for event in [e for e in self._pending if e.cycle_id != truth.cycle_id]:
-            self._pending.remove(event)
-            self.counters['stale'] += 1
-        for known in (self._reports, self._beams):
-            for key in [key for key in known if key[0] != truth.cycle_id]:
-                del known[key]
+        stale = [serial for serial, event in self._pending.items()
+                 if event.cycle_id != truth.cycle_id]
+        for serial in stale:
+            del self._pending[serial]
+        self.count(Outcome.STALE, len(stale))
+        for configured in [key for key in self._configurations if key[0] != truth.cycle_id]:
+            del self._configurations[configured]
+        for steered in [key for key in self._beams if key[0] != truth.cycle_id]:
+            del self._beams[steered]
 
-    def _forget_overflow(self) -> None:
-        """Drop the oldest of what belongs to no cycle that can still be complete."""
-        while len(self._pending) > _MOST_PENDING:
-            self._pending.popleft()
-            self.counters['overflow'] += 1
-        for known in (self._reports, self._beams):
-            while len(known) > _MOST_PENDING:
-                del known[next(iter(known))]
-                self.counters['overflow'] += 1
-
-    def _answer_pending(self) -> list[Action]:
-        if self._cycle is None:
-            return []
+    def _answer_pending(self, cycle: _Cycle) -> list[Action]:
         actions: list[Action] = []
-        truth = self._cycle.truth
-        # Each once; what still lacks something goes back to the end.
-        for _ in range(len(self._pending)):
-            event = self._pending.popleft()
-            if event.cycle_id == truth.cycle_id and event.user != truth.user:
-                self.counters['wrong_user'] += 1
+        for serial, event in list(self._pending.items()):
+            if event.cycle_id != cycle.truth.cycle_id:
                 continue
-            answer = None
-            if event.cycle_id == truth.cycle_id:
-                answer = self._answer(event, self._cycle)
-            if answer is None:
-                self._pending.append(event)
-            else:
+            if event.user != cycle.truth.user:
+                self.count(Outcome.WRONG_USER)
+                del self._pending[serial]
+                continue
+            answer = self._answer(event, cycle)
+            if answer is not None:
                 actions.append(Send(answer))
+                del self._pending[serial]
         return actions
 
     def _answer(self, event: m.Pilot | m.Data, cycle: _Cycle) -> m.Message | None:
-        """Answer an event of the cycle, or return None if something is still missing."""
+        """Return the answer to a message of the cycle, or None if something is missing."""
         if isinstance(event, m.Data):
             return self._deliver(event, cycle)
         applied = self._applied(m.Mode.POSITIONING, event.band, cycle)
         return None if applied is None else self._propagate(event, cycle, applied)
 
     def _applied(self, mode: m.Mode, band: int, cycle: _Cycle) -> np.ndarray | None:
-        """What the surface reports for the cycle [F or 1, N_E], if it has."""
-        return self._reports.get((cycle.truth.cycle_id, mode, band))
+        """Return the configurations that the surface reported [F or 1, N_E], or None."""
+        return self._configurations.get((cycle.truth.cycle_id, mode, band))
 
     def _propagate(self, pilot: m.Pilot, cycle: _Cycle, applied: np.ndarray) -> m.FeedSignals:
         band = pilot.band
@@ -156,10 +144,12 @@ class Channel(PlainRole):
             cycle.los[band], cycle.multipath[band][:, pilot.frame],
             complex(pilot.symbol_re, pilot.symbol_im))
         feeds = feed_signals(self._scenario, band, applied[pilot.frame], elements)
-        return m.FeedSignals(pilot.cycle_id, pilot.user, band, pilot.frame, feeds)
+        return m.FeedSignals(
+            cycle_id=pilot.cycle_id, user=pilot.user, band=band, frame=pilot.frame,
+            signals=feeds)
 
     def _deliver(self, data: m.Data, cycle: _Cycle) -> m.Data | None:
-        """Pass on what the true channel's capacity carries, and drop the rest."""
+        """Return the data within the capacity of the true channel; the rest is lost."""
         truth = cycle.truth
         beam = self._beams.get((truth.cycle_id, truth.user))
         if beam is None:

@@ -1,4 +1,4 @@
-"""What a role is told, besides messages, and what it asks for."""
+"""Events of the roles other than messages, and the actions that the roles return."""
 
 import dataclasses
 from typing import Any
@@ -11,33 +11,33 @@ from rhs_isac_ros.protocol.settings import PositionerSettings
 
 @dataclasses.dataclass(frozen=True)
 class Tick:
-    """The deadline that a role named has passed."""
+    """The deadline of the role has passed."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CodebookOffered:
-    """A codebook is to be used from the next cycle on."""
+    """A codebook is available for the next cycle."""
 
     codebook: Codebook
 
 
 @dataclasses.dataclass(frozen=True)
 class SettingsOffered:
-    """Other settings, of the class that the role has, are to be used from the next cycle on."""
+    """New settings, of the same class as those in use, take effect with the next cycle."""
 
     settings: Any
 
 
 @dataclasses.dataclass(frozen=True)
 class PeersChanged:
-    """The set of roles that a role needs and does not see has changed."""
+    """The set of missing roles, among those that a role needs, has changed."""
 
     missing: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorReady:
-    """What `BuildEstimator` asked for is there; it took `elapsed_s`."""
+    """The estimator requested by `BuildEstimator` was built in `elapsed_s` seconds."""
 
     codebook: Codebook
     estimator: Estimator
@@ -46,7 +46,7 @@ class EstimatorReady:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorFailed:
-    """What `BuildEstimator` asked for cannot be had."""
+    """The estimator requested by `BuildEstimator` could not be built."""
 
     codebook: Codebook
     reason: str
@@ -65,7 +65,7 @@ class Send:
 
 @dataclasses.dataclass(frozen=True)
 class LogMessage:
-    """Tell the person who watches; `warning` if something is amiss."""
+    """Log a text, as a warning if `warning` is set."""
 
     text: str
     warning: bool = False
@@ -73,7 +73,7 @@ class LogMessage:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BuildEstimator:
-    """Make an estimator for a codebook, meanwhile, and answer with one of two events."""
+    """Build an estimator in the background; reply with `EstimatorReady` or `EstimatorFailed`."""
 
     codebook: Codebook
     settings: PositionerSettings
@@ -81,7 +81,7 @@ class BuildEstimator:
 
 @dataclasses.dataclass(frozen=True)
 class SettingsReverted:
-    """What was offered last cannot be used: parameters are to tell these settings again."""
+    """Set the parameters back to these settings: the ones offered last cannot be used."""
 
     settings: Any
 

@@ -1,21 +1,21 @@
-"""Declaring what the fields of a message hold, and checking it."""
+"""Declarations of the valid values of message fields, and their check."""
 
 import dataclasses
 import functools
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 
 class MessageError(ValueError):
-    """A message holds something that no valid message holds."""
+    """A field of a message has an invalid value."""
 
 
 def array(
         dims: str, kind: type = float, low: float = -math.inf, high: float = math.inf,
-        may_lack: bool = False) -> Any:
+        nan_allowed: bool = False) -> Any:
     """Declare an array field.
 
     Parameters
@@ -25,94 +25,58 @@ def array(
     kind
         ``float`` or ``complex``.
     low, high
-        Range of the entries, for real arrays.
-    may_lack
-        Whether entries may be NaN, for `not known`.
-
-    Returns
-    -------
-    dataclasses.Field
-        The field.
+        Range of the entries of a real array, inclusive.
+    nan_allowed
+        Whether entries may be NaN, for unknown values.
     """
     return dataclasses.field(
         metadata={'dims': tuple(dims.split()), 'kind': kind, 'low': low, 'high': high,
-                  'may_lack': may_lack})
+                  'nan_allowed': nan_allowed})
 
 
 def index(symbol: str) -> Any:
-    """Declare a field that counts from 0 to below a size.
-
-    Parameters
-    ----------
-    symbol
-        The size, a symbol of `Scenario.sizes`.
-
-    Returns
-    -------
-    dataclasses.Field
-        The field.
-    """
+    """Declare an index, from 0 to one less than a size, a symbol of `Scenario.sizes`."""
     return dataclasses.field(metadata={'below': symbol})
 
 
 def number(low: float, high: float) -> Any:
-    """Declare a number with a range.
-
-    Parameters
-    ----------
-    low, high
-        Range, inclusive.
-
-    Returns
-    -------
-    dataclasses.Field
-        The field.
-    """
+    """Declare a number with an inclusive range."""
     return dataclasses.field(metadata={'least': low, 'most': high})
 
 
 def size(symbol: str) -> Any:
-    """Declare a field that repeats a size.
-
-    Parameters
-    ----------
-    symbol
-        The size, a symbol of `Scenario.sizes`.
-
-    Returns
-    -------
-    dataclasses.Field
-        The field.
-    """
+    """Declare a field that equals a size, a symbol of `Scenario.sizes`."""
     return dataclasses.field(metadata={'equals': symbol})
 
 
-def open_float() -> Any:
-    """Declare a number that may be NaN, for `not known`.
-
-    Returns
-    -------
-    dataclasses.Field
-        The field.
-    """
+def optional_float() -> Any:
+    """Declare a number that may be NaN, for an unknown value."""
     return dataclasses.field(metadata={'open': True})
 
 
-def check(message: Any, sizes: Mapping[str, int]) -> None:
-    """Check a message's arrays, indices and numbers.
+class Checkable(Protocol):
+    """A dataclass with the fields declared here."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+    def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """Return sizes that depend on the content, by symbol."""
+        ...
+
+
+def check(message: Checkable, sizes: Mapping[str, int]) -> None:
+    """Check the arrays, indices and numbers of a message.
 
     Parameters
     ----------
-    message
-        A message, a dataclass with such fields and a method `own_sizes`.
     sizes
-        Sizes by symbol, as `Scenario.sizes` gives them.
+        Sizes by symbol, as in `Scenario.sizes`.
 
     Raises
     ------
     MessageError
-        If a shape differs, an index is too high, or a number is not finite or out of its range;
-        the text names message, field, value and what was expected.
+        If a shape differs, an index is too large, or a number is not finite or out of its range;
+        the text names the message, the field, its value and the expected value.
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
@@ -135,8 +99,8 @@ def check(message: Any, sizes: Mapping[str, int]) -> None:
 
 
 @functools.cache
-def _fields(kind: type) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-    """Name and declaration of every field."""
+def _fields(kind: type[Checkable]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+    """Return name and declaration of every field."""
     return tuple((field.name, field.metadata) for field in dataclasses.fields(kind))
 
 
@@ -144,10 +108,10 @@ def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[st
     dims = meta['dims']
     expected = [sizes[d] if d in sizes else int(d) for d in dims]
     if list(value.shape) != expected:
-        wanted = ', '.join(d if d.isdigit() else f'{d} = {e}'
+        described = ', '.join(d if d.isdigit() else f'{d} = {e}'
                            for d, e in zip(dims, expected, strict=True))
-        return f'shape {list(value.shape)}, expected [{wanted}]'
-    if not (np.isfinite(value) | (meta['may_lack'] & np.isnan(value))).all():
+        return f'shape {list(value.shape)}, expected [{described}]'
+    if not (np.isfinite(value) | (meta['nan_allowed'] & np.isnan(value))).all():
         return 'not finite, expected finite numbers'
     if meta['low'] > -math.inf and value.size and (
             value.min() < meta['low'] or value.max() > meta['high']):

@@ -13,7 +13,7 @@ class FrameBuffer:
     Parameters
     ----------
     sizes
-        The sizes of the scenario; ``N_B`` and ``F`` count here.
+        Sizes of the scenario; ``N_B`` and ``F`` are used.
     """
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
@@ -21,42 +21,19 @@ class FrameBuffer:
         self._signals: dict[tuple[int, int], np.ndarray] = {}
 
     def __contains__(self, feeds: m.FeedSignals) -> bool:
-        """Tell whether a band's frame is there already."""
+        """Return whether the frame of a band was added before."""
         return (feeds.band, feeds.frame) in self._signals
 
-    def keep(self, feeds: m.FeedSignals) -> None:
-        """Keep a frame.
-
-        Parameters
-        ----------
-        feeds
-            Its signals.
-        """
+    def add(self, feeds: m.FeedSignals) -> None:
+        """Add the signals of a frame."""
         self._signals[feeds.band, feeds.frame] = feeds.signals
 
-    def missing(self, band: int | None = None) -> int:
-        """Count what has not come yet.
-
-        Parameters
-        ----------
-        band
-            The last band that counts, from 0; by default the last of all.
-
-        Returns
-        -------
-        int
-            The number of frames.
-        """
+    def n_missing(self, band: int | None = None) -> int:
+        """Return the number of frames missing up to and including `band`; by default of all."""
         n_bands = self._n_bands if band is None else band + 1
         return n_bands * self._n_frames - len(self._signals)
 
     def stack(self) -> np.ndarray:
-        """Put all frames together; none may be missing.
-
-        Returns
-        -------
-        numpy.ndarray
-            Complex128 [N_B, F, N_SB, K].
-        """
+        """Return the signals of all frames, complex128 [N_B, F, N_SB, K]; none may be missing."""
         return np.stack([[self._signals[band, frame] for frame in range(self._n_frames)]
                          for band in range(self._n_bands)])

@@ -111,7 +111,7 @@ class ImpairedChannel:
         if not isinstance(event, m.GroundTruth) or event.cycle_id in (0, self._cycle_id):
             return []
         self._cycle_id = event.cycle_id
-        return [*self._settings.settle()]
+        return [*self._settings.apply()]
 
     def _send(self, action: Send, now_s: float) -> None:
         impairments = self._settings.in_use

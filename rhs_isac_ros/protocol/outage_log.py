@@ -1,99 +1,55 @@
-"""Saying once what is amiss, and once that it is mended."""
+"""Log messages about outages: one at the beginning of each, one at its end."""
 
 from collections.abc import Iterable
 
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.outcomes import Outcome
 
-# The reason that concerns one user; all others concern the network.
-_OF_A_USER = 'user_gone'
+# The reason that concerns one user; all others concern the whole network.
+_USER_REASON = Outcome.USER_GONE.value
 
 
 class OutageLog:
-    """Why no cycle begins, and why cycles are given up, each reason told once.
+    """Suppresses repeated log messages about the same outage.
 
-    What is waited for is told again after a cycle has begun, why one was given up after one was
-    served. That a user is gone is mended by serving that user, all else by serving anybody.
+    Missing roles are logged again after a cycle has begun, the reason of a lost cycle after
+    service has resumed: to the same user for ``user_gone``, to any user for other reasons.
     """
 
     def __init__(self) -> None:
+        # Reason and user of each outage; user 0 for the whole network.
         self._open: set[tuple[str, int]] = set()
-        self._needs: tuple[str, ...] = ()
+        self._waiting_for: tuple[str, ...] = ()
 
-    def waiting(self, needs: Iterable[str]) -> list[LogMessage]:
-        """Enter that no cycle can begin.
-
-        Parameters
-        ----------
-        needs
-            What it takes.
-
-        Returns
-        -------
-        list of Note
-            A warning, unless the same was said already.
-        """
-        said, self._needs = self._needs, tuple(needs)
-        if self._needs == said:
+    def log_waiting(self, missing: Iterable[str]) -> list[LogMessage]:
+        """Return a warning about what is missing, unless the last one had the same text."""
+        previous, self._waiting_for = self._waiting_for, tuple(missing)
+        if self._waiting_for == previous:
             return []
-        return [LogMessage(f'waiting for {", ".join(self._needs)}', warning=True)]
+        return [LogMessage(f'waiting for {", ".join(self._waiting_for)}', warning=True)]
 
-    def begun(self) -> None:
-        """Enter that a cycle has begun."""
-        self._needs = ()
+    def clear_waiting(self) -> None:
+        """Note that nothing is missing, since a cycle has begun."""
+        self._waiting_for = ()
 
     @staticmethod
-    def lost(users: Iterable[int]) -> list[LogMessage]:
-        """Enter users that are not waited for any more.
+    def log_lost_users(users: Iterable[int]) -> list[LogMessage]:
+        """Return a warning for each user that stopped answering beacons."""
+        return [LogMessage(f'user {user} no longer answers', warning=True) for user in users]
 
-        Parameters
-        ----------
-        users
-            Their numbers.
-
-        Returns
-        -------
-        list of Note
-            A warning of each.
-        """
-        return [LogMessage(f'user {user} answers no more', warning=True) for user in users]
-
-    def given_up(self, cycle_id: int, user: int, reason: str) -> list[LogMessage]:
-        """Enter a cycle that was given up.
-
-        Parameters
-        ----------
-        cycle_id, user
-            Which cycle, and whose.
-        reason
-            Why.
-
-        Returns
-        -------
-        list of Note
-            A warning, unless the same was said already.
-        """
-        key = reason, user if reason == _OF_A_USER else 0
+    def log_lost_cycle(self, cycle_id: int, user: int, reason: str) -> list[LogMessage]:
+        """Return a warning about a cycle without service, unless its reason was logged before."""
+        key = reason, user if reason == _USER_REASON else 0
         if key in self._open:
             return []
         self._open.add(key)
         return [LogMessage(f'cycle {cycle_id}: user {user} given up: {reason}', warning=True)]
 
-    def served(self, cycle_id: int, user: int) -> list[LogMessage]:
-        """Enter a cycle that was served.
-
-        Parameters
-        ----------
-        cycle_id, user
-            Which cycle, and whose.
-
-        Returns
-        -------
-        list of Note
-            What is mended by that, if anything.
-        """
-        mended = {key for key in self._open if key[1] in (0, user)}
-        if not mended:
+    def log_served_cycle(self, cycle_id: int, user: int) -> list[LogMessage]:
+        """Return a message about the outages that a served cycle ends, if any."""
+        ended = {key for key in self._open if key[1] in (0, user)}
+        if not ended:
             return []
-        self._open -= mended
-        reasons = ', '.join(sorted(reason for reason, _ in mended))
+        self._open -= ended
+        reasons = ', '.join(sorted(reason for reason, _ in ended))
         return [LogMessage(f'cycle {cycle_id}: user {user} served again after: {reasons}')]

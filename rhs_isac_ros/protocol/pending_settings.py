@@ -1,49 +1,35 @@
-"""Settings of a role: those in use, and those that wait for the end of the cycle."""
+"""Settings in use, and settings that take effect at the end of a cycle."""
 
-from typing import Any
+from typing import Generic, TypeVar
 
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.settings import changes, describe_settings, shown
 
+SettingsT = TypeVar('SettingsT')
 
-class PendingSettings:
-    """Holds settings back until the role may change.
 
-    Parameters
-    ----------
-    settings
-        Those in use.
+class PendingSettings(Generic[SettingsT]):
+    """Holds new settings back until the role may apply them.
 
     Attributes
     ----------
     in_use
-        The settings that the role works with.
+        The settings in use.
     newest
-        Those that it was given last.
+        The settings received last.
     """
 
-    def __init__(self, settings: Any) -> None:
-        self.in_use = self.newest = settings
+    def __init__(self, settings: SettingsT) -> None:
+        self.in_use = settings
+        self.newest = settings
 
-    def settle(self) -> list[LogMessage]:
-        """Use the newest settings from now on.
-
-        Returns
-        -------
-        list of Note
-            What is another now, if anything.
-        """
+    def apply(self) -> list[LogMessage]:
+        """Put the newest settings into use; return a message that lists changes, if any."""
         changed = changes(self.in_use, self.newest)
         self.in_use = self.newest
-        told = ', '.join(f'{name} {shown(value)!r}' for name, value in changed.items())
-        return [LogMessage(f'from now on: {told}')] if told else []
+        described = ', '.join(f'{name} {shown(value)!r}' for name, value in changed.items())
+        return [LogMessage(f'from now on: {described}')] if described else []
 
     def describe(self) -> dict[str, str]:
-        """Put them in words, for the diagnostics.
-
-        Returns
-        -------
-        dict
-            As of `settings.describe_settings`.
-        """
+        """Return the values in use and the pending ones, as `settings.describe_settings` does."""
         return describe_settings(self.in_use, self.newest)

@@ -1,4 +1,4 @@
-"""The positioner: turns received signals into a position."""
+"""The positioner: estimates positions from received signals."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -23,24 +23,25 @@ from rhs_isac_ros.protocol.events import (
     SettingsOffered,
     SettingsReverted,
 )
+from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
 
 class _Job(NamedTuple):
-    """An estimator to make."""
+    """What an estimator is built from."""
 
     codebook: Codebook
     settings: PositionerSettings
 
-    def is_as(self, other: '_Job | None') -> bool:
+    def equals(self, other: '_Job | None') -> bool:
         return other is not None and (self.codebook.id, self.settings) == (
             other.codebook.id, other.settings)
 
 
-class _Made(NamedTuple):
-    """An estimator, what it was made of, and what tells its bound."""
+class _Built(NamedTuple):
+    """An estimator, what it was built from, and what its bound is computed from."""
 
     job: _Job
     model: MeasurementModel
@@ -50,20 +51,18 @@ class _Made(NamedTuple):
 class Positioner(PlainRole):
     """The role of the positioner.
 
-    The received signals tell with which of the codebooks that it knows they were taken. An
-    estimator takes its time to make: one is made at a time, those for other codebooks serve
-    meanwhile, and the newest signals of its own codebook wait for it. Where there is one for the
-    same codebook, with other settings, that one serves until the new one is ready, and stays
-    where none can be made.
+    The codebook id of the received signals selects the estimator. Estimators are built one at a
+    time in the background. Meanwhile, estimators for other codebooks remain in use, and the newest
+    signals of the codebook wait for its estimator. If there is an estimator for the same codebook
+    with other settings, it remains in use until the new one is ready, and for good if the new one
+    cannot be built.
 
     Parameters
     ----------
-    scenario
-        The scenario.
     stopwatch
-        Function that returns a time [s], to measure the estimators with.
+        Callable that returns a time [s], to measure the latency of the estimators.
     settings
-        Which estimator to use, until others are offered; by default the usual one.
+        Initial settings.
     """
 
     SENDS = (m.PositionEstimate, m.NoFix)
@@ -75,94 +74,75 @@ class Positioner(PlainRole):
         super().__init__()
         self._scenario, self._stopwatch = scenario, stopwatch
         self._settings = PendingSettings(settings or PositionerSettings())
-        # Why the last change of settings came to nothing, if it did.
+        # Why the last change of settings was reverted; empty if it was not.
         self._failure = ''
-        self._estimators: CodebookCache[_Made] = CodebookCache()
+        self._estimators: CodebookCache[_Built] = CodebookCache()
         self._codebook: Codebook | None = None
-        # The estimator that is being made, and the newest one wanted since.
-        self._making: _Job | None = None
+        # The estimator that is being built, and the newest one requested since.
+        self._building: _Job | None = None
         self._next: _Job | None = None
         self._waiting: m.ReceivedSignals | None = None
-        # Whether the last signals told no position: said once in a row.
-        self._is_lost = False
-        # The signals that were answered last, and the answer.
+        # Whether the last signals gave no position: the first of a series is logged.
+        self._no_fix_logged = False
+        # The last signals that were answered, and the answer.
         self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Take a codebook, settings, an estimator, or received signals.
-
-        Parameters
-        ----------
-        event
-            The event.
-        now_s
-            The time [s].
-
-        Returns
-        -------
-        list of Action
-            The position estimate, or why there is none; an estimator to make.
-        """
+        """Process an event and return an estimate, or the request to build an estimator."""
         match event:
             case CodebookOffered(codebook):
                 self._codebook = codebook
-                return self._want(_Job(codebook, self._settings.newest))
+                return self._request(_Job(codebook, self._settings.newest))
             case SettingsOffered(settings):
-                return self._take_settings(settings)
+                return self._offer_settings(settings)
             case EstimatorReady(codebook, estimator, elapsed_s):
                 return [*self._keep(self._job_of(codebook), estimator, elapsed_s),
-                        *self._go_on()]
+                        *self._continue()]
             case EstimatorFailed(codebook, reason):
-                return [*self._do_without(self._job_of(codebook), reason), *self._go_on()]
+                return [*self._revert(self._job_of(codebook), reason), *self._continue()]
             case m.ReceivedSignals():
                 return self._receive(event)
         return []
 
     def status(self) -> Mapping[str, str]:
-        """Return the settings and the codebook in use, those that wait, and what failed.
-
-        Returns
-        -------
-        Mapping
-            Values by name.
-        """
+        """Return the settings and codebook in use, pending settings and the last failure."""
         failed = {'failed.estimator': self._failure} if self._failure else {}
         return self._settings.describe() | failed | {'codebook_id': self._estimators.in_use}
 
-    def _take_settings(self, settings: PositionerSettings) -> list[Action]:
+    def _offer_settings(self, settings: PositionerSettings) -> list[Action]:
         self._settings.newest, self._failure = settings, ''
         if self._codebook is None:
-            return self._settings.settle()
-        return self._want(_Job(self._codebook, settings))
+            return [*self._settings.apply()]
+        return self._request(_Job(self._codebook, settings))
 
-    def _want(self, job: _Job) -> list[Action]:
-        made = self._estimators.peek(job.codebook.id)
-        if made and job.is_as(made.job):
+    def _request(self, job: _Job) -> list[Action]:
+        built = self._estimators.peek(job.codebook.id)
+        if built and job.equals(built.job):
             self._next = None
             return []
-        if self._making is not None:
-            self._next = None if job.is_as(self._making) else job
+        if self._building is not None:
+            self._next = None if job.equals(self._building) else job
             return []
-        self._making = job
+        self._building = job
         return [BuildEstimator(job.codebook, job.settings)]
 
     def _job_of(self, codebook: Codebook) -> _Job:
-        return self._making or _Job(codebook, self._settings.newest)
+        return self._building or _Job(codebook, self._settings.newest)
 
     def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> list[Action]:
-        """Use an estimator from the next signals on, unless another one is wanted by now."""
+        """Store an estimator, unless other settings were offered meanwhile."""
         codebook = job.codebook
-        is_wanted = job.settings == self._settings.newest
-        if not is_wanted and codebook.id in self._estimators:
+        is_current = job.settings == self._settings.newest
+        if not is_current and codebook.id in self._estimators:
             return []
         model = MeasurementModel(self._scenario, codebook).prepare()
-        self._estimators.put(codebook.id, _Made(job, model, estimator))
+        self._estimators.put(codebook.id, _Built(job, model, estimator))
         self._settings.in_use = job.settings
-        return [LogMessage(f'{estimator.name} is ready for codebook {codebook.id} after '
-                     f'{elapsed_s:.1f} s')]
+        return [LogMessage(
+            f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')]
 
-    def _do_without(self, job: _Job, reason: str) -> list[Action]:
-        """Stay with the settings in use if others were the reason that nothing was made."""
+    def _revert(self, job: _Job, reason: str) -> list[Action]:
+        """Revert to the settings in use if new settings were the reason of a failure."""
         kept = self._settings.in_use
         if job.settings == kept:
             return [LogMessage(
@@ -171,30 +151,30 @@ class Positioner(PlainRole):
             return []
         self._settings.newest = kept
         self._failure = f'{job.settings.estimator}: {reason}'
-        # Whichever codebook is wanted by now, it is wanted with the settings in use.
+        # A codebook offered meanwhile needs an estimator with the settings in use.
         self._next = _Job((self._next or job).codebook, kept)
-        return [LogMessage(f'estimator {job.settings.estimator} not used, {kept.estimator} stays: '
-                     f'{reason}', warning=True), SettingsReverted(kept)]
+        text = f'estimator {job.settings.estimator} not used, keeping {kept.estimator}: {reason}'
+        return [LogMessage(text, warning=True), SettingsReverted(kept)]
 
-    def _go_on(self) -> list[Action]:
-        """After an estimator was made: the signals that waited for it, and the next one."""
-        waiting, wanted = self._waiting, self._next
-        self._making = self._next = self._waiting = None
-        actions = self._want(wanted) if wanted else []
+    def _continue(self) -> list[Action]:
+        """Request the next estimator and process the signals that waited for the last one."""
+        waiting, job = self._waiting, self._next
+        self._building = self._next = self._waiting = None
+        actions = self._request(job) if job else []
         return actions + (self._receive(waiting) if waiting else [])
 
     def _receive(self, received: m.ReceivedSignals) -> list[Action]:
         if self._answered and m.same(self._answered[0], received):
-            self.counters['duplicate'] += 1
+            self.count(Outcome.DUPLICATE)
             return self._answered[1]
         if received.codebook_id in self._estimators:
             self._answered = received, self._locate(received)
             return self._answered[1]
-        coming = {job.codebook.id for job in (self._making, self._next) if job}
-        if received.codebook_id in coming:
+        expected = {job.codebook.id for job in (self._building, self._next) if job}
+        if received.codebook_id in expected:
             self._waiting = received
         else:
-            self.counters['wrong_codebook'] += 1
+            self.count(Outcome.WRONG_CODEBOOK)
         return []
 
     def _locate(self, received: m.ReceivedSignals) -> list[Action]:
@@ -207,45 +187,41 @@ class Positioner(PlainRole):
             return self._no_fix(received, str(error))
         latency_s = self._stopwatch() - begin
         if not estimate.fix:
-            return self._no_fix(received, estimate.reason)
-        self._is_lost = False
+            return self._no_fix(received, str(estimate.reason))
+        self._no_fix_logged = False
         bound = float(crlb_of(model, estimate.mean[None])[0])
         return [Send(m.PositionEstimate(
-            received.cycle_id, received.user, received.codebook_id,
-            np.array(estimate.mean), np.array(estimate.covariance), bound, estimator.name,
-            latency_s))]
+            cycle_id=received.cycle_id, user=received.user, codebook_id=received.codebook_id,
+            position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
+            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))]
 
     def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
-        self.counters['no_fix'] += 1
-        sent = Send(m.NoFix(received.cycle_id, received.user, received.codebook_id, reason))
-        note = LogMessage(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)
-        said, self._is_lost = self._is_lost, True
-        return [sent] if said else [sent, note]
+        self.count(Outcome.NO_FIX)
+        sent = Send(m.NoFix(
+            cycle_id=received.cycle_id, user=received.user, codebook_id=received.codebook_id,
+            reason=reason))
+        if self._no_fix_logged:
+            return [sent]
+        self._no_fix_logged = True
+        return [sent, LogMessage(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)]
 
 
 def build_estimator(
         codebook: Codebook, make: Callable[[Codebook], Estimator],
         stopwatch: Callable[[], float]) -> EstimatorReady | EstimatorFailed:
-    """Do what `BuildEstimator` asks for; this may run in another thread.
+    """Build the estimator that `BuildEstimator` requests; this may run in another thread.
 
     Parameters
     ----------
-    codebook
-        The codebook.
     make
-        Function of a codebook that returns an estimator.
+        Callable that takes a codebook and returns an estimator.
     stopwatch
-        Function that returns a time [s].
-
-    Returns
-    -------
-    EstimatorReady or EstimatorFailed
-        The event for the role.
+        Callable that returns a time [s].
     """
     begin = stopwatch()
     try:
         estimator = make(codebook)
-    # What a codebook, a model file or a full disk may be the reason of.
+    # Possible causes: the codebook, the model file, a full disk or memory.
     except (ValueError, OSError, MemoryError) as error:
         return EstimatorFailed(codebook, str(error) or type(error).__name__)
     return EstimatorReady(codebook, estimator, stopwatch() - begin)

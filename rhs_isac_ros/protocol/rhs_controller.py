@@ -1,143 +1,153 @@
-"""The controller of the surface: applies configurations and reports them."""
+"""The RHS controller: applies configurations to the surface and reports them."""
 
-import collections
+import dataclasses
 import enum
 from collections.abc import Mapping
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.codebook_cache import CodebookCache
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, LogMessage, Send
-from rhs_isac_ros.protocol.state_machine import ANY, SAME, StateMachine, Transition
+from rhs_isac_ros.protocol.events import Action, CodebookOffered, LogMessage, Send
+from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
+
+# Cycles and commands that are remembered, to recognize late and repeated messages.
+_MAX_REMEMBERED = 8
 
 
 class State(enum.Enum):
-    """States of the controller."""
+    """States of the RHS controller."""
 
     IDLE = 'idle'                  # no configuration applied
-    POSITIONING = 'positioning'    # a band's configurations, frame after frame
+    POSITIONING = 'positioning'    # a band's configurations, one for each frame
     TRANSMITTING = 'transmitting'  # the configuration of a beam
 
 
-class Input(enum.Enum):
-    """Names of what can happen to the controller."""
-
-    CODEBOOK = 'codebook'
-    GRANT = 'grant'
-    COMMAND = 'command'
-    STALE_COMMAND = 'stale_command'
-    DUPLICATE = 'duplicate'
-    BEAM = 'beam'
-    WRONG_CODEBOOK = 'wrong_codebook'
-    WRONG_CYCLE = 'wrong_cycle'
-    WRONG_USER = 'wrong_user'
-
-
-S, I = State, Input  # noqa: E741
-
-TABLE: Mapping[tuple[State | None, Input], Transition] = {
-    (ANY, I.CODEBOOK): Transition(SAME, ('keep',)),
-    (ANY, I.GRANT): Transition(SAME, ('note_grant',)),
-    (ANY, I.COMMAND): Transition(S.POSITIONING, ('apply_band',)),
-    (S.POSITIONING, I.BEAM): Transition(S.TRANSMITTING, ('apply_beam',)),
-    (S.TRANSMITTING, I.BEAM): Transition(SAME, ('apply_beam',), counts='duplicate'),
-    # Who asks again may not have heard the answer.
-    (ANY, I.DUPLICATE): Transition(SAME, ('apply_band',), counts='duplicate'),
-    (ANY, I.STALE_COMMAND): Transition(SAME, counts='stale_command'),
-    (ANY, I.WRONG_CODEBOOK): Transition(SAME, ('complain',), counts='wrong_codebook'),
-    (ANY, I.WRONG_CYCLE): Transition(SAME, counts='wrong_cycle'),
-    (ANY, I.WRONG_USER): Transition(SAME, counts='wrong_user'),
-}
-# Grants and commands that are known again when they come late or doubled.
-_MOST_KNOWN = 8
-
-
-class RhsController(StateMachine):
-    """The role of the controller of the surface.
-
-    Which of the codebooks it knows applies is for the base station's commands to say.
-    """
-
-    SENDS = (m.RhsConfiguration,)
-    RECEIVES = (m.Grant, m.RhsCommand, m.Beam)
-
-    TABLE = TABLE
+class RhsControllerSteps(StateMachine[State]):
+    """The memory of an RHS controller, and the guards and actions of its table."""
 
     def __init__(self) -> None:
         super().__init__(State.IDLE, {})
         self._codebooks: CodebookCache[Codebook] = CodebookCache()
         self._cycle_id = 0
-        self._granted: collections.deque[m.Grant] = collections.deque(maxlen=_MOST_KNOWN)
-        # Cycle, band and codebook of what was applied, the present one last.
-        self._applied: collections.deque[tuple[int, int, str]] = collections.deque(
-            maxlen=_MOST_KNOWN)
-        # Said once until a command is obeyed.
-        self._has_complained = False
+        # The user of each granted cycle.
+        self._granted: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
+        # Cycle, band and codebook of the commands obeyed; the present one is the last.
+        self._applied: NewestDict[tuple[int, int, str], None] = NewestDict(_MAX_REMEMBERED)
+        # Reset by the next command obeyed, so that each outage is logged once.
+        self._unknown_logged = False
 
     def status(self) -> Mapping[str, str]:
-        """Return the codebook in use.
-
-        Returns
-        -------
-        Mapping
-            Values by name.
-        """
+        """Return the codebook in use, as ``codebook_id``."""
         return {'codebook_id': self._codebooks.in_use}
 
-    def _classify(self, event: Event) -> Input:
-        match event:
-            case CodebookOffered():
-                return Input.CODEBOOK
-            case m.Grant():
-                return Input.GRANT
-            case m.RhsCommand():
-                return self._classify_command(event)
-            case m.Beam():
-                if event.cycle_id != self._cycle_id:
-                    return Input.WRONG_CYCLE
-                if self._users(event.cycle_id) - {event.user}:
-                    return Input.WRONG_USER
-                same = event.codebook_id == self._codebooks.in_use
-                return Input.BEAM if same else Input.WRONG_CODEBOOK
-        raise TypeError(f'{type(event).__name__} is no event of a controller of the surface')
+    # Guards
 
-    def _classify_command(self, command: m.RhsCommand) -> Input:
-        if command.codebook_id not in self._codebooks:
-            return Input.WRONG_CODEBOOK
-        key = command.cycle_id, command.band, command.codebook_id
-        if key not in self._applied:
-            return Input.COMMAND
-        present = self.state is State.POSITIONING and key == self._applied[-1]
-        return Input.DUPLICATE if present else Input.STALE_COMMAND
+    def unknown_codebook(self, event: m.RhsCommand, now_s: float) -> bool:
+        """Whether the codebook of a command was never offered, or was discarded."""
+        return event.codebook_id not in self._codebooks
 
-    def _users(self, cycle_id: int) -> set[int]:
-        """Whom a cycle was granted to, as far as the grant was heard."""
-        newest = [grant.user for grant in self._granted if grant.cycle_id == cycle_id]
-        return set(newest[-1:])
+    def repeats_command(self, event: m.RhsCommand, now_s: float) -> bool:
+        """Whether the configurations of a command are those applied now."""
+        newest = next(reversed(self._applied), None)
+        return self.state is State.POSITIONING and _key(event) == newest
 
-    def _note_grant(self, event: m.Grant, now_s: float) -> None:
-        self._granted.append(event)
+    def stale_command(self, event: m.RhsCommand, now_s: float) -> bool:
+        """Whether a command was obeyed before."""
+        return _key(event) in self._applied
 
-    def _keep(self, event: CodebookOffered, now_s: float) -> None:
+    def wrong_cycle(self, event: m.Beam, now_s: float) -> bool:
+        """Whether a beam belongs to another cycle than the last command."""
+        return event.cycle_id != self._cycle_id
+
+    def wrong_user(self, event: m.Beam, now_s: float) -> bool:
+        """Whether the cycle of a beam is known to be granted to another user."""
+        return self._granted.get(event.cycle_id, event.user) != event.user
+
+    def wrong_codebook(self, event: m.Beam, now_s: float) -> bool:
+        """Whether a beam belongs to another codebook than the one applied."""
+        return event.codebook_id != self._codebooks.in_use
+
+    # Actions
+
+    def store_codebook(self, event: CodebookOffered, now_s: float) -> None:
+        """Add a codebook to those held."""
         self._codebooks.put(event.codebook.id, event.codebook)
 
-    def _apply_band(self, event: m.RhsCommand, now_s: float) -> list[Action]:
-        self._cycle_id, self._has_complained = event.cycle_id, False
-        key = event.cycle_id, event.band, event.codebook_id
-        if key not in self._applied:
-            self._applied.append(key)
+    def store_grant(self, event: m.Grant, now_s: float) -> None:
+        """Remember the user of a cycle."""
+        self._granted.put(event.cycle_id, event.user)
+
+    def apply_band(self, event: m.RhsCommand, now_s: float) -> list[Action]:
+        """Report the codebook's configurations of a band."""
+        self._cycle_id, self._unknown_logged = event.cycle_id, False
+        self._applied.put(_key(event), None)
         analog = self._codebooks.take(event.codebook_id).analog[event.band]
         return [Send(m.RhsConfiguration(
-            event.cycle_id, m.Mode.POSITIONING, event.band, event.codebook_id, analog))]
+            cycle_id=event.cycle_id, mode=m.Mode.POSITIONING, band=event.band,
+            codebook_id=event.codebook_id, analog=analog))]
 
-    def _apply_beam(self, event: m.Beam, now_s: float) -> list[Action]:
+    def apply_beam(self, event: m.Beam, now_s: float) -> list[Action]:
+        """Report the configuration of a beam."""
         return [Send(m.RhsConfiguration(
-            event.cycle_id, m.Mode.TRANSMISSION, event.band, event.codebook_id,
-            event.analog[None]))]
+            cycle_id=event.cycle_id, mode=m.Mode.TRANSMISSION, band=event.band,
+            codebook_id=event.codebook_id, analog=event.analog[None]))]
 
-    def _complain(self, event: m.RhsCommand | m.Beam, now_s: float) -> list[Action]:
-        if self._has_complained:
+    def log_unknown_codebook(self, event: m.RhsCommand | m.Beam, now_s: float) -> list[Action]:
+        """Log the first request for a codebook that is not available."""
+        if self._unknown_logged:
             return []
-        self._has_complained = True
-        return [LogMessage(f'codebook {event.codebook_id!r} asked for, known: '
-                     f'{self._codebooks.ids()}', warning=True)]
+        self._unknown_logged = True
+        return [LogMessage(
+            f'codebook {event.codebook_id!r} requested, available: {self._codebooks.ids()}',
+            warning=True)]
+
+
+def _key(command: m.RhsCommand) -> tuple[int, int, str]:
+    return command.cycle_id, command.band, command.codebook_id
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Row(Transition[State, RhsControllerSteps, EventT]):
+    """A row of the RHS controller's table."""
+
+
+Steps = RhsControllerSteps
+
+TABLE = (
+    Row(event=CodebookOffered, actions=(Steps.store_codebook,)),
+    Row(event=m.Grant, actions=(Steps.store_grant,)),
+
+    Row(event=m.RhsCommand, guard=Steps.unknown_codebook, actions=(Steps.log_unknown_codebook,),
+        outcome=Outcome.WRONG_CODEBOOK),
+    # The base station repeats a command if it may have missed the report.
+    Row(event=m.RhsCommand, guard=Steps.repeats_command, actions=(Steps.apply_band,),
+        outcome=Outcome.DUPLICATE),
+    Row(event=m.RhsCommand, guard=Steps.stale_command, outcome=Outcome.STALE_COMMAND),
+    Row(event=m.RhsCommand, actions=(Steps.apply_band,), target=State.POSITIONING),
+
+    Row(event=m.Beam, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.Beam, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(event=m.Beam, guard=Steps.wrong_codebook, actions=(Steps.log_unknown_codebook,),
+        outcome=Outcome.WRONG_CODEBOOK),
+    Row(source=(State.POSITIONING,), event=m.Beam, actions=(Steps.apply_beam,),
+        target=State.TRANSMITTING),
+    Row(source=(State.TRANSMITTING,), event=m.Beam, actions=(Steps.apply_beam,),
+        outcome=Outcome.DUPLICATE),
+)
+
+
+class RhsController(RhsControllerSteps):
+    """The role of the RHS controller.
+
+    It holds the newest codebooks; the commands of the base station select the one to apply.
+    """
+
+    SENDS = (m.RhsConfiguration,)
+    RECEIVES = (m.Grant, m.RhsCommand, m.Beam)
+
+    STATES = State
+    TABLE = TABLE
+    EVENT_NAMES = {CodebookOffered: 'codebook', m.Grant: 'grant', m.RhsCommand: 'command',
+                   m.Beam: 'beam'}

@@ -1,4 +1,4 @@
-"""The interface of the roles, and the base of those without a state machine."""
+"""The interface of the roles, and what all of them have in common."""
 
 import collections
 import enum
@@ -7,15 +7,16 @@ from typing import Protocol
 
 from rhs_isac_ros.protocol.events import Action, Event
 from rhs_isac_ros.protocol.messages import Message
+from rhs_isac_ros.protocol.outcomes import Outcome
 
 
 class Role(Protocol):
-    """A role of the protocol: it turns events into actions and has no clock of its own.
+    """A role of the protocol: it turns events into actions and reads no clock.
 
     Attributes
     ----------
     counters
-        Number of dropped messages and failures, by reason.
+        Number of occurrences of each outcome and of each kind of unexpected event.
     """
 
     counters: collections.Counter[str]
@@ -41,40 +42,49 @@ class Role(Protocol):
         ...
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Handle an event at a time [s] of a monotonic clock and return actions, in order."""
+        """Process an event at a time [s] of a monotonic clock and return actions, in order."""
         ...
 
     def next_deadline(self) -> float | None:
-        """Return when the role needs a `Tick` [s], on the clock of `handle`, or None."""
+        """Return when the role expects a `Tick` [s], on the clock of `handle`, or None."""
         ...
 
     def status(self) -> Mapping[str, str]:
-        """Return what is in use and what is pending, by name, for the diagnostics.
+        """Return the values in use and those pending by name, for the diagnostics.
 
-        The names are such as ``parameter.policy``, ``pending.policy`` and ``codebook_id``; the
-        result is empty if nothing of the role can change.
+        Examples of names are ``parameter.policy``, ``pending.policy`` and ``codebook_id``; the
+        result is empty if the role has no settings.
         """
         ...
 
 
-class PlainRole:
-    """Base of the roles that answer messages and have neither states nor deadlines.
+class CountingRole:
+    """Base of all roles: counts outcomes and has no settings.
 
     Attributes
     ----------
     counters
-        Number of dropped messages, by reason.
+        Number of occurrences of each outcome and of each kind of unexpected event.
     """
-
-    LACKING: frozenset[enum.Enum] = frozenset()
-    state: enum.Enum | None = None
 
     def __init__(self) -> None:
         self.counters: collections.Counter[str] = collections.Counter()
 
+    def count(self, outcome: Outcome, n: int = 1) -> None:
+        """Add `n` occurrences of an outcome."""
+        if n:
+            self.counters[outcome.value] += n
+
     def status(self) -> Mapping[str, str]:
-        """Return what is in use and what is pending, as `Role.status`; here nothing."""
+        """Return an empty mapping: nothing in the role can change."""
         return {}
+
+
+class PlainRole(CountingRole):
+    """Base of the roles that only answer messages, without states or deadlines."""
+
+    LACKING: frozenset[enum.Enum] = frozenset()
+    state: enum.Enum | None = None
 
     def next_deadline(self) -> float | None:
         """Return None: the role needs no `Tick`."""

@@ -1,129 +1,164 @@
-"""State machines that are driven by a literal table."""
+"""State machines whose tables of transitions are the complete description of a role."""
 
-import collections
 import dataclasses
 import enum
-from collections.abc import Mapping
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar, Generic, TypeVar
 
 from rhs_isac_ros.protocol.events import Action, Event
+from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.role import CountingRole
 
-# In a table: any state, as the source; the present state, as the target.
+StateT = TypeVar('StateT', bound=enum.Enum)
+RoleT = TypeVar('RoleT')
+EventT = TypeVar('EventT')
+
+# As a source: any state. As a target: the present state.
 ANY = None
 SAME = None
 
 
-@dataclasses.dataclass(frozen=True)
-class Transition:
-    """One transition.
+def always(role: object, event: object, now_s: float) -> bool:
+    """Accept every event: the guard of a row without a condition."""
+    return True
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Transition(Generic[StateT, RoleT, EventT]):
+    """One row of a table.
 
     Attributes
     ----------
-    to
+    source
+        States in which the row applies, or ANY.
+    event
+        Class of the event.
+    guard
+        Condition on role, event and time; it changes nothing.
+    actions
+        Steps to carry out, in order; each may return protocol actions.
+    target
         Next state, or SAME.
-    do
-        Methods of the machine that make the actions, in their order.
-    counts
-        Counter to raise.
-    rearm
-        Start the state's time-out afresh even if the state stays.
+    outcome
+        What is counted, if anything.
+    restart_timeout
+        Whether the time-out starts anew although the state stays.
     """
 
-    to: enum.Enum | None = SAME
-    do: tuple[str, ...] = ()
-    counts: str = ''
-    rearm: bool = False
+    source: tuple[StateT, ...] | None = ANY
+    event: type[EventT]
+    guard: Callable[[RoleT, EventT, float], bool] = always
+    actions: tuple[Callable[[RoleT, EventT, float], Iterable[Action] | None], ...] = ()
+    target: StateT | None = SAME
+    outcome: Outcome | None = None
+    restart_timeout: bool = False
 
 
-class StateMachine:
-    """A role of the protocol: events in, actions out.
+class StateMachine(CountingRole, Generic[StateT]):
+    """A role with states: it takes events and returns actions.
 
-    A subclass names every event by `_classify` and lists in `TABLE` what each name does in each
-    state, first by state, then for ANY. A pair that the table does not hold changes nothing and
-    counts as ``unexpected_<name>``. There is no clock inside: every call brings the time.
+    `handle` takes the first row of `TABLE` whose source, event class and guard match. An event
+    without a matching row changes nothing and counts as ``unexpected_<name>``. The machine reads
+    no clock: every call passes the time.
 
     Parameters
     ----------
     initial
         First state.
     timeouts_s
-        How long the machine may stay in a state before it wants a `Tick`; states that are not
-        listed have no end.
+        Time after which a state expects a `Tick` [s]; other states have no time-out.
 
     Attributes
     ----------
     state
         Present state.
     repeats
-        How often the present state's time-out began afresh.
-    counters
-        What was dropped or went wrong, by reason.
+        Number of times that the time-out of the present state was restarted.
     """
 
-    TABLE: ClassVar[Mapping[tuple[enum.Enum | None, enum.Enum], Transition]]
+    STATES: ClassVar[type[enum.Enum]]
+    TABLE: ClassVar[tuple[Transition[Any, Any, Any], ...]]
+    # Names of the events in the counters of unexpected events.
+    EVENT_NAMES: ClassVar[Mapping[type, str]]
     # States in which something that the role needs is missing.
     LACKING: ClassVar[frozenset[enum.Enum]] = frozenset()
 
-    def __init__(self, initial: enum.Enum, timeouts_s: Mapping[enum.Enum, float]) -> None:
+    _rows: ClassVar[Mapping[tuple[enum.Enum, type], tuple[Transition[Any, Any, Any], ...]]]
+
+    def __init_subclass__(cls) -> None:
+        """Group the rows of a new table by state and event class."""
+        super().__init_subclass__()
+        if 'TABLE' in vars(cls):
+            cls._rows = {(state, event): tuple(rows_for(cls.TABLE, state, event))
+                         for state in cls.STATES for event in {row.event for row in cls.TABLE}}
+
+    def __init__(self, initial: StateT, timeouts_s: Mapping[StateT, float]) -> None:
+        super().__init__()
         self.state = initial
         self.repeats = 0
-        self.counters: collections.Counter[str] = collections.Counter()
         self._timeouts_s = dict(timeouts_s)
         self._deadline_s: float | None = None
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Take an event.
+        """Process an event.
 
         Parameters
         ----------
-        event
-            A message, or something local.
         now_s
-            The time, on any clock that only goes forward [s].
+            Time on any monotonic clock [s].
 
         Returns
         -------
         list of Action
-            What to do, in this order.
+            Actions to carry out, in order.
+
+        Raises
+        ------
+        TypeError
+            If no row of the table names the class of the event.
         """
-        name = self._classify(event)
-        step = self.TABLE.get((self.state, name)) or self.TABLE.get((ANY, name))
-        if step is None:
-            self.counters[f'unexpected_{name.value}'] += 1
-            return []
-        if step.counts:
-            self.counters[step.counts] += 1
-        actions: list[Action] = []
-        for method in step.do:
-            actions += getattr(self, f'_{method}')(event, now_s) or []
-        changes = step.to is not SAME and step.to is not self.state
-        if changes or step.rearm:
-            self.state = step.to or self.state
-            self.repeats = 0 if changes else self.repeats + 1
-            timeout = self._timeouts_s.get(self.state)
-            self._deadline_s = None if timeout is None else now_s + timeout
-        return actions
+        kind = type(event)
+        try:
+            rows = self._rows[self.state, kind]
+        except KeyError:
+            raise TypeError(
+                f'{kind.__name__} is not an event of {type(self).__name__}') from None
+        for row in rows:
+            if row.guard(self, event, now_s):
+                return self._take(row, event, now_s)
+        self.counters[f'unexpected_{self.EVENT_NAMES[kind]}'] += 1
+        return []
 
     def next_deadline(self) -> float | None:
-        """Return when the machine wants a `Tick`.
+        """Return when the machine expects a `Tick`.
 
         Returns
         -------
         float or None
-            The time [s], on the clock of `handle`; None if only a message can change anything.
+            Time on the clock of `handle` [s]; None if the state has no time-out.
         """
         return self._deadline_s
 
-    def status(self) -> Mapping[str, str]:
-        """Return what is in use and what waits, for the diagnostics.
+    def _take(self, row: Transition[Any, Any, Any], event: Event, now_s: float) -> list[Action]:
+        if row.outcome:
+            self.count(row.outcome)
+        actions: list[Action] = []
+        for action in row.actions:
+            actions += action(self, event, now_s) or ()
+        target = row.target or self.state
+        changes = target is not self.state
+        if changes or row.restart_timeout:
+            self.state = target
+            self.repeats = 0 if changes else self.repeats + 1
+            # Looked up after the actions, which may have changed the time-outs.
+            timeout_s = self._timeouts_s.get(self.state)
+            self._deadline_s = None if timeout_s is None else now_s + timeout_s
+        return actions
 
-        Returns
-        -------
-        Mapping
-            Values by name, such as ``parameter.policy`` and ``pending.policy``, and the
-            ``codebook_id`` in use; empty if all of that is fixed.
-        """
-        return {}
 
-    def _classify(self, event: Event) -> enum.Enum:
-        raise NotImplementedError
+def rows_for(
+        table: Iterable[Transition[Any, Any, Any]], state: enum.Enum, event: type
+) -> list[Transition[Any, Any, Any]]:
+    """Return the rows for a state and a class of events, in the order in which they are tried."""
+    return [row for row in table
+            if row.event is event and (row.source is ANY or state in row.source)]

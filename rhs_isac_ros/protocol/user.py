@@ -1,87 +1,31 @@
 """The user: answers beacons, sends pilots, exchanges data."""
 
+import dataclasses
 import enum
 from collections.abc import Mapping
-from typing import Any
 
 from rhs_isac_ros.model.mobility import Mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, Event, LogMessage, PeersChanged, Send, Tick
-from rhs_isac_ros.protocol.state_machine import ANY, SAME, StateMachine, Transition
+from rhs_isac_ros.protocol.events import Action, LogMessage, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
+
+# Cycles that are remembered; no message of an older one can still be in transit.
+_MAX_REMEMBERED = 8
+# Steps of a cycle during which the user may receive nothing: the signals of the last band, the
+# position, the beam and the data.
+_SILENT_STEPS = 4
 
 
 class State(enum.Enum):
     """States of a user."""
 
-    DISCONNECTED = 'disconnected'                # base station or channel is not there
-    LISTENING = 'listening'        # for a beacon
-    NO_BEACON = 'no_beacon'          # the same, for too long
+    DISCONNECTED = 'disconnected'  # base station or channel missing
+    LISTENING = 'listening'        # waiting for a beacon
+    NO_BEACON = 'no_beacon'        # waiting for a beacon for longer than the time-out
     ACKNOWLEDGED = 'acknowledged'  # waiting for the grant
     GRANTED = 'granted'            # being positioned and served
-
-
-class Input(enum.Enum):
-    """Names of what can happen to a user."""
-
-    CONNECTED = 'connected'
-    CUT_OFF = 'cut_off'
-    BEACON = 'beacon'
-    STALE_BEACON = 'stale_beacon'
-    GRANT = 'grant'
-    LATE_GRANT = 'late_grant'
-    OTHER_GRANT = 'other_grant'
-    OTHER_USER = 'other_user'
-    PILOT_REQUEST = 'pilot_request'
-    SAME_REQUEST = 'same_request'
-    DOWNLINK = 'downlink'
-    OTHER_DATA = 'other_data'
-    WRONG_CYCLE = 'wrong_cycle'
-    TIMEOUT = 'timeout'
-
-
-S, I = State, Input  # noqa: E741
-
-TABLE: Mapping[tuple[State | None, Input], Transition] = {
-    (S.DISCONNECTED, I.CONNECTED): Transition(S.LISTENING, ('say_found',)),
-    (S.DISCONNECTED, I.CUT_OFF): Transition(SAME, ('say_missing',)),
-    (S.DISCONNECTED, I.BEACON): Transition(SAME),
-    (ANY, I.CONNECTED): Transition(SAME),
-    (ANY, I.CUT_OFF): Transition(S.DISCONNECTED, ('say_missing',)),
-    # The base station may take longer than this user waited.
-    (S.LISTENING, I.GRANT): Transition(S.GRANTED, ('stand',)),
-    (S.LISTENING, I.BEACON): Transition(S.ACKNOWLEDGED, ('acknowledge',)),
-    (S.LISTENING, I.TIMEOUT): Transition(S.NO_BEACON, ('say_uncalled',), counts='no_beacon'),
-    (S.NO_BEACON, I.GRANT): Transition(S.GRANTED, ('say_called', 'stand')),
-    (S.NO_BEACON, I.BEACON): Transition(S.ACKNOWLEDGED, ('say_called', 'acknowledge')),
-    (S.ACKNOWLEDGED, I.BEACON): Transition(SAME, ('acknowledge',), rearm=True),
-    (S.ACKNOWLEDGED, I.GRANT): Transition(S.GRANTED, ('stand',)),
-    # A request that overtakes the grant says the same.
-    (S.ACKNOWLEDGED, I.PILOT_REQUEST): Transition(S.GRANTED, ('stand', 'send_pilots')),
-    (S.ACKNOWLEDGED, I.OTHER_GRANT): Transition(S.LISTENING),
-    (S.ACKNOWLEDGED, I.TIMEOUT): Transition(S.LISTENING, counts='not_granted'),
-    (S.GRANTED, I.GRANT): Transition(SAME),
-    (S.GRANTED, I.PILOT_REQUEST): Transition(SAME, ('send_pilots',), rearm=True),
-    # Something was lost: perhaps the pilots, perhaps where they come from.
-    (S.GRANTED, I.SAME_REQUEST): Transition(
-        SAME, ('stand', 'send_pilots'), counts='asked_again', rearm=True),
-    (S.GRANTED, I.DOWNLINK): Transition(S.LISTENING, ('send_uplink',)),
-    (S.LISTENING, I.DOWNLINK): Transition(SAME, ('send_uplink',), counts='asked_again'),
-    (S.GRANTED, I.BEACON): Transition(S.ACKNOWLEDGED, ('acknowledge',), counts='abandoned'),
-    (S.GRANTED, I.TIMEOUT): Transition(S.LISTENING, counts='bs_silent'),
-    (ANY, I.STALE_BEACON): Transition(SAME, counts='stale_beacon'),
-    (ANY, I.LATE_GRANT): Transition(SAME, counts='late_grant'),
-    (ANY, I.OTHER_GRANT): Transition(SAME),
-    (ANY, I.OTHER_USER): Transition(SAME),
-    (ANY, I.OTHER_DATA): Transition(SAME),
-    (ANY, I.WRONG_CYCLE): Transition(SAME, counts='wrong_cycle'),
-}
-
-
-# Cycles that are known again; of older ones no message can still be on its way.
-_MOST_KNOWN = 8
-# Steps of a cycle that the base station may wait for while its user hears nothing: the last
-# band's signals, the position, the beam, and the data.
-_SILENT_STEPS = 4
 
 
 def timeouts(step_s: float, beacon_s: float) -> dict[State, float]:
@@ -90,9 +34,9 @@ def timeouts(step_s: float, beacon_s: float) -> dict[State, float]:
     Parameters
     ----------
     step_s
-        How long the base station waits for each step [s].
+        Time that the base station waits for each step [s].
     beacon_s
-        How long is too long without a beacon [s].
+        Time without a beacon after which the user warns [s].
 
     Returns
     -------
@@ -103,24 +47,8 @@ def timeouts(step_s: float, beacon_s: float) -> dict[State, float]:
             State.GRANTED: _SILENT_STEPS * step_s}
 
 
-class User(StateMachine):
-    """The role of a user.
-
-    Parameters
-    ----------
-    user
-        Number of the user, from 1.
-    mobility
-        Where the user is at a time.
-    timeouts_s
-        Time-outs by state.
-    """
-
-    SENDS = (m.Ack, m.GroundTruth, m.Pilot, m.Data)
-    RECEIVES = (m.Beacon, m.Grant, m.PilotRequest, m.Data)
-
-    TABLE = TABLE
-    LACKING = frozenset({State.DISCONNECTED, State.NO_BEACON})
+class UserSteps(StateMachine[State]):
+    """The memory of a user, and the guards and actions of its table."""
 
     def __init__(
             self, user: int, mobility: Mobility, timeouts_s: Mapping[State, float]) -> None:
@@ -128,98 +56,191 @@ class User(StateMachine):
         self.user = user
         self._mobility = mobility
         self._cycle_id = 0
-        # Cycle and band of the pilots that were sent last.
+        # Cycle and band of the last pilot request answered.
         self._sounded = (0, 0)
-        # By cycle: the highest attempt heard, and where it stood, which holds for all of it.
-        self._heard: dict[int, int] = {}
-        self._truths: dict[int, m.GroundTruth] = {}
+        # By cycle: the highest attempt received, and the position, fixed for the whole cycle.
+        self._attempts: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
+        self._truths: NewestDict[int, m.GroundTruth] = NewestDict(_MAX_REMEMBERED)
 
     def ground_truth(self, now_s: float, cycle_id: int = 0) -> m.GroundTruth:
-        """Return where the user is.
+        """Return the user's position and velocity.
 
         Parameters
         ----------
         now_s
-            The time, on the clock of `handle` [s].
+            Time on the clock of `handle` [s].
         cycle_id
-            The cycle for which the position holds; 0 for none.
-
-        Returns
-        -------
-        GroundTruth
-            Position and velocity.
+            The cycle to which the position applies; 0 for none.
         """
-        return m.GroundTruth(cycle_id, self.user, *self._mobility.state(now_s))
+        position, velocity = self._mobility.state(now_s)
+        return m.GroundTruth(
+            cycle_id=cycle_id, user=self.user, position=position, velocity=velocity)
 
-    def _classify(self, event: Event) -> Input:
-        match event:
-            case Tick():
-                return Input.TIMEOUT
-            case PeersChanged(missing):
-                return Input.CUT_OFF if missing else Input.CONNECTED
-            case m.Beacon():
-                return Input.STALE_BEACON if self._is_stale(event) else Input.BEACON
-            case m.Data(stage=m.Stage.OFFERED) | m.Data(direction=m.Direction.UPLINK):
-                return Input.OTHER_DATA
-        if event.user != self.user:
-            ours = isinstance(event, m.Grant) and event.cycle_id == self._cycle_id
-            return Input.OTHER_GRANT if ours else Input.OTHER_USER
-        if event.cycle_id != self._cycle_id:
-            return Input.WRONG_CYCLE
-        if isinstance(event, m.Grant) and self._is_done:
-            return Input.LATE_GRANT
-        if isinstance(event, m.PilotRequest) and self._sounded == (event.cycle_id, event.band):
-            return Input.SAME_REQUEST
-        names = {m.Grant: Input.GRANT, m.PilotRequest: Input.PILOT_REQUEST,
-                 m.Data: Input.DOWNLINK}
-        return names[type(event)]
+    # Guards
 
-    def _is_stale(self, beacon: m.Beacon) -> bool:
-        """Tell whether a beacon says nothing new: a late one, or the double of another."""
-        granted = self.state is State.GRANTED and beacon.cycle_id == self._cycle_id
-        return granted or beacon.attempt <= self._heard.get(beacon.cycle_id, -1)
+    def peers_missing(self, event: PeersChanged, now_s: float) -> bool:
+        """Whether a role that the user needs is missing."""
+        return bool(event.missing)
 
-    @property
-    def _is_done(self) -> bool:
-        """Whether its cycle was granted before, and is over."""
-        return self._cycle_id in self._truths and self.state is not State.GRANTED
+    def stale_beacon(self, event: m.Beacon, now_s: float) -> bool:
+        """Whether a beacon is late or a duplicate."""
+        granted = self.state is State.GRANTED and event.cycle_id == self._cycle_id
+        return granted or event.attempt <= self._attempts.get(event.cycle_id, -1)
 
-    def _say_found(self, event: PeersChanged, now_s: float) -> list[Action]:
+    def other_user(self, event: m.Grant | m.PilotRequest | m.Data, now_s: float) -> bool:
+        """Whether a message is addressed to another user."""
+        return event.user != self.user
+
+    def other_user_granted(self, event: m.Grant, now_s: float) -> bool:
+        """Whether the acknowledged cycle is granted to another user."""
+        return event.user != self.user and event.cycle_id == self._cycle_id
+
+    def wrong_cycle(self, event: m.Grant | m.PilotRequest | m.Data, now_s: float) -> bool:
+        """Whether a message belongs to another cycle than the one acknowledged last."""
+        return event.cycle_id != self._cycle_id
+
+    def late_grant(self, event: m.Grant, now_s: float) -> bool:
+        """Whether the cycle was granted before and has ended."""
+        return event.cycle_id in self._truths and self.state is not State.GRANTED
+
+    def new_request(self, event: m.PilotRequest, now_s: float) -> bool:
+        """Whether a request differs from the last one answered."""
+        return self._sounded != (event.cycle_id, event.band)
+
+    def not_delivered_downlink(self, event: m.Data, now_s: float) -> bool:
+        """Whether data are not those that the channel delivers to a user."""
+        return event.stage is m.Stage.OFFERED or event.direction is m.Direction.UPLINK
+
+    # Actions
+
+    def log_connected(self, event: PeersChanged, now_s: float) -> list[Action]:
+        """Log that no role is missing."""
         return [LogMessage('listening for beacons')]
 
-    def _say_missing(self, event: PeersChanged, now_s: float) -> list[Action]:
+    def log_missing_peers(self, event: PeersChanged, now_s: float) -> list[Action]:
+        """Log the missing roles."""
         return [LogMessage(f'waiting for {", ".join(event.missing)}', warning=True)]
 
-    def _say_uncalled(self, event: Tick, now_s: float) -> list[Action]:
+    def log_no_beacon(self, event: Tick, now_s: float) -> list[Action]:
+        """Log that beacons have ceased."""
         wait_s = self._timeouts_s[State.LISTENING]
         return [LogMessage(f'no beacon for {wait_s:g} s', warning=True)]
 
-    def _say_called(self, event: m.Beacon | m.Grant, now_s: float) -> list[Action]:
-        return [LogMessage('called again')]
+    def log_resumed(self, event: m.Beacon | m.Grant, now_s: float) -> list[Action]:
+        """Log that the base station is active again."""
+        return [LogMessage('beacons resumed')]
 
-    def _acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
+    def acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
+        """Answer a beacon."""
         self._cycle_id = event.cycle_id
-        _keep(self._heard, event.cycle_id, event.attempt)
-        return [Send(m.Ack(event.cycle_id, self.user))]
+        self._attempts.put(event.cycle_id, event.attempt)
+        return [Send(m.Ack(cycle_id=event.cycle_id, user=self.user))]
 
-    def _stand(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
+    def fix_position(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
+        """Publish the position that applies to the cycle."""
         truth = self._truths.get(event.cycle_id) or self.ground_truth(now_s, event.cycle_id)
-        _keep(self._truths, event.cycle_id, truth)
+        self._truths.put(event.cycle_id, truth)
         return [Send(truth)]
 
-    def _send_pilots(self, event: m.PilotRequest, now_s: float) -> list[Action]:
+    def send_pilots(self, event: m.PilotRequest, now_s: float) -> list[Action]:
+        """Send a pilot in each frame of a band."""
         self._sounded = event.cycle_id, event.band
-        return [Send(m.Pilot(event.cycle_id, self.user, event.band, frame, 1.0, 0.0))
+        return [Send(m.Pilot(
+            cycle_id=event.cycle_id, user=self.user, band=event.band, frame=frame, symbol_re=1.0,
+            symbol_im=0.0))
                 for frame in range(event.n_frames)]
 
-    def _send_uplink(self, event: m.Data, now_s: float) -> list[Action]:
-        return [Send(m.Data(event.cycle_id, self.user, m.Direction.UPLINK, m.Stage.OFFERED,
-                            event.duration_s, event.bits))]
+    def send_uplink(self, event: m.Data, now_s: float) -> list[Action]:
+        """Answer the downlink with as much uplink."""
+        return [Send(m.Data(
+            cycle_id=event.cycle_id, user=self.user, direction=m.Direction.UPLINK,
+            stage=m.Stage.OFFERED, duration_s=event.duration_s, bits=event.bits))]
 
 
-def _keep(items: dict, cycle_id: int, item: Any) -> None:
-    """Remember something of a cycle, and forget the oldest."""
-    items.pop(cycle_id, None)
-    items[cycle_id] = item
-    if len(items) > _MOST_KNOWN:
-        del items[next(iter(items))]
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Row(Transition[State, UserSteps, EventT]):
+    """A row of the user's table."""
+
+
+Steps = UserSteps
+
+TABLE = (
+    Row(event=PeersChanged, guard=Steps.peers_missing, actions=(Steps.log_missing_peers,),
+        target=State.DISCONNECTED),
+    Row(source=(State.DISCONNECTED,), event=PeersChanged, actions=(Steps.log_connected,),
+        target=State.LISTENING),
+    Row(event=PeersChanged),
+
+    Row(source=(State.LISTENING,), event=Tick, actions=(Steps.log_no_beacon,),
+        target=State.NO_BEACON, outcome=Outcome.NO_BEACON),
+    Row(source=(State.ACKNOWLEDGED,), event=Tick, target=State.LISTENING,
+        outcome=Outcome.NOT_GRANTED),
+    Row(source=(State.GRANTED,), event=Tick, target=State.LISTENING,
+        outcome=Outcome.BS_SILENT),
+
+    Row(event=m.Beacon, guard=Steps.stale_beacon, outcome=Outcome.STALE_BEACON),
+    Row(source=(State.DISCONNECTED,), event=m.Beacon),
+    Row(source=(State.LISTENING,), event=m.Beacon, actions=(Steps.acknowledge,),
+        target=State.ACKNOWLEDGED),
+    Row(source=(State.NO_BEACON,), event=m.Beacon,
+        actions=(Steps.log_resumed, Steps.acknowledge), target=State.ACKNOWLEDGED),
+    Row(source=(State.ACKNOWLEDGED,), event=m.Beacon, actions=(Steps.acknowledge,),
+        restart_timeout=True),
+    Row(source=(State.GRANTED,), event=m.Beacon, actions=(Steps.acknowledge,),
+        target=State.ACKNOWLEDGED, outcome=Outcome.ABANDONED),
+
+    Row(source=(State.ACKNOWLEDGED,), event=m.Grant, guard=Steps.other_user_granted,
+        target=State.LISTENING),
+    Row(event=m.Grant, guard=Steps.other_user),
+    Row(event=m.Grant, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.Grant, guard=Steps.late_grant, outcome=Outcome.LATE_GRANT),
+    # The base station may wait for longer than the user did.
+    Row(source=(State.LISTENING, State.ACKNOWLEDGED), event=m.Grant,
+        actions=(Steps.fix_position,), target=State.GRANTED),
+    Row(source=(State.NO_BEACON,), event=m.Grant,
+        actions=(Steps.log_resumed, Steps.fix_position), target=State.GRANTED),
+    Row(source=(State.GRANTED,), event=m.Grant),
+
+    Row(event=m.PilotRequest, guard=Steps.other_user),
+    Row(event=m.PilotRequest, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    # A request that overtakes the grant implies it.
+    Row(source=(State.ACKNOWLEDGED,), event=m.PilotRequest, guard=Steps.new_request,
+        actions=(Steps.fix_position, Steps.send_pilots), target=State.GRANTED),
+    Row(source=(State.GRANTED,), event=m.PilotRequest, guard=Steps.new_request,
+        actions=(Steps.send_pilots,), restart_timeout=True),
+    # The channel may have missed the pilots or the position.
+    Row(source=(State.GRANTED,), event=m.PilotRequest,
+        actions=(Steps.fix_position, Steps.send_pilots), outcome=Outcome.ASKED_AGAIN,
+        restart_timeout=True),
+
+    Row(event=m.Data, guard=Steps.not_delivered_downlink),
+    Row(event=m.Data, guard=Steps.other_user),
+    Row(event=m.Data, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(source=(State.GRANTED,), event=m.Data, actions=(Steps.send_uplink,),
+        target=State.LISTENING),
+    Row(source=(State.LISTENING,), event=m.Data, actions=(Steps.send_uplink,),
+        outcome=Outcome.ASKED_AGAIN),
+)
+
+
+class User(UserSteps):
+    """The role of a user.
+
+    Parameters
+    ----------
+    user
+        Number of the user, from 1.
+    mobility
+        The user's position as a function of time.
+    timeouts_s
+        Time-outs by state [s].
+    """
+
+    SENDS = (m.Ack, m.GroundTruth, m.Pilot, m.Data)
+    RECEIVES = (m.Beacon, m.Grant, m.PilotRequest, m.Data)
+
+    STATES = State
+    TABLE = TABLE
+    EVENT_NAMES = {PeersChanged: 'peers', Tick: 'timeout', m.Beacon: 'beacon', m.Grant: 'grant',
+                   m.PilotRequest: 'pilot_request', m.Data: 'downlink'}
+    LACKING = frozenset({State.DISCONNECTED, State.NO_BEACON})

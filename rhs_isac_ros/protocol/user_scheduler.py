@@ -1,151 +1,101 @@
-"""The users that a base station knows, and whom of them it serves next."""
+"""The users that a base station waits for, and the order in which it serves them."""
 
 import numpy as np
 
 POLICIES = ('round_robin', 'first', 'random')
-# A user that leaves so many beacons in a row without an answer is not waited for.
-_PATIENCE = 3
-# More that answer at once are refused: numbers cost nothing, memory does.
-_MOST_USERS = 1024
+# Consecutive beacons without an answer after which a user is removed.
+_MAX_MISSED = 3
+# Bounds the memory, whatever user numbers the acks contain.
+_MAX_USERS = 1024
 
 
 class UserScheduler:
-    """Users that answer beacons.
+    """Registers the users that answer beacons and selects the next one to serve.
 
     Parameters
     ----------
     policy
-        ``round_robin``: who was served longest ago; ``first``: who answered first; ``random``.
+        ``round_robin``: the user served longest ago; ``first``: the first to answer; ``random``.
     rng
         Source of randomness, for ``random``.
+
+    Attributes
+    ----------
+    answered
+        Users that answered in this cycle, in order.
 
     Raises
     ------
     ValueError
-        If there is no such policy.
+        If the policy is unknown.
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
         self._rng = rng
-        self.follow(policy)
-        # The turn in which a user was served last, 1, or after which it came, 0.
+        self.set_policy(policy)
+        # By user: (turn, 1) if it was served in that turn, (turn, 0) if it was registered after
+        # it and not served yet.
         self._served: dict[int, tuple[int, int]] = {}
+        # By user: consecutive beacons without an answer.
         self._missed: dict[int, int] = {}
         self._turn = 0
         self.answered: list[int] = []
 
-    def follow(self, policy: str) -> None:
-        """Select by a policy from now on; who was served when stays known.
-
-        Parameters
-        ----------
-        policy
-            The policy.
+    def set_policy(self, policy: str) -> None:
+        """Change the policy; the turns of the users are kept.
 
         Raises
         ------
         ValueError
-            If there is no such policy.
+            If the policy is unknown.
         """
         if policy not in POLICIES:
             raise ValueError(f'policy: {policy!r}, expected one of {list(POLICIES)}')
         self._policy = policy
 
-    def open(self) -> None:
-        """Begin a cycle: nobody has answered yet."""
+    def begin_cycle(self) -> None:
+        """Clear the answers."""
         self.answered = []
 
     def is_full_for(self, user: int) -> bool:
-        """Tell whether there is no place for a user.
+        """Return whether a user is new while the maximum number of users is registered."""
+        return user not in self._missed and len(self._missed) >= _MAX_USERS
 
-        Parameters
-        ----------
-        user
-            The user.
-
-        Returns
-        -------
-        bool
-            True if it is not known, and no other can be.
-        """
-        return user not in self._missed and len(self._missed) >= _MOST_USERS
-
-    def welcome(self, user: int) -> None:
-        """Know a user, without counting it as answering.
-
-        Parameters
-        ----------
-        user
-            The user.
-        """
-        # A newcomer stands behind all that wait, and before who was served just now: who comes
-        # and goes takes nobody's turn.
+    def register(self, user: int) -> None:
+        """Wait for a user, without counting it among those that answered."""
+        # A new user comes after all that wait and before the one served last, so that users that
+        # leave and return do not gain turns.
         self._served.setdefault(user, (self._turn, 0))
         self._missed[user] = 0
 
-    def answer(self, user: int) -> None:
-        """Count a user as answering in this cycle.
-
-        Parameters
-        ----------
-        user
-            The user.
-        """
-        self.welcome(user)
+    def add_answer(self, user: int) -> None:
+        """Register a user as answering in this cycle."""
+        self.register(user)
         self.answered.append(user)
 
-    def forget(self, user: int) -> None:
-        """Wait for a user no longer; it is known again when it answers.
-
-        Parameters
-        ----------
-        user
-            The user.
-        """
+    def remove(self, user: int) -> None:
+        """Stop waiting for a user until it answers again."""
         self._missed.pop(user, None)
         self._served.pop(user, None)
 
-    def complete_with(self, user: int) -> bool:
-        """Tell whether a user's answer leaves nobody to wait for.
-
-        Parameters
-        ----------
-        user
-            The user that answers.
-
-        Returns
-        -------
-        bool
-            True if the selection need not wait.
-        """
+    def is_complete_with(self, user: int) -> bool:
+        """Return whether the selection need not wait for others if `user` answers now."""
         if self._policy == 'first':
             return True
         return self._missed.keys() <= {*self.answered, user}
 
-    def give_up(self) -> list[int]:
-        """Wait no longer for users that have not answered for some cycles; the list closes.
-
-        Returns
-        -------
-        list of int
-            Who is not waited for any more.
-        """
+    def remove_absent(self) -> list[int]:
+        """Count missed beacons; remove and return the users that missed too many in a row."""
         lost = []
         for user in sorted(self._missed.keys() - set(self.answered)):
             self._missed[user] += 1
-            if self._missed[user] >= _PATIENCE:
-                self.forget(user)
+            if self._missed[user] >= _MAX_MISSED:
+                self.remove(user)
                 lost.append(user)
         return lost
 
     def select(self) -> int:
-        """Choose among those that answered.
-
-        Returns
-        -------
-        int
-            The user to serve.
-        """
+        """Return the user to serve, one of those that answered."""
         if self._policy == 'first':
             chosen = self.answered[0]
         elif self._policy == 'random':

@@ -10,7 +10,7 @@ from rhs_isac_ros.monitoring.invariants import RECEIVES, InvariantChecker
 from rhs_isac_ros.protocol import messages as m
 
 # Belongs to no cycle; its late arrival makes all earlier results due.
-END = m.Grant(0, 1)
+END = m.Grant(cycle_id=0, user=1)
 
 
 @pytest.fixture
@@ -58,9 +58,9 @@ def test_a_result_is_checked_after_the_settling_time(net):
     for message in sorted(first, key=lambda message: not isinstance(message, m.PositionEstimate)):
         checker.add(message, 5.0)
     assert checker.checked == 0
-    checker.add(m.Grant(2, 1), 5.9)
+    checker.add(m.Grant(cycle_id=2, user=1), 5.9)
     assert checker.checked == 0
-    checker.add(m.Grant(2, 1), 6.1)
+    checker.add(m.Grant(cycle_id=2, user=1), 6.1)
     assert checker.checked == 2
     assert checker.violations == []
 
@@ -144,5 +144,5 @@ def test_messages_of_an_undiscovered_publisher_may_be_missing(net):
 def test_old_cycles_are_discarded(net):
     checker = InvariantChecker(net.scenario)
     for cycle_id in range(1000):
-        checker.add(m.Grant(cycle_id, 1), 0.0)
+        checker.add(m.Grant(cycle_id=cycle_id, user=1), 0.0)
     assert len(checker._cycles) <= 64

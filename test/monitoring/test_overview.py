@@ -9,7 +9,9 @@ from rhs_isac_ros.protocol import messages as m
 
 
 def ended(cycle_id, user, phase, outcome):
-    return m.ProtocolState(cycle_id, user, phase, outcome, np.zeros(4), 0.0)
+    return m.ProtocolState(
+        cycle_id=cycle_id, user=user, phase=phase, outcome=outcome, began_s=np.zeros(4),
+        elapsed_s=0.0)
 
 
 def overview_of(net, until_s=np.inf):
@@ -61,7 +63,7 @@ def test_phases_follow_each_other_and_have_their_start_times(network):
 
 def test_a_cycle_that_is_given_up_has_a_reason():
     overview = Overview()
-    overview.add(m.Beacon(7, 0), 1.0)
+    overview.add(m.Beacon(cycle_id=7, attempt=0), 1.0)
     overview.add(ended(7, 3, m.Phase.POSITIONING, ''), 1.1)
     overview.add(ended(7, 3, m.Phase.BEACONING, 'rhs_silent'), 2.1)
     assert (overview.served, overview.given_up) == (0, 1)
@@ -73,7 +75,7 @@ def test_the_rate_is_averaged_over_ten_seconds():
     overview = Overview()
     for cycle_id in range(1, 101):
         now_s = 0.5 * cycle_id
-        overview.add(m.Beacon(cycle_id, 0), now_s - 0.1)
+        overview.add(m.Beacon(cycle_id=cycle_id, attempt=0), now_s - 0.1)
         overview.add(ended(cycle_id, 1, m.Phase.BEACONING, 'served'), now_s)
         if cycle_id == 4:
             assert overview.rate_hz(2.4) == pytest.approx(4 / 2.0)

@@ -10,21 +10,26 @@ from rhs_isac_ros.protocol import messages as m
 
 
 def truth(user, position, cycle_id=0):
-    return m.GroundTruth(cycle_id, user, np.array(position, float), np.zeros(3))
+    return m.GroundTruth(
+        cycle_id=cycle_id, user=user, position=np.array(position, float), velocity=np.zeros(3))
 
 
 def estimate(user, position, cycle_id):
     return m.PositionEstimate(
-        cycle_id, user, 'cb', np.array(position, float), np.eye(3), 0.1, 'bayes', 0.01)
+        cycle_id=cycle_id, user=user, codebook_id='cb', position=np.array(position, float),
+        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01)
 
 
 def beam(user):
-    return m.Beam(1, user, 'cb', 0, np.ones(4), np.ones((2, 2), complex), 1e6)
+    return m.Beam(
+        cycle_id=1, user=user, codebook_id='cb', band=0, analog=np.ones(4),
+        digital=np.ones((2, 2), complex), expected_bps=1e6)
 
 
 def test_it_is_complete_once_every_user_has_an_estimate():
     scene = SceneState()
-    for message in (m.RhsConfiguration(1, m.Mode.POSITIONING, 0, 'cb', np.ones((3, 4))),
+    for message in (m.RhsConfiguration(
+        cycle_id=1, mode=m.Mode.POSITIONING, band=0, codebook_id='cb', analog=np.ones((3, 4))),
                     truth(1, [9, 0, 0]), truth(2, [8, 0, 0]), estimate(1, [9, 1, 0], 1)):
         scene.add(message, 1.0)
         assert not scene.complete

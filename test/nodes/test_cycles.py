@@ -271,11 +271,13 @@ def test_nan_does_not_spread(network, join):
         for frame in range(request.n_frames):
             signals = np.full((8, 3), complex(math.nan, 0))
             feeds.publish(convert.to_ros(m.FeedSignals(
-                request.cycle_id, request.user, request.band, frame, signals), None))
+                cycle_id=request.cycle_id, user=request.user, band=request.band, frame=frame,
+                signals=signals), None))
         stamp = watch.node.get_clock().now().to_msg()
         signals = np.full((2, 8, 4), complex(0, math.inf))
         received.publish(convert.to_ros(m.ReceivedSignals(
-            request.cycle_id, request.user, codebook.id, signals), stamp))
+            cycle_id=request.cycle_id, user=request.user, codebook_id=codebook.id,
+            signals=signals), stamp))
         sent.update({m.FeedSignals: request.n_frames, m.ReceivedSignals: 1})
 
     since = {kind: len(messages) for kind, messages in watch.received.items()}

@@ -1,4 +1,4 @@
-"""What roles keep for a codebook."""
+"""Items that roles derive from codebooks."""
 
 import pytest
 
@@ -7,33 +7,33 @@ from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 
 @pytest.fixture
 def shelf():
-    """A shelf with a, b and c, of which none is in use."""
+    """A cache with items a, b and c, none of which is in use."""
     made = CodebookCache()
     for name in 'abc':
         made.put(name, name.upper())
     return made
 
 
-def test_what_was_put_can_be_taken(shelf):
+def test_a_stored_item_can_be_taken(shelf):
     assert [shelf.take(name) for name in 'abc'] == ['A', 'B', 'C']
     assert shelf.ids() == ['a', 'b', 'c']
 
 
-def test_an_empty_shelf_has_nothing_in_use():
+def test_an_empty_cache_has_nothing_in_use():
     shelf = CodebookCache()
     assert shelf.in_use == ''
     assert shelf.ids() == []
     assert '' not in shelf
 
 
-def test_what_was_taken_last_is_in_use(shelf):
+def test_the_item_taken_last_is_in_use(shelf):
     shelf.take('a')
     assert shelf.in_use == 'a'
     shelf.take('c')
     assert shelf.in_use == 'c'
 
 
-def test_the_oldest_goes(shelf):
+def test_the_oldest_item_is_discarded(shelf):
     shelf.put('d', 'D')
     assert shelf.ids() == ['b', 'c', 'd']
     assert 'a' not in shelf
@@ -42,7 +42,7 @@ def test_the_oldest_goes(shelf):
     assert shelf.in_use == ''
 
 
-def test_what_is_in_use_stays(shelf):
+def test_the_item_in_use_is_kept(shelf):
     shelf.take('a')
     for name in 'defg':
         shelf.put(name, name.upper())
@@ -50,7 +50,7 @@ def test_what_is_in_use_stays(shelf):
     assert shelf.take('a') == 'A'
 
 
-def test_what_is_no_longer_in_use_goes_with_its_age(shelf):
+def test_an_item_no_longer_in_use_is_discarded_by_age(shelf):
     shelf.take('a')
     shelf.put('d', 'D')
     shelf.take('d')
@@ -59,21 +59,21 @@ def test_what_is_no_longer_in_use_goes_with_its_age(shelf):
     assert shelf.ids() == ['b', 'c', 'd', 'e']
 
 
-def test_what_is_put_again_is_new(shelf):
+def test_an_item_stored_again_is_the_newest(shelf):
     shelf.put('a', 'again')
     shelf.put('d', 'D')
     assert shelf.ids() == ['c', 'a', 'd']
     assert shelf.take('a') == 'again'
 
 
-def test_the_memory_does_not_grow(shelf):
+def test_the_size_is_bounded(shelf):
     for n in range(1000):
         shelf.put(str(n), n)
         shelf.take(str(n - n % 7))
     assert len(shelf.ids()) == 4
 
 
-def test_who_only_looks_changes_nothing(shelf):
+def test_peeking_changes_nothing(shelf):
     shelf.take('b')
     assert shelf.peek('a') == 'A'
     assert shelf.peek('z') is None

@@ -1,9 +1,9 @@
-"""A new codebook holds from the next cycle on, and no cycle mixes two."""
+"""A new codebook takes effect with the next cycle, and no cycle mixes two."""
 
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 
 IN_A_CYCLE = [State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING,
               State.STEERING, State.TRANSMITTING]
@@ -12,14 +12,14 @@ WITH_ID = (m.RhsCommand, m.RhsConfiguration, m.ReceivedSignals, m.PositionEstima
 
 
 def ids(network, cycle_id):
-    """Which codebooks the messages of a cycle name."""
+    """Return the codebook ids in the messages of a cycle."""
     found = [message for kind in WITH_ID for message in network.sent(kind, cycle_id=cycle_id)]
     assert {type(message) for message in found} == set(WITH_ID)
     return {message.codebook_id for message in found}
 
 
 @pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING], ids=lambda state: state.value)
-def test_a_codebook_holds_from_the_next_cycle_on(network, codebooks, state):
+def test_a_codebook_takes_effect_with_the_next_cycle(network, codebooks, state):
     net = network(2)
     net.run_cycles(2)
     net.run_to(state)
@@ -34,7 +34,7 @@ def test_a_codebook_holds_from_the_next_cycle_on(network, codebooks, state):
 
 
 @pytest.mark.parametrize('state', IN_A_CYCLE, ids=lambda state: state.value)
-def test_of_two_codebooks_in_one_cycle_the_last_holds(network, codebooks, state):
+def test_of_two_codebooks_in_one_cycle_the_last_takes_effect(network, codebooks, state):
     net = network()
     net.run_cycles(1)
     net.run_to(state)
@@ -47,7 +47,7 @@ def test_of_two_codebooks_in_one_cycle_the_last_holds(network, codebooks, state)
     net.verify()
 
 
-def test_codebooks_change_again_and_again(network, codebooks):
+def test_codebooks_may_change_repeatedly(network, codebooks):
     net = network(2)
     for turn in range(12):
         net.run_to(State.SOUNDING)
@@ -59,7 +59,7 @@ def test_codebooks_change_again_and_again(network, codebooks):
     net.verify()
 
 
-def test_the_codebook_in_use_may_come_back(network, codebooks):
+def test_the_codebook_in_use_may_be_offered_again(network, codebooks):
     net = network()
     net.run_cycles(1)
     net.run_to(State.SOUNDING)
@@ -71,7 +71,7 @@ def test_the_codebook_in_use_may_come_back(network, codebooks):
 
 
 @pytest.mark.parametrize('role', ['rhs_controller', 'positioner', 'transmission'])
-def test_a_role_that_has_the_new_codebook_late_costs_one_cycle(network, codebooks, role):
+def test_a_role_that_receives_the_codebook_late_costs_one_cycle(network, codebooks, role):
     reasons = {'rhs_controller': 'rhs_silent', 'positioner': 'positioner_silent',
                'transmission': 'transmission_silent'}
     net = network()
@@ -92,7 +92,7 @@ def test_a_role_that_has_the_new_codebook_late_costs_one_cycle(network, codebook
 def test_the_base_station_waits_for_a_codebook(network, codebooks, scenario):
     net = network(codebook=None)
     net.run(limit_s=10.0)
-    assert net.said('bs') == ['waiting for codebook']
+    assert net.logged('bs') == ['waiting for codebook']
     assert net.sent(m.Beacon) == []
     net.offer(codebooks[1])
     net.run_cycles(1)
@@ -100,23 +100,23 @@ def test_the_base_station_waits_for_a_codebook(network, codebooks, scenario):
     assert ids(net, 1) == {codebooks[1].id}
 
 
-def test_without_role_and_codebook_both_are_named(network):
+def test_a_missing_role_and_a_missing_codebook_are_both_logged(network):
     net = network(codebook=None, absent=['channel'])
-    assert net.said('bs') == ['waiting for channel, codebook']
+    assert net.logged('bs') == ['waiting for channel, codebook']
     net.add('channel')
-    assert net.said('bs')[1:] == ['waiting for codebook']
+    assert net.logged('bs')[1:] == ['waiting for codebook']
 
 
-def test_the_positioner_tells_when_it_is_ready(network, codebooks):
+def test_the_positioner_logs_when_it_is_ready(network, codebooks):
     net = network()
     net.offer(codebooks[1])
     net.offer(codebooks[1])
-    assert net.said('positioner') == [
+    assert net.logged('positioner') == [
         f'centre is ready for codebook {c.id} after 0.0 s' for c in codebooks[:2]]
 
 
-def test_a_codebook_offered_before_anybody_was_served_costs_nothing(network, codebooks, places):
-    """Beaconing to an empty network may last for hours, and a codebook be loaded meanwhile."""
+def test_a_codebook_offered_while_nobody_answers_costs_no_cycle(network, codebooks, places):
+    """Beaconing without users may last for hours, with a new codebook meanwhile."""
     net = network(0)
     net.run(limit_s=1.0)
     net.offer(codebooks[1])
@@ -128,7 +128,7 @@ def test_a_codebook_offered_before_anybody_was_served_costs_nothing(network, cod
     net.verify()
 
 
-def test_a_codebook_offered_twice_while_beaconing_costs_nothing(network, codebooks):
+def test_a_codebook_offered_twice_while_beaconing_costs_no_cycle(network, codebooks):
     net = network()
     net.run_cycles(1)
     net.offer(codebooks[1])
@@ -140,8 +140,8 @@ def test_a_codebook_offered_twice_while_beaconing_costs_nothing(network, codeboo
 
 
 
-def test_no_cycle_is_lost_while_an_estimator_is_made(network, codebooks):
-    """The signals of the new codebook wait for it, within the patience of the base station."""
+def test_no_cycle_is_lost_while_an_estimator_is_built(network, codebooks):
+    """The signals of the new codebook wait for it, within the time-out of the base station."""
     net = network(make_s=0.8, step_timeout_s=1.0)
     net.run_cycles(2)
     net.run_to(State.SOUNDING)
@@ -154,7 +154,7 @@ def test_no_cycle_is_lost_while_an_estimator_is_made(network, codebooks):
     net.verify()
 
 
-def test_an_estimator_that_takes_long_costs_the_cycles_of_its_codebook_only(network, codebooks):
+def test_a_slow_estimator_costs_only_cycles_of_its_codebook(network, codebooks):
     net = network(make_s=2.5, step_timeout_s=1.0)
     net.run(limit_s=5.0)
     before = len(net.outcomes())

@@ -11,10 +11,10 @@ from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, st
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 
 PACKAGE = Path(rhs_isac_ros.__file__).parent
-# What one cycle puts on the bus, for two bands of two frames.
+# Messages of one cycle with two bands of two frames.
 OF_A_BAND = [m.RhsCommand, m.RhsConfiguration, m.PilotRequest, m.Pilot, m.Pilot, m.FeedSignals,
              m.FeedSignals]
 OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, *OF_A_BAND, *OF_A_BAND, m.ReceivedSignals,
@@ -26,7 +26,7 @@ def of_cycle(network, cycle_id):
     return [sent.message for sent in network.log if sent.message.cycle_id == cycle_id]
 
 
-def test_the_messages_of_a_cycle_come_in_the_order_of_the_protocol(network):
+def test_the_messages_of_a_cycle_follow_the_order_of_the_protocol(network):
     net = network()
     net.run_cycles(3)
     for cycle_id in (1, 2, 3):
@@ -42,14 +42,14 @@ def test_the_messages_of_a_cycle_come_in_the_order_of_the_protocol(network):
     net.verify()
 
 
-def test_without_faults_nothing_is_counted_and_nobody_complains(network):
+def test_without_faults_nothing_is_counted_or_logged(network):
     net = network()
     net.run_cycles(100)
     assert net.counters() == {}
-    assert not any(said.note.warning for said in net.notes)
+    assert not any(said.message.warning for said in net.logs)
 
 
-def test_bands_and_frames_come_in_turn(network, scenario, codebooks):
+def test_bands_and_frames_are_sounded_in_order(network, scenario, codebooks):
     net = network()
     net.run_cycles(1)
     assert [c.band for c in net.sent(m.RhsCommand)] == [0, 1]
@@ -73,7 +73,7 @@ def test_the_results_of_a_cycle_carry_its_number_user_and_codebook(network, code
     net.verify()
 
 
-def test_the_estimate_is_what_the_estimator_finds(network, scenario):
+def test_the_estimate_is_the_result_of_the_estimator(network, scenario):
     class Corner:
         name = 'corner'
 
@@ -123,7 +123,7 @@ def test_a_perfect_estimate_loses_nothing(network, scenario):
     assert report.loss_bps == pytest.approx(0, abs=1e-6 * report.perfect_bps)
 
 
-def test_data_beyond_the_true_capacity_are_dropped(network):
+def test_data_beyond_the_true_capacity_are_lost(network):
     net = network(5)
     net.run_cycles(5)
     limited = []
@@ -143,9 +143,9 @@ def test_data_beyond_the_true_capacity_are_dropped(network):
 
 
 @pytest.mark.parametrize('n_users', [1, 2, 5])
-def test_round_robin_lets_nobody_wait_more_than_a_round(network, n_users):
+def test_round_robin_serves_every_user_once_per_round(network, n_users):
     net = network(n_users)
-    # Until all are known, a user may be met again.
+    # Until all users are registered, one may be served twice.
     net.run_cycles(4 * n_users)
     served = net.served()
     assert len(served) == 4 * n_users
@@ -153,7 +153,7 @@ def test_round_robin_lets_nobody_wait_more_than_a_round(network, n_users):
         assert set(served[start:start + n_users]) == set(range(1, n_users + 1))
 
 
-def test_first_serves_who_answers_first(network):
+def test_first_serves_the_first_user_to_answer(network):
     def prefer_2(message, recipient):
         late = isinstance(message, m.Ack) and message.user != 2
         return [(2e-3 if late else 1e-3, message)]
@@ -163,7 +163,7 @@ def test_first_serves_who_answers_first(network):
     assert net.served() == [2] * 6
 
 
-def test_random_serves_everybody_now_and_then(network):
+def test_random_serves_every_user(network):
     net = network(3, policy='random')
     net.run_cycles(60)
     served = net.served()
@@ -201,8 +201,8 @@ def test_multipath_and_noise_differ_between_cycles(network):
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_signals_do_not_depend_on_the_order_of_callbacks(network, noisy, seed):
-    """Multipath and noise belong to (seed, user, cycle), however messages overtake each other."""
+def test_signals_do_not_depend_on_the_order_of_messages(network, noisy, seed):
+    """Multipath and noise are functions of seed, user and cycle only."""
     def by_cycle(net):
         net.run_cycles(8)
         net.verify()
@@ -217,8 +217,8 @@ def test_signals_do_not_depend_on_the_order_of_callbacks(network, noisy, seed):
         np.testing.assert_array_equal(signals, calm[cycle_id])
 
 
-def test_signals_of_a_cycle_are_the_same_after_another_past(network):
-    """What a user meets in a cycle does not depend on what the network did before."""
+def test_signals_of_a_cycle_do_not_depend_on_earlier_cycles(network):
+    """Cycles with the same number have the same multipath and noise."""
     plain, rough = network(), network()
     rough.run_to(State.SOUNDING)
     rough.remove('user1')
@@ -230,7 +230,7 @@ def test_signals_of_a_cycle_are_the_same_after_another_past(network):
     np.testing.assert_array_equal(a.signals, b.signals)
 
 
-def test_a_moving_user_stands_still_within_a_cycle(network, scenario):
+def test_the_position_of_a_moving_user_is_fixed_within_a_cycle(network, scenario):
     walk = mobility.RandomWalk(scenario, 50.0, np.random.default_rng(0))
     net = network({1: walk})
     net.run_cycles(10)
@@ -246,7 +246,7 @@ def test_a_moving_user_stands_still_within_a_cycle(network, scenario):
         assert report.actual_bps == pytest.approx(actual)
 
 
-def test_whereabouts_outside_a_cycle_change_nothing(network, example):
+def test_positions_outside_a_cycle_change_nothing(network, example):
     net, plain = network(), network()
     for state in (State.CONFIGURING, State.SOUNDING, State.STEERING, State.TRANSMITTING):
         net.run_to(state)
@@ -270,10 +270,12 @@ def test_the_true_position_never_reaches_base_station_and_positioner(subscriptio
 
 
 def test_the_position_is_estimated_without_the_true_one(network, places):
-    """Only what the user radiates tells where it is: a false report changes nothing but losses."""
+    """A false true position changes nothing but the reported losses."""
     def lie_to_transmission(message, recipient):
         if isinstance(message, m.GroundTruth) and recipient == 'transmission':
-            return [(1e-3, m.GroundTruth(message.cycle_id, message.user, places[4], np.zeros(3)))]
+            return [(1e-3, m.GroundTruth(
+                cycle_id=message.cycle_id, user=message.user, position=places[4],
+                velocity=np.zeros(3)))]
         return [(1e-3, message)]
 
     honest, deceived = network(), network(transport=lie_to_transmission)
@@ -309,7 +311,7 @@ def test_a_user_that_joins_an_empty_network_is_served(network, places):
 
 
 @pytest.mark.parametrize('signs', [(-1, -1, -1), (1, 1, 1), (-1, 1, 0), (1, -1, 1)])
-def test_a_user_at_the_edge_of_the_region_is_served(network, scenario, signs):
+def test_a_user_at_a_corner_of_the_region_is_served(network, scenario, signs):
     low, high = scenario.roi_bounds_m
     net = network({1: (low + high) / 2 + np.array(signs) * (high - low) / 2})
     net.run_cycles(2)
@@ -318,13 +320,13 @@ def test_a_user_at_the_edge_of_the_region_is_served(network, scenario, signs):
     net.verify()
 
 
-def test_no_pause_between_cycles_is_fine(network):
+def test_the_pause_between_cycles_may_be_zero(network):
     net = network(2, rest_s=0.0)
     net.run_cycles(7)
     assert net.served() == [1, 2, 1, 2, 1, 2, 1]
 
 
-def test_beacons_wait_for_the_pause(network):
+def test_a_beacon_follows_the_pause(network):
     net = network(rest_s=2.5)
     net.run_cycles(2)
     beacons = [sent.time_s for sent in net.log if isinstance(sent.message, m.Beacon)]
@@ -363,10 +365,10 @@ def test_a_cycle_of_table_1_finds_the_user(network_class, shipped, table1_estima
         assert 0 <= report.loss_percent < 1
 
 
-def test_of_64_users_none_waits_more_than_a_round(network, places):
+def test_64_users_are_each_served_once_per_round(network, places):
     net = network({user: places[0] for user in range(1, 65)}, rest_s=0.0)
     net.run_cycles(1 + 64 + 4)
-    # The first ack ends the wait of the first cycle: nobody else is known yet.
+    # The first ack ends the wait in the first cycle: no other user is registered yet.
     assert net.counters() == {'bs': {'late_ack': 63}}
     served = net.served()[1:]
     assert sorted(served[:64]) == list(range(1, 65))

@@ -1,4 +1,4 @@
-"""An air that is not ideal: what it does to messages, and that the protocol bears it."""
+"""A channel with impairments, and the protocol under them."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from rhs_isac_ros.protocol.role import PlainRole
 
 
 class Repeats(PlainRole):
-    """Sends on what it is told, with a note."""
+    """Publishes each message that it receives, with a log message."""
 
     def handle(self, event, now_s):
         return [Send(event), LogMessage('heard')]
@@ -19,31 +19,32 @@ class Repeats(PlainRole):
 
 @pytest.fixture
 def impaired():
-    """Function of impairments: `Repeats` behind such an air."""
+    """Function that takes impairments and returns an impaired `Repeats`."""
     def make(seed=0, **impairments):
         return ImpairedChannel(Repeats(), Impairments(**impairments), np.random.default_rng(seed))
     return make
 
 
 def through(role, n):
-    """Cycle numbers in the order of their arrival, of n messages sent at time 0."""
-    arrived = [action for cycle in range(n) for action in role.handle(m.Beacon(cycle, 0), 0.0)]
+    """Return the cycle ids of n messages sent at time 0, in the order of their arrival."""
+    arrived = [action for cycle in range(n) for action in role.handle(m.Beacon(
+        cycle_id=cycle, attempt=0), 0.0)]
     while (due_s := role.next_deadline()) is not None:
         arrived += role.handle(Tick(), due_s)
     assert sum(isinstance(action, LogMessage) for action in arrived) == n
     return [action.message.cycle_id for action in arrived if isinstance(action, Send)]
 
 
-def test_an_ideal_air_changes_nothing(impaired):
+def test_an_ideal_channel_changes_nothing(impaired):
     role = impaired()
     (sent, note) = sorted(
-        role.handle(m.Beacon(5, 0), 1.0), key=lambda a: isinstance(a, LogMessage))
+        role.handle(m.Beacon(cycle_id=5, attempt=0), 1.0), key=lambda a: isinstance(a, LogMessage))
     assert (sent.message.cycle_id, note.text) == (5, 'heard')
     assert role.next_deadline() is None
     assert role.counters == {}
 
 
-def test_losses_and_doubles_are_as_probable_as_told_and_counted(impaired):
+def test_losses_and_duplicates_have_their_probabilities_and_are_counted(impaired):
     role = impaired(loss_probability=0.2, double_probability=0.1)
     arrived = through(role, 5000)
     lost = 5000 - len(set(arrived))
@@ -55,9 +56,9 @@ def test_losses_and_doubles_are_as_probable_as_told_and_counted(impaired):
     assert len(arrived) <= 2 * len(set(arrived))
 
 
-def test_each_takes_its_time_and_they_overtake_each_other(impaired):
+def test_messages_are_delayed_at_random_and_reordered(impaired):
     role = impaired(delay_s=0.5, jitter_s=0.2)
-    role.handle(m.Beacon(1, 0), 10.0)
+    role.handle(m.Beacon(cycle_id=1, attempt=0), 10.0)
     due_s = role.next_deadline()
     assert 10.5 <= due_s <= 10.7
     assert role.handle(Tick(), due_s - 1e-6) == []
@@ -68,16 +69,16 @@ def test_each_takes_its_time_and_they_overtake_each_other(impaired):
     assert arrived != sorted(arrived)
 
 
-def test_without_jitter_the_order_stays(impaired):
+def test_without_jitter_the_order_is_kept(impaired):
     assert through(impaired(delay_s=0.5), 50) == list(range(50))
 
 
-def test_the_fate_of_a_message_does_not_depend_on_that_of_others(impaired):
+def test_impairments_of_messages_are_independent(impaired):
     some, more = (set(through(impaired(loss_probability=p), 1000)) for p in (0.3, 0.1))
     assert some < more
 
 
-def test_nearly_all_cycles_are_served_through_a_bad_air(network):
+def test_nearly_all_cycles_are_served_under_impairments(network):
     net = network(2, rest_s=0.0, retries=3)
     channel = Channel(net.scenario, net.seed)
     air = Impairments(0.05, 0.05, 1e-3, 5e-3)

@@ -1,4 +1,4 @@
-"""Whatever is lost, doubled, late, dead or started anew: the promises of the protocol hold."""
+"""The guarantees of the protocol hold under losses, duplicates, delays, crashes and restarts."""
 
 import itertools
 import types
@@ -14,11 +14,11 @@ from rhs_isac_ros.link import Beam, Outcome
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import transmission
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 
 STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
-# Faults end after so long; then everyone has to be served within the other.
-TROUBLE_S, PATIENCE_S = 1.0, 3.0
+# Duration of the faults, and the time within which every user must be served after it.
+FAULTS_END_S, RECOVERY_S = 1.0, 3.0
 ROLES = ('bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'user1', 'user2')
 LOST = [(kind, recipient) for recipient, kinds in {
     'bs': (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.Beam, m.Data),
@@ -31,7 +31,7 @@ LOST = [(kind, recipient) for recipient, kinds in {
 
 
 class Fault(NamedTuple):
-    """The nth message of a kind to a recipient arrives after each of these delays."""
+    """The nth message of a class to a recipient arrives once after each of the delays."""
 
     kind: type[m.Message]
     recipient: str
@@ -40,7 +40,7 @@ class Fault(NamedTuple):
 
 
 class Crash(NamedTuple):
-    """A role dies, with or without its peers' notice, and comes back."""
+    """A role crashes, detected by its peers or not, and restarts."""
 
     at_s: float
     role: str
@@ -49,14 +49,14 @@ class Crash(NamedTuple):
 
 
 class Offer(NamedTuple):
-    """A codebook is offered to all that are there."""
+    """A codebook is offered to all roles that are present."""
 
     at_s: float
     number: int
 
 
 class Change(NamedTuple):
-    """Other settings are offered to a role, if it is there."""
+    """New settings are offered to a role, if it is present."""
 
     at_s: float
     role: str
@@ -64,7 +64,7 @@ class Change(NamedTuple):
 
 
 class Faulty:
-    """A transport with a list of faults; all else is on time."""
+    """A transport with a list of faults; all other messages are on time."""
 
     def __init__(self, faults):
         self._faults = {(fault.kind, fault.recipient, fault.nth): fault.delays_s
@@ -77,8 +77,8 @@ class Faulty:
         return [(delay_s, message) for delay_s in self._faults.get((*key, nth), (1e-3,))]
 
 
-TIMES_S = st.sampled_from([n * TROUBLE_S / 30 for n in range(30)]) | st.floats(
-    0, TROUBLE_S, allow_subnormal=False)
+TIMES_S = st.sampled_from([n * FAULTS_END_S / 30 for n in range(30)]) | st.floats(
+    0, FAULTS_END_S, allow_subnormal=False)
 DELAYS_S = st.sampled_from([1e-3, 2.5e-3, 0.03, 0.08, 0.25, 0.45])
 FAULTS = st.lists(st.builds(
     lambda pair, nth, delays_s: Fault(*pair, nth, tuple(delays_s)),
@@ -101,7 +101,7 @@ NOISE = st.fixed_dictionaries({
 
 @pytest.fixture(scope='module', autouse=True)
 def plain_beams():
-    """Beams that tell where they point, without the search for the best of them."""
+    """Replace the optimization of beams by a simple function of the position."""
     def choose(scenario, position, covariance_m2, bands):
         angles = np.arange(scenario.n_elements) * np.abs(position).sum()
         digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
@@ -116,7 +116,7 @@ def plain_beams():
 
 @pytest.fixture(scope='module')
 def make_network(network_class, scenario, codebooks):
-    """Function that makes a network of two users that move fast."""
+    """Function that returns a network of two fast users."""
     def make(transport, ordered, retries):
         users = {user: mobility.RandomWalk(scenario, 50.0, np.random.default_rng(user))
                  for user in (1, 2)}
@@ -128,7 +128,7 @@ def make_network(network_class, scenario, codebooks):
 
 @pytest.fixture(scope='module')
 def survive(codebooks):
-    """Function that lets a network live through crashes, offers and changes, and heals it."""
+    """Function that runs a network through crashes, offers and changes and checks its recovery."""
     def run(net, crashes, offers, changes):
         happens = [(crash.at_s, lambda crash=crash: stop(net, crash)) for crash in crashes]
         happens += [(crash.at_s + crash.down_s, lambda crash=crash: start(net, crash.role))
@@ -140,9 +140,9 @@ def survive(codebooks):
         for at_s, act in sorted(happens, key=lambda pair: pair[0]):
             net.run(limit_s=at_s - net.now_s)
             act()
-        net.run(limit_s=max(TROUBLE_S - net.now_s, 0.0))
+        net.run(limit_s=max(FAULTS_END_S - net.now_s, 0.0))
         net.transport = lambda message, recipient: [(1e-3, message)]
-        # Under other policies a user may wait for ever.
+        # Other policies do not guarantee service to every user.
         net.change('bs', policy='round_robin')
         check_end(net)
         net.verify()
@@ -166,15 +166,15 @@ def alter(net, change):
 
 
 def check_end(net):
-    """The base station beacons again, serves everyone, and rests between cycles."""
-    net.run_to(State.BEACONING, limit_s=PATIENCE_S)
+    """Check that the base station sends beacons again and serves every user."""
+    net.run_to(State.BEACONING, limit_s=RECOVERY_S)
     before = len(net.served())
-    net.run(lambda: {1, 2} <= set(net.served()[before:]), PATIENCE_S)
-    net.run_to(State.BEACONING, limit_s=PATIENCE_S)
+    net.run(lambda: {1, 2} <= set(net.served()[before:]), RECOVERY_S)
+    net.run_to(State.BEACONING, limit_s=RECOVERY_S)
 
 
 def check_results(net):
-    """A cycle has one user, one position and one codebook, and its results are of these."""
+    """Check that each cycle has one user, one position and one codebook."""
     cycles = {}
     for _, _, message in net.log:
         if message.cycle_id and isinstance(message, (
@@ -200,17 +200,17 @@ def check_results(net):
 @given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
        retries=RETRIES)
 @explicit(faults=[], crashes=[], offers=[], changes=[], ordered=True, retries=3)
-def test_single_faults_and_crashes_break_no_promise(
+def test_guarantees_hold_under_single_faults_and_crashes(
         make_network, survive, faults, crashes, offers, changes, ordered, retries):
     survive(make_network(Faulty(faults), ordered, retries), crashes, offers, changes)
 
 
 @given(noise=NOISE, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
        retries=RETRIES)
-# A late beacon and a late grant of a cycle that is over.
+# A late beacon and a late grant of a finished cycle.
 @explicit(noise={'seed': 1038635, 'loss': 0.02, 'doubles': 0.5, 'jitter_s': 0.5},
           crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
           offers=[], changes=[], ordered=False, retries=0)
-def test_storms_and_crashes_break_no_promise(
+def test_guarantees_hold_under_random_faults_and_crashes(
         make_network, survive, noisy, noise, crashes, offers, changes, ordered, retries):
     survive(make_network(noisy(**noise), ordered, retries), crashes, offers, changes)

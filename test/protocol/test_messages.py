@@ -1,4 +1,4 @@
-"""Messages and events as plain data, and what `check` says of malformed ones."""
+"""Messages and events as data, and the check of malformed messages."""
 
 import dataclasses
 import inspect
@@ -25,7 +25,7 @@ def test_an_example_of_every_message_is_valid(example, scenario, kind):
 
 
 @pytest.mark.parametrize('kind', KINDS, ids=name_of)
-def test_every_message_begins_with_its_cycle(kind):
+def test_the_first_field_of_every_message_is_its_cycle(kind):
     assert dataclasses.fields(kind)[0].name == 'cycle_id'
 
 
@@ -45,12 +45,12 @@ def test_events_and_actions_cannot_be_changed(event, field):
         setattr(event, field, None)
 
 
-def test_messages_are_the_same_if_all_that_they_say_is(example):
+def test_messages_are_the_same_if_all_fields_are_equal(example):
     one = example(m.Beam, cycle_id=3, user=1)
     assert m.same(one, example(m.Beam, cycle_id=3, user=1))
     for changes in ({'cycle_id': 4}, {'user': 2}, {'analog': one.analog + 0.5}):
         assert not m.same(one, dataclasses.replace(one, **changes))
-    assert not m.same(m.Ack(1, 2), m.Grant(1, 2))
+    assert not m.same(m.Ack(cycle_id=1, user=2), m.Grant(cycle_id=1, user=2))
 
 
 def test_events_without_arrays_compare_by_value():
@@ -114,10 +114,10 @@ ARRAYS = [(kind, field) for kind in KINDS for field in dataclasses.fields(kind)
 
 @pytest.mark.parametrize(('kind', 'field'), ARRAYS, ids=name_of)
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
-def test_an_array_with_something_not_finite_is_named(example, scenario, kind, field, bad):
+def test_an_array_with_a_value_that_is_not_finite_is_named(example, scenario, kind, field, bad):
     message = example(kind)
     getattr(message, field.name).flat[-1] = bad
-    if field.metadata['may_lack'] and math.isnan(bad):
+    if field.metadata['nan_allowed'] and math.isnan(bad):
         m.check(message, scenario.sizes)
         return
     with pytest.raises(m.MessageError) as caught:
@@ -207,7 +207,7 @@ def test_a_number_out_of_range_is_named(example, scenario, kind, field):
             f'{kind.__name__}.{field.name}: {field.type(bad)}, expected {least:g} to {most:g}')
 
 
-def test_users_count_from_one_and_amounts_are_not_negative():
+def test_users_start_at_one_and_amounts_are_not_negative():
     ranges = {(kind, field.name): field.metadata['least'] for kind, field in RANGES}
     for kind in KINDS:
         for field in dataclasses.fields(kind):
@@ -221,14 +221,14 @@ def test_users_count_from_one_and_amounts_are_not_negative():
 
 
 @pytest.mark.parametrize('n_frames', [0, 1, 3, 2**31])
-def test_a_request_for_another_number_of_frames_is_named(example, scenario, n_frames):
+def test_a_request_with_a_wrong_number_of_frames_is_named(example, scenario, n_frames):
     with pytest.raises(m.MessageError) as caught:
         m.check(example(m.PilotRequest, n_frames=n_frames), scenario.sizes)
     assert str(caught.value) == f'PilotRequest.n_frames: {n_frames}, expected F = 2'
 
 
 @pytest.mark.parametrize('kind', [m.PositionEstimate, m.GroundTruth], ids=name_of)
-def test_a_place_out_of_this_world_is_named(example, scenario, kind):
+def test_a_position_out_of_range_is_named(example, scenario, kind):
     with pytest.raises(m.MessageError, match=rf'{kind.__name__}\.position: 0 to 2e\+06'):
         m.check(example(kind, position=np.array([2e6, 0, 0])), scenario.sizes)
 

@@ -1,4 +1,4 @@
-"""Messages of different topics may overtake each other: no cycle is lost by that alone."""
+"""Messages of different topics may be reordered; no cycle is lost by that alone."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from rhs_isac_ros.protocol.user import State
 
 
 class Delays:
-    """Delays what one recipient gets of a kind."""
+    """Delays messages of a class to one recipient."""
 
     def __init__(self, kind, recipient, delay_s, **fields):
         self.kind, self.recipient, self.delay_s, self.fields = kind, recipient, delay_s, fields
@@ -49,7 +49,7 @@ def test_a_message_may_be_late(network, kind, recipient, fields):
     net.verify()
 
 
-def test_no_cycle_is_lost_by_order_alone(network, noisy):
+def test_no_cycle_is_lost_by_reordering_alone(network, noisy):
     for seed in range(5):
         net = network(2, transport=noisy(seed, jitter_s=0.02))
         net.run_cycles(20)
@@ -58,7 +58,7 @@ def test_no_cycle_is_lost_by_order_alone(network, noisy):
 
 
 def test_data_wait_for_both_the_beam_and_the_surface_in_every_cycle(network):
-    """The base station hears of them in either order, and keeps nothing from cycle to cycle."""
+    """They arrive in either order, and nothing is kept from cycle to cycle."""
     beam_late, surface_late = Delays(m.Beam, 'bs', 0.05), Delays(
         m.RhsConfiguration, 'bs', 0.05, mode=m.Mode.TRANSMISSION)
     net = network(transport=beam_late)
@@ -75,7 +75,7 @@ def test_data_wait_for_both_the_beam_and_the_surface_in_every_cycle(network):
     assert net.counters() == {}
 
 
-def test_an_estimate_that_comes_after_its_beam_is_no_fault(network):
+def test_an_estimate_that_arrives_after_its_beam_is_not_a_fault(network):
     net = network(transport=Delays(m.PositionEstimate, 'bs', 2.5e-3))
     net.run_cycles(2)
     assert net.served() == [1, 1]
@@ -89,7 +89,7 @@ def test_the_surface_may_be_ready_before_the_base_station_has_estimate_and_beam(
     net.run_cycles(2)
     assert net.served() == [1, 1]
     net.run(limit_s=0.09)
-    # The estimate comes when the data are under way already.
+    # The estimate arrives after the data were sent.
     assert net.counters() == {'bs': {'unexpected_estimate': 2}}
 
 
@@ -98,8 +98,8 @@ def test_the_surface_may_be_ready_before_the_base_station_has_estimate_and_beam(
     ((m.Pilot, 'channel'), (m.RhsConfiguration, 'bs')),
     ((m.FeedSignals, 'bs'), (m.PositionEstimate, 'transmission')),
 ], ids=['positioner and transmission', 'channel and surface', 'channel and transmission'])
-def test_steps_that_are_slow_but_in_time_lose_nothing(network, slow):
-    """The base station grants each step its time-out; two at 60 % of it must not lose the user."""
+def test_slow_steps_within_their_timeouts_lose_no_cycle(network, slow):
+    """Each step has its own time-out; two steps at 60 % of it must not lose the user."""
     transports = [Delays(kind, recipient, 0.6) for kind, recipient in slow]
     net = network(transport=lambda message, recipient: max(
         (t(message, recipient) for t in transports), key=lambda arriving: arriving[0][0]))
@@ -107,16 +107,18 @@ def test_steps_that_are_slow_but_in_time_lose_nothing(network, slow):
     assert net.served() == [1, 1]
 
 
-def test_what_another_user_got_in_an_older_cycle_does_not_matter(network):
+def test_data_of_another_user_in_an_older_cycle_are_ignored(network):
     user = network()['user1']
-    user.handle(m.Beacon(8, 0), 0.0)
-    user.handle(m.Data(7, 2, m.Direction.DOWNLINK, m.Stage.DELIVERED, 1e-3, 1e3), 0.1)
+    user.handle(m.Beacon(cycle_id=8, attempt=0), 0.0)
+    user.handle(m.Data(
+        cycle_id=7, user=2, direction=m.Direction.DOWNLINK, stage=m.Stage.DELIVERED,
+        duration_s=1e-3, bits=1e3), 0.1)
     assert user.state is State.ACKNOWLEDGED
-    (send,) = user.handle(m.Grant(8, 1), 0.2)
+    (send,) = user.handle(m.Grant(cycle_id=8, user=1), 0.2)
     assert isinstance(send.message, m.GroundTruth)
 
 
-def test_a_doubled_truth_changes_nothing(network):
+def test_a_duplicate_true_position_changes_nothing(network):
     def doubles(message, recipient):
         again = [(2.5e-3, message)] if isinstance(message, m.GroundTruth) else []
         return [(1e-3, message), *again]

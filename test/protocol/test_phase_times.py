@@ -1,4 +1,4 @@
-"""When the phases of a cycle begin."""
+"""Times at which the phases of a cycle begin."""
 
 import math
 
@@ -8,26 +8,26 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.phase_times import PhaseTimes
 
 
-def test_times_count_from_the_newest_beacon():
+def test_times_count_from_the_latest_beacon():
     times = PhaseTimes()
-    times.beacon(10.0)
-    times.beacon(20.0)
-    state = times.begin(m.Phase.POSITIONING, 7, 2, 20.5)
+    times.start(10.0)
+    times.start(20.0)
+    state = times.begin_phase(m.Phase.POSITIONING, 7, 2, 20.5)
     assert (state.cycle_id, state.user, state.phase, state.outcome, state.elapsed_s) == (
         7, 2, m.Phase.POSITIONING, '', 0.5)
     np.testing.assert_array_equal(state.began_s, [0.0, 0.5, math.nan, math.nan])
-    times.begin(m.Phase.ESTIMATING, 7, 2, 21.0)
-    end = times.end('transmission_silent', 7, 2, 22.0)
+    times.begin_phase(m.Phase.ESTIMATING, 7, 2, 21.0)
+    end = times.end_cycle('transmission_silent', 7, 2, 22.0)
     assert (end.phase, end.outcome, end.elapsed_s) == (
         m.Phase.BEACONING, 'transmission_silent', 2.0)
     np.testing.assert_array_equal(end.began_s, [0.0, 0.5, 1.0, math.nan])
-    # The next cycle knows nothing of it, and what was said does not change.
-    times.beacon(30.0)
-    assert np.isnan(times.begin(m.Phase.POSITIONING, 8, 1, 30.25).began_s[2:]).all()
+    # The next cycle starts anew; messages returned earlier do not change.
+    times.start(30.0)
+    assert np.isnan(times.begin_phase(m.Phase.POSITIONING, 8, 1, 30.25).began_s[2:]).all()
     assert state.began_s[1] == 0.5
 
 
-def test_a_cycle_tells_when_each_phase_began(network):
+def test_a_cycle_reports_when_each_phase_began(network):
     net = network()
     net.run_cycles(1)
     states = net.sent(m.ProtocolState)

@@ -1,4 +1,4 @@
-"""Settings of roles, and how they are told."""
+"""Settings of roles, and their description."""
 
 import dataclasses
 
@@ -15,39 +15,39 @@ from rhs_isac_ros.protocol.settings import (
 )
 
 
-def test_changes_are_the_new_values_of_what_is_another():
+def test_changes_are_the_new_values_of_changed_settings():
     old = BaseStationSettings()
     assert changes(old, dataclasses.replace(old, policy='first', retries=0)) == {
         'policy': 'first', 'retries': 0}
     assert changes(old, BaseStationSettings()) == {}
 
 
-def test_what_is_in_use_is_told_and_what_waits():
+def test_settings_in_use_and_pending_are_described():
     told = describe_settings(PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
     assert told == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
                     'pending.estimator': 'neural'}
 
 
-def test_values_are_written_as_ros_does():
+def test_values_are_written_as_in_ros():
     assert [shown(value) for value in (True, False, 3, 0.5, '')] == [
         'true', 'false', '3', '0.5', '']
 
 
 @pytest.mark.parametrize('users', ['0', '3-1', 'all'])
-def test_what_is_no_list_of_users_is_refused(users):
+def test_a_malformed_list_of_users_is_an_error(users):
     with pytest.raises(ValueError, match=f"allowed_users: '{users}', expected numbers"):
         BaseStationSettings(allowed_users=users)
 
 
-def test_the_newest_settings_wait_until_they_are_settled():
+def test_the_newest_settings_are_pending_until_they_are_applied():
     old, new = PositionerSettings(), PositionerSettings('ml')
-    standing = PendingSettings(old)
-    assert standing.settle() == []
-    standing.newest = PositionerSettings('neural')
-    standing.newest = new
-    assert standing.in_use == old
-    assert standing.describe()['pending.estimator'] == 'ml'
-    assert standing.settle() == [LogMessage("from now on: estimator 'ml'")]
-    assert standing.in_use == new
-    assert 'pending.estimator' not in standing.describe()
-    assert standing.settle() == []
+    pending = PendingSettings(old)
+    assert pending.apply() == []
+    pending.newest = PositionerSettings('neural')
+    pending.newest = new
+    assert pending.in_use == old
+    assert pending.describe()['pending.estimator'] == 'ml'
+    assert pending.apply() == [LogMessage("from now on: estimator 'ml'")]
+    assert pending.in_use == new
+    assert 'pending.estimator' not in pending.describe()
+    assert pending.apply() == []

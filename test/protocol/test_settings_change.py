@@ -1,10 +1,10 @@
-"""Other settings hold from the next cycle on, and no cycle mixes two."""
+"""New settings take effect with the next cycle, and no cycle mixes two."""
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_table import State
+from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
@@ -14,13 +14,13 @@ UNFIT = {'estimator': 'neural', 'model_file': 'unfit'}
 
 
 def told(net, role, beginning):
-    """What a role tells under names with a beginning."""
+    """Return the status values of a role whose names have a prefix."""
     return {name: value for name, value in net[role].status().items()
             if name.startswith(beginning)}
 
 
 def estimators(net):
-    """Estimators by cycle; each cycle has one."""
+    """Return the estimator of each cycle, after checking that it is the only one."""
     found = {}
     for estimate in net.sent(m.PositionEstimate):
         assert found.setdefault(estimate.cycle_id, estimate.estimator) == estimate.estimator
@@ -29,7 +29,7 @@ def estimators(net):
 
 @pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING, State.BEACONING],
                          ids=lambda state: state.value)
-def test_noise_holds_for_whole_cycles(network, state):
+def test_noise_does_not_change_within_a_cycle(network, state):
     net = network()
     net.run_cycles(2)
     net.run_to(state)
@@ -41,21 +41,21 @@ def test_noise_holds_for_whole_cycles(network, state):
     net.run_cycles(3)
     assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
     assert told(net, 'bs', 'pending') == {}
-    assert net.said('bs') == ["from now on: receiver_noise 'false'"]
-    # The reference signals are with the noise that held at the grant.
+    assert net.logged('bs') == ["from now on: receiver_noise 'false'"]
+    # The reference signals use the noise setting at the time of the grant.
     net.verify()
     first = 4 if waits else 3
     assert [net._noise[cycle_id] for cycle_id in range(1, 6)] == [
         cycle_id < first for cycle_id in range(1, 6)]
 
 
-def test_a_policy_holds_from_the_next_cycle_on_and_the_turns_stay_known(network):
+def test_a_policy_takes_effect_with_the_next_cycle_and_keeps_the_turns(network):
     net = network(3)
     net.run_cycles(2)
     net.run_to(State.SOUNDING)
     net.change('bs', policy='first')
     net.run_cycles(3)
-    # The rest of the present cycle, then whoever answers first; all answer at once.
+    # The rest of the present cycle, then the first user to answer; all answer at once.
     first = net.sent(m.Ack, cycle_id=4)[0].user
     assert net.served() == [1, 2, 3, first, first]
     net.change('bs', policy='round_robin')
@@ -63,7 +63,7 @@ def test_a_policy_holds_from_the_next_cycle_on_and_the_turns_stay_known(network)
     assert set(net.served()[-2:]) == {1, 2, 3} - {first}
 
 
-def test_a_list_of_users_that_lets_nobody_in_can_be_put_right(network):
+def test_a_list_of_users_without_any_present_user_can_be_corrected(network):
     net = network(2, allowed_users='99')
     net.run(limit_s=2.0)
     assert net.outcomes() == []
@@ -72,7 +72,7 @@ def test_a_list_of_users_that_lets_nobody_in_can_be_put_right(network):
     assert net.served() == [2, 2]
 
 
-def test_a_long_rest_ends_when_it_is_to_be_short(network):
+def test_a_long_pause_ends_when_it_is_shortened(network):
     net = network(rest_s=3000.0)
     net.run_cycles(1)
     net.run(limit_s=1.0)
@@ -80,7 +80,7 @@ def test_a_long_rest_ends_when_it_is_to_be_short(network):
     net.run_cycles(2, limit_s=3.0)
 
 
-def test_a_rest_set_in_a_cycle_is_the_one_after_it(network):
+def test_a_pause_set_in_a_cycle_applies_after_it(network):
     net = network(rest_s=0.1)
     net.run_to(State.STEERING)
     net.change('bs', rest_s=30.0)
@@ -106,7 +106,7 @@ def test_retries_change_after_the_cycle(network):
     assert len(net.sent(m.PilotRequest)) == before + 3
 
 
-def test_before_a_cycle_settings_hold_at_once(network):
+def test_settings_take_effect_at_once_before_a_cycle(network):
     net = network(codebook=None)
     net.change('bs', policy='random', data_duration_s=2e-3)
     assert told(net, 'bs', 'pending') == {}
@@ -134,7 +134,7 @@ def test_an_estimator_changes_between_cycles_and_none_is_lost(network, state, ma
     net.verify()
 
 
-def test_signals_that_were_answered_get_the_same_answer_again(network):
+def test_duplicate_signals_get_the_same_answer(network):
     net = network()
     net.run_to(State.STEERING)
     net.change('positioner', estimator='ml')
@@ -144,7 +144,7 @@ def test_signals_that_were_answered_get_the_same_answer_again(network):
 
 
 @pytest.mark.parametrize('make_s', [0.0, 0.5])
-def test_an_estimator_that_cannot_be_made_leaves_the_old_one(network, make_s):
+def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(network, make_s):
     net = network(make_s=make_s, step_timeout_s=2.0)
     net.run_cycles(2)
     net.change('positioner', **UNFIT)
@@ -152,8 +152,8 @@ def test_an_estimator_that_cannot_be_made_leaves_the_old_one(network, make_s):
     assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
     assert set(estimators(net).values()) == {'centre'}
     assert net.kept == [PositionerSettings()]
-    assert net.said('positioner')[1:] == [
-        'estimator neural not used, bayes stays: model_file: unfit']
+    assert net.logged('positioner')[1:] == [
+        'estimator neural not used, keeping bayes: model_file: unfit']
     assert told(net, 'positioner', 'pending') == {}
     assert told(net, 'positioner', 'failed') == {
         'failed.estimator': 'neural: model_file: unfit'}
@@ -164,7 +164,7 @@ def test_an_estimator_that_cannot_be_made_leaves_the_old_one(network, make_s):
     assert list(estimators(net).values())[-1] == 'ml'
 
 
-def test_of_several_estimators_the_last_is_used(network):
+def test_the_last_of_several_estimators_is_used(network):
     net = network(make_s=0.5, step_timeout_s=2.0)
     net.run_cycles(1)
     net.change('positioner', estimator='neural')
@@ -173,7 +173,7 @@ def test_of_several_estimators_the_last_is_used(network):
     net.run(limit_s=10.0)
     assert set(estimators(net).values()) == {'centre', 'ml'}
     assert net.kept == []
-    # Taken back while it is made: nothing changes.
+    # Reverted while it is built: nothing changes.
     net.change('positioner', estimator='bayes')
     net.change('positioner', estimator='ml')
     assert told(net, 'positioner', 'pending') == {}
@@ -182,7 +182,7 @@ def test_of_several_estimators_the_last_is_used(network):
     net.verify()
 
 
-def test_that_an_estimator_fails_which_nobody_wants_any_more_is_not_told(network):
+def test_the_failure_of_a_replaced_estimator_is_not_logged(network):
     net = network(make_s=0.5, step_timeout_s=2.0)
     net.run_cycles(1)
     net.change('positioner', **UNFIT)
@@ -190,7 +190,7 @@ def test_that_an_estimator_fails_which_nobody_wants_any_more_is_not_told(network
     net.run(limit_s=5.0)
     assert list(estimators(net).values())[-1] == 'ml'
     assert net.kept == []
-    assert not [text for text in net.said('positioner') if 'not used' in text]
+    assert not [text for text in net.logged('positioner') if 'not used' in text]
     assert told(net, 'positioner', 'failed') == {}
 
 
@@ -212,7 +212,7 @@ def test_estimator_and_codebook_change_together(network, codebooks, codebook_fir
     net.verify()
 
 
-def test_a_codebook_that_comes_back_comes_with_the_newest_estimator(network, codebooks):
+def test_a_codebook_offered_again_uses_the_newest_estimator(network, codebooks):
     net = network()
     net.run_cycles(1)
     net.offer(codebooks[1])
@@ -224,7 +224,7 @@ def test_a_codebook_that_comes_back_comes_with_the_newest_estimator(network, cod
     assert list(estimators(net).values()) == ['centre', 'centre', 'ml', 'ml']
 
 
-def test_without_a_codebook_the_estimator_is_only_noted(network, codebooks):
+def test_without_a_codebook_no_estimator_is_requested(network, codebooks):
     net = network(codebook=None)
     net.change('positioner', estimator='ml')
     net.offer(codebooks[0])
@@ -232,7 +232,7 @@ def test_without_a_codebook_the_estimator_is_only_noted(network, codebooks):
     assert list(estimators(net).values()) == ['ml']
 
 
-def test_the_air_changes_when_a_cycle_begins(network):
+def test_impairments_change_when_a_cycle_begins(network):
     net = network()
     net._roles['channel'] = ImpairedChannel(
         net['channel'], Impairments(), np.random.default_rng(1))
@@ -260,7 +260,7 @@ def test_the_air_changes_when_a_cycle_begins(network):
     assert net.served()[3:] == [1, 1]
 
 
-def test_the_codebook_in_use_is_told(network, codebooks):
+def test_the_codebook_in_use_is_reported(network, codebooks):
     net = network()
     net.run_cycles(1)
     net.run_to(State.SOUNDING)

@@ -1,12 +1,13 @@
-"""The engine that follows a table."""
+"""The engine that takes the rows of a table."""
 
 import dataclasses
 import enum
 
 import pytest
 
-from rhs_isac_ros.protocol.events import LogMessage, Tick
-from rhs_isac_ros.protocol.state_machine import ANY, SAME, StateMachine, Transition
+from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.state_machine import ANY, StateMachine, Transition, rows_for
 
 
 class State(enum.Enum):
@@ -15,41 +16,70 @@ class State(enum.Enum):
     DARK = 'dark'
 
 
-class Input(enum.Enum):
-    GO = 'go'
-    STOP = 'stop'
-    BLINK = 'blink'
-    STAY = 'stay'
-    FAIL = 'fail'
+@dataclasses.dataclass
+class Go:
+    fast: bool = False
 
 
-class Light(StateMachine):
-    """Takes inputs as they are and writes down what it is asked to do."""
+class Stop:
+    pass
 
-    TABLE = {
-        (State.RED, Input.GO): Transition(State.GREEN, ('say', 'be_silent', 'say')),
-        (State.GREEN, Input.STOP): Transition(State.RED),
-        (State.GREEN, Input.GO): Transition(State.GREEN),
-        (State.RED, Input.STAY): Transition(SAME),
-        (State.RED, Input.BLINK): Transition(SAME, rearm=True),
-        (State.GREEN, Input.BLINK): Transition(SAME, counts='green_blink'),
-        (ANY, Input.BLINK): Transition(SAME, ('say',), counts='blink'),
-        (ANY, Input.FAIL): Transition(State.DARK, ('say',), counts='fail'),
-    }
+
+class Blink:
+    pass
+
+
+class Wait:
+    pass
+
+
+class Fail:
+    pass
+
+
+class LightSteps(StateMachine):
+    """A traffic light that records its actions."""
 
     def __init__(self):
         super().__init__(State.RED, {State.RED: 10.0, State.GREEN: 2.0})
         self.seen = []
 
-    def _classify(self, event):
-        return event
+    def fast(self, event, now_s):
+        return event.fast
 
-    def _say(self, event, now_s):
+    def past(self, event, now_s):
+        return now_s > 100.0
+
+    def log(self, event, now_s):
         self.seen.append((event, now_s, self.state))
-        return [LogMessage(f'{event.value} {len(self.seen)}')]
+        return [LogMessage(f'{type(event).__name__} {len(self.seen)}')]
 
-    def _be_silent(self, event, now_s):
-        self.seen.append('silent')
+    def record(self, event, now_s):
+        self.seen.append('recorded')
+
+    def shorten(self, event, now_s):
+        self._timeouts_s = {State.RED: 1.0}
+
+
+class Light(LightSteps):
+    STATES = State
+    EVENT_NAMES = {Go: 'go', Stop: 'stop', Blink: 'blink', Wait: 'wait', Fail: 'fail'}
+    TABLE = (
+        Transition(event=Go, guard=LightSteps.past, outcome=Outcome.STALE),
+        Transition(source=(State.RED,), event=Go, guard=LightSteps.fast, target=State.GREEN,
+                   outcome=Outcome.CROWDED),
+        Transition(source=(State.RED,), event=Go, target=State.GREEN,
+                   actions=(LightSteps.log, LightSteps.record, LightSteps.log)),
+        Transition(source=(State.GREEN,), event=Go, target=State.GREEN),
+        Transition(source=(State.GREEN,), event=Stop, target=State.RED),
+        Transition(source=(State.GREEN,), event=Fail, actions=(LightSteps.shorten,),
+                   target=State.RED),
+        Transition(source=(State.RED,), event=Wait),
+        Transition(source=(State.RED, State.GREEN), event=Blink, restart_timeout=True),
+        Transition(event=Blink, actions=(LightSteps.log,), outcome=Outcome.DUPLICATE),
+        Transition(event=Fail, actions=(LightSteps.log,), target=State.DARK,
+                   outcome=Outcome.OVERFLOW),
+    )
 
 
 def test_a_machine_begins_without_a_deadline():
@@ -59,90 +89,128 @@ def test_a_machine_begins_without_a_deadline():
     assert light.counters == {}
 
 
-def test_a_step_acts_in_order_with_event_and_time_and_then_moves():
-    light = Light()
-    actions = light.handle(Input.GO, 5.0)
-    assert light.seen == [(Input.GO, 5.0, State.RED), 'silent', (Input.GO, 5.0, State.RED)]
-    assert actions == [LogMessage('go 1'), LogMessage('go 3')]
+def test_actions_run_in_order_in_the_old_state():
+    light, go = Light(), Go()
+    actions = light.handle(go, 5.0)
+    assert light.seen == [(go, 5.0, State.RED), 'recorded', (go, 5.0, State.RED)]
+    assert actions == [LogMessage('Go 1'), LogMessage('Go 3')]
     assert light.state is State.GREEN
     assert light.counters == {}
 
 
+def test_the_first_row_whose_guard_holds_is_taken():
+    light = Light()
+    assert light.handle(Go(fast=True), 101.0) == []
+    assert (light.state, light.counters) == (State.RED, {'stale': 1})
+    assert light.handle(Go(fast=True), 5.0) == []
+    assert (light.state, light.counters) == (State.GREEN, {'stale': 1, 'crowded': 1})
+
+
+def test_rows_for_a_state_include_those_for_any_in_order():
+    assert rows_for(Light.TABLE, State.RED, Go) == list(Light.TABLE[:3])
+    assert rows_for(Light.TABLE, State.DARK, Go) == [Light.TABLE[0]]
+    assert Light.TABLE[0].source is ANY
+
+
 def test_a_new_state_sets_its_deadline():
     light = Light()
-    light.handle(Input.GO, 5.0)
+    light.handle(Go(), 5.0)
     assert light.next_deadline() == 7.0
-    light.handle(Input.STOP, 6.0)
+    light.handle(Stop(), 6.0)
     assert light.next_deadline() == 16.0
 
 
-def test_a_state_without_time_out_has_no_deadline():
+def test_the_deadline_uses_timeouts_that_an_action_changed():
     light = Light()
-    light.handle(Input.GO, 5.0)
-    light.handle(Input.FAIL, 6.0)
+    light.handle(Go(), 5.0)
+    light.handle(Fail(), 6.0)
+    assert light.next_deadline() == 7.0
+
+
+def test_a_state_without_timeout_has_no_deadline():
+    light = Light()
+    light.handle(Blink(), 5.0)
+    light.handle(Fail(), 6.0)
     assert light.state is State.DARK
     assert light.next_deadline() is None
 
 
-def test_staying_keeps_the_deadline():
+@pytest.mark.parametrize('event', [Go(), Wait()])
+def test_a_row_that_keeps_the_state_keeps_the_deadline(event):
     light = Light()
-    light.handle(Input.GO, 5.0)
-    for event in (Input.GO, Input.BLINK, Input.STAY):
-        light.handle(event, 6.0)
-        assert light.state is State.GREEN
-        assert light.next_deadline() == 7.0
+    light.handle(Go(), 5.0)
+    light.handle(event, 6.0)
+    assert (light.state, light.next_deadline(), light.repeats) == (State.GREEN, 7.0, 0)
 
 
-def test_rearming_starts_the_time_out_afresh():
+def test_a_restarted_timeout_is_counted_until_the_state_changes():
     light = Light()
-    light.handle(Input.BLINK, 3.0)
-    assert light.state is State.RED
-    assert light.next_deadline() == 13.0
+    for n in (1, 2):
+        light.handle(Blink(), 3.0 * n)
+        assert (light.state, light.next_deadline(), light.repeats) == (
+            State.RED, 3.0 * n + 10.0, n)
+    light.handle(Go(), 7.0)
+    assert light.repeats == 0
 
 
-def test_a_row_of_the_state_goes_before_one_of_any():
+def test_a_row_without_source_applies_in_any_state():
     light = Light()
-    assert light.handle(Input.BLINK, 0.0) == []
-    light.handle(Input.GO, 0.0)
-    light.handle(Input.BLINK, 0.0)
-    assert light.counters == {'green_blink': 1}
-    light.handle(Input.FAIL, 0.0)
-    assert light.handle(Input.BLINK, 0.0) == [LogMessage('blink 5')]
-    assert light.counters == {'green_blink': 1, 'fail': 1, 'blink': 1}
+    light.handle(Blink(), 0.0)
+    assert (light.counters, light.seen) == ({}, [])
+    light.handle(Fail(), 0.0)
+    assert light.handle(Blink(), 0.0) == [LogMessage('Blink 2')]
+    assert light.counters == {'overflow': 1, 'duplicate': 1}
 
 
-@pytest.mark.parametrize(('before', 'name'), [
-    ([], Input.STOP), ([Input.GO], Input.STAY), ([Input.FAIL], Input.GO)])
-def test_a_pair_that_is_not_in_the_table_is_counted_only(before, name):
+@pytest.mark.parametrize(('before', 'event', 'name'), [
+    ([], Stop(), 'stop'), ([Go()], Wait(), 'wait'), ([Fail()], Go(), 'go')])
+def test_an_event_without_a_matching_row_is_only_counted(before, event, name):
     light = Light()
-    for event in before:
-        light.handle(event, 1.0)
+    for earlier in before:
+        light.handle(earlier, 1.0)
     state, deadline_s, seen = light.state, light.next_deadline(), list(light.seen)
     counters = dict(light.counters)
     for n in (1, 2):
-        assert light.handle(name, 1.5) == []
+        assert light.handle(event, 1.5) == []
         assert (light.state, light.next_deadline(), light.seen) == (state, deadline_s, seen)
-        assert light.counters == counters | {f'unexpected_{name.value}': n}
+        assert light.counters == counters | {f'unexpected_{name}': n}
 
 
-def test_a_machine_keeps_its_own_time_outs():
+def test_an_event_that_no_row_names_is_an_error():
+    with pytest.raises(TypeError, match='int is not an event of Light'):
+        Light().handle(3, 0.0)
+
+
+def test_a_subclass_inherits_the_rows_of_its_table():
+    class Lamp(Light):
+        pass
+
+    lamp = Lamp()
+    lamp.handle(Go(), 0.0)
+    assert lamp.state is State.GREEN
+
+
+def test_a_machine_copies_its_timeouts():
     timeouts_s = {State.RED: 1.0}
 
-    class Patient(Light):
+    class Slow(Light):
         def __init__(self):
             StateMachine.__init__(self, State.GREEN, timeouts_s)
 
-    light = Patient()
+    light = Slow()
     timeouts_s[State.RED] = 99.0
-    light.handle(Input.STOP, 0.0)
+    light.handle(Stop(), 0.0)
     assert light.next_deadline() == 1.0
 
 
-def test_a_step_cannot_be_changed():
+def test_a_row_cannot_be_changed():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        Transition().to = State.RED
+        Light.TABLE[0].target = State.RED
 
 
-def test_a_machine_must_name_its_events():
-    with pytest.raises(NotImplementedError):
-        StateMachine(State.RED, {}).handle(Tick(), 0.0)
+def test_counting_nothing_adds_no_counter():
+    light = Light()
+    light.count(Outcome.USER_LOST, 0)
+    assert 'user_lost' not in light.counters
+    light.count(Outcome.USER_LOST, 2)
+    assert light.counters == {'user_lost': 2}

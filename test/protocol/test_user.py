@@ -1,4 +1,4 @@
-"""The user by itself: what the whole network seldom shows."""
+"""The user alone, in situations that are rare in a network."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
 
 @pytest.fixture
 def user():
-    """User 4, connected; waits 2 s for a grant and 3 s when granted."""
+    """User 4, connected, with time-outs of 2 s for a grant and 3 s after it."""
     way = mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)
     made = User(4, way, {State.ACKNOWLEDGED: 2.0, State.GRANTED: 3.0})
     made.handle(PeersChanged(()), 0.0)
@@ -26,39 +26,40 @@ def answers(user, event, now_s):
 
 
 def grant(user, cycle_id=7, now_s=10.0):
-    user.handle(m.Beacon(cycle_id, 0), now_s)
-    return answers(user, m.Grant(cycle_id, 4), now_s)
+    user.handle(m.Beacon(cycle_id=cycle_id, attempt=0), now_s)
+    return answers(user, m.Grant(cycle_id=cycle_id, user=4), now_s)
 
 
 def test_a_beacon_is_answered(user):
-    (ack,) = answers(user, m.Beacon(7, 0), 10.0)
+    (ack,) = answers(user, m.Beacon(cycle_id=7, attempt=0), 10.0)
     assert (type(ack), ack.cycle_id, ack.user) == (m.Ack, 7, 4)
     assert user.state is State.ACKNOWLEDGED
     assert user.next_deadline() == 12.0
 
 
-def test_a_late_beacon_and_grant_of_a_cycle_do_not_move_the_user_within_it(user):
+def test_a_late_beacon_or_grant_of_a_cycle_keeps_its_position(user):
     (truth,) = grant(user)
-    user.handle(m.Data(7, 4, DOWN, DELIVERED, 0.25, 123.0), 11.0)
-    assert answers(user, m.Grant(7, 4), 11.5) == []
+    user.handle(m.Data(
+        cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
+    assert answers(user, m.Grant(cycle_id=7, user=4), 11.5) == []
     assert user.counters == {'late_grant': 1}
-    assert answers(user, m.Beacon(7, 0), 11.5) == []
+    assert answers(user, m.Beacon(cycle_id=7, attempt=0), 11.5) == []
     assert user.counters == {'late_grant': 1, 'stale_beacon': 1}
-    user.handle(m.Beacon(7, 1), 12.0)
-    again, *_ = answers(user, m.PilotRequest(7, 4, 0, 2), 12.5)
+    user.handle(m.Beacon(cycle_id=7, attempt=1), 12.0)
+    again, *_ = answers(user, m.PilotRequest(cycle_id=7, user=4, band=0, n_frames=2), 12.5)
     assert again is truth
 
 
 @pytest.mark.parametrize('cycle_id', [7, 8])
-def test_every_further_beacon_is_answered_and_starts_the_time_out_afresh(user, cycle_id):
-    user.handle(m.Beacon(7, 0), 10.0)
-    (ack,) = answers(user, m.Beacon(cycle_id, 1), 11.5)
+def test_every_further_beacon_is_answered_and_restarts_the_timeout(user, cycle_id):
+    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
+    (ack,) = answers(user, m.Beacon(cycle_id=cycle_id, attempt=1), 11.5)
     assert ack.cycle_id == cycle_id
     assert user.next_deadline() == 13.5
     assert user.counters == {}
 
 
-def test_a_grant_is_answered_with_the_position_of_the_moment(user):
+def test_a_grant_is_answered_with_the_present_position(user):
     user.ground_truth(8.0)
     (truth,) = grant(user)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
@@ -67,24 +68,25 @@ def test_a_grant_is_answered_with_the_position_of_the_moment(user):
     assert user.next_deadline() == 13.0
 
 
-def test_whereabouts_belong_to_no_cycle_unless_told(user):
+def test_a_true_position_has_cycle_0_unless_given(user):
     assert user.ground_truth(0.0).cycle_id == 0
     assert user.ground_truth(0.0, 9).cycle_id == 9
     assert user.ground_truth(0.0).user == 4
 
 
-def test_a_pilot_request_is_answered_frame_by_frame_and_starts_the_time_out_afresh(user):
+def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
     grant(user)
-    pilots = answers(user, m.PilotRequest(7, 4, 1, 3), 12.5)
+    pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=1, n_frames=3), 12.5)
     assert [(p.cycle_id, p.user, p.band, p.frame) for p in pilots] == [
         (7, 4, 1, frame) for frame in range(3)]
     assert {complex(p.symbol_re, p.symbol_im) for p in pilots} == {1 + 0j}
     assert user.next_deadline() == 15.5
 
 
-def test_the_downlink_is_answered_in_kind_and_ends_the_cycle(user):
+def test_the_downlink_is_answered_with_equal_uplink_and_ends_the_cycle(user):
     grant(user)
-    (data,) = answers(user, m.Data(7, 4, DOWN, DELIVERED, 0.25, 123.0), 11.0)
+    (data,) = answers(user, m.Data(
+        cycle_id=7, user=4, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=123.0), 11.0)
     assert (data.cycle_id, data.user, data.direction, data.stage) == (7, 4, UP, OFFERED)
     assert (data.duration_s, data.bits) == (0.25, 123.0)
     assert user.state is State.LISTENING
@@ -92,61 +94,65 @@ def test_the_downlink_is_answered_in_kind_and_ends_the_cycle(user):
 
 
 @pytest.mark.parametrize(('direction', 'stage'), [(DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED)])
-def test_data_on_their_way_are_none_of_its_business(user, direction, stage):
+def test_other_data_are_ignored(user, direction, stage):
     grant(user)
-    assert user.handle(m.Data(7, 4, direction, stage, 0.25, 123.0), 11.0) == []
+    assert user.handle(m.Data(
+        cycle_id=7, user=4, direction=direction, stage=stage, duration_s=0.25,
+        bits=123.0), 11.0) == []
     assert user.state is State.GRANTED
     assert user.counters == {}
 
 
-def test_a_late_beacon_of_the_cycle_that_it_was_granted_is_counted_only(user):
-    """Another beacon of a cycle may be on its way while the first answer is granted."""
+def test_a_late_beacon_of_the_granted_cycle_is_only_counted(user):
+    """Another beacon of a cycle may be in transit while the first ack is granted."""
     grant(user)
-    assert user.handle(m.Beacon(7, 1), 11.0) == []
+    assert user.handle(m.Beacon(cycle_id=7, attempt=1), 11.0) == []
     assert user.state is State.GRANTED
     assert user.next_deadline() == 13.0
     assert user.counters == {'stale_beacon': 1}
 
 
-def test_a_beacon_of_another_cycle_tells_that_its_own_was_given_up(user):
+def test_a_beacon_of_another_cycle_ends_the_granted_one(user):
     grant(user)
-    (ack,) = answers(user, m.Beacon(8, 0), 11.0)
+    (ack,) = answers(user, m.Beacon(cycle_id=8, attempt=0), 11.0)
     assert ack.cycle_id == 8
     assert user.state is State.ACKNOWLEDGED
     assert user.counters == {'abandoned': 1}
 
 
-def test_the_grant_of_another_user_ends_its_hope(user):
-    user.handle(m.Beacon(7, 0), 10.0)
-    assert user.handle(m.Grant(7, 5), 10.5) == []
+def test_a_grant_to_another_user_ends_the_wait(user):
+    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
+    assert user.handle(m.Grant(cycle_id=7, user=5), 10.5) == []
     assert user.state is State.LISTENING
     assert user.counters == {}
 
 
 @pytest.mark.parametrize('other', [
-    m.Grant(6, 5), m.PilotRequest(7, 5, 0, 2), m.Data(6, 5, DOWN, DELIVERED, 0.25, 1.0)],
+    m.Grant(cycle_id=6, user=5), m.PilotRequest(cycle_id=7, user=5, band=0, n_frames=2), m.Data(
+        cycle_id=6, user=5, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0)],
     ids=['grant of another cycle', 'request', 'data'])
-def test_what_else_goes_to_another_user_is_none_of_its_business(user, other):
-    for event, state in ((m.Beacon(7, 0), State.ACKNOWLEDGED), (m.Grant(7, 4), State.GRANTED)):
+def test_other_messages_to_another_user_are_ignored(user, other):
+    for event, state in ((m.Beacon(
+        cycle_id=7, attempt=0), State.ACKNOWLEDGED), (m.Grant(cycle_id=7, user=4), State.GRANTED)):
         user.handle(event, 10.0)
         assert user.handle(other, 10.5) == []
         assert user.state is state
     assert user.counters == {}
 
 
-def test_a_pilot_request_that_overtakes_the_grant_stands_for_it(user):
-    user.handle(m.Beacon(7, 0), 10.0)
-    truth, *pilots = answers(user, m.PilotRequest(7, 4, 0, 2), 10.5)
+def test_a_pilot_request_that_overtakes_the_grant_implies_it(user):
+    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
+    truth, *pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=0, n_frames=2), 10.5)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
     assert [(type(p), p.frame) for p in pilots] == [(m.Pilot, 0), (m.Pilot, 1)]
     assert user.state is State.GRANTED
-    assert user.handle(m.Grant(7, 4), 11.0) == []
+    assert user.handle(m.Grant(cycle_id=7, user=4), 11.0) == []
     assert user.next_deadline() == 13.5
     assert user.counters == {}
 
 
-def test_a_granted_user_outlasts_the_steps_that_it_hears_nothing_of():
-    """Sounding of the last band, estimating and steering, each just within its time-out."""
+def test_the_timeout_of_a_granted_user_covers_the_steps_without_messages_to_it():
+    """These are sounding of the last band, estimating and steering."""
     waits = timeouts(0.5, 7.0)
     assert waits[State.GRANTED] > 3 * 0.5
     assert waits.keys() == {State.LISTENING, State.ACKNOWLEDGED, State.GRANTED}
@@ -155,10 +161,10 @@ def test_a_granted_user_outlasts_the_steps_that_it_hears_nothing_of():
 
 @pytest.mark.parametrize(('granted', 'deadline_s', 'reason'), [
     (False, 12.0, 'not_granted'), (True, 13.0, 'bs_silent')])
-def test_waiting_in_vain_ends_with_listening(user, granted, deadline_s, reason):
-    user.handle(m.Beacon(7, 0), 10.0)
+def test_a_timeout_leads_back_to_listening(user, granted, deadline_s, reason):
+    user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
     if granted:
-        user.handle(m.Grant(7, 4), 10.0)
+        user.handle(m.Grant(cycle_id=7, user=4), 10.0)
     assert user.next_deadline() == deadline_s
     assert user.handle(Tick(), deadline_s) == []
     assert user.state is State.LISTENING
@@ -167,18 +173,18 @@ def test_waiting_in_vain_ends_with_listening(user, granted, deadline_s, reason):
 
 
 @pytest.mark.parametrize('state', State)
-def test_a_user_that_is_cut_off_says_so_and_is_silent(user, state):
+def test_a_disconnected_user_logs_it_and_sends_nothing(user, state):
     user.state = state
     assert user.handle(PeersChanged(('channel', 'bs')), 1.0) == [
         LogMessage('waiting for channel, bs', warning=True)]
     assert user.state is State.DISCONNECTED
-    assert user.handle(m.Beacon(7, 0), 1.0) == []
+    assert user.handle(m.Beacon(cycle_id=7, attempt=0), 1.0) == []
     assert user.handle(PeersChanged(()), 2.0) == [LogMessage('listening for beacons')]
     assert user.state is State.LISTENING
 
 
 @pytest.mark.parametrize('state', [State.LISTENING, State.ACKNOWLEDGED, State.GRANTED])
-def test_a_user_that_is_connected_stays_as_it_is(user, state):
+def test_a_connected_user_keeps_its_state(user, state):
     user.state = state
     assert user.handle(PeersChanged(()), 1.0) == []
     assert user.state is state

@@ -88,21 +88,26 @@ def channel(stage):
 
 
 def truth(cycle_id, place=PLACE):
-    return m.GroundTruth(cycle_id, 1, np.asarray(place, float), np.zeros(3))
+    return m.GroundTruth(
+        cycle_id=cycle_id, user=1, position=np.asarray(place, float), velocity=np.zeros(3))
 
 
 def pilot(cycle_id, symbol=1.0):
-    return m.Pilot(cycle_id, 1, 0, 1, symbol, 0.0)
+    return m.Pilot(cycle_id=cycle_id, user=1, band=0, frame=1, symbol_re=symbol, symbol_im=0.0)
 
 
 def applied(scenario, cycle_id, mode=m.Mode.POSITIONING, rows=None):
     rows = rows or (scenario.n_frames if mode is m.Mode.POSITIONING else 1)
-    return m.RhsConfiguration(cycle_id, mode, 0, '', np.full((rows, scenario.n_elements), 0.5))
+    return m.RhsConfiguration(
+        cycle_id=cycle_id, mode=mode, band=0, codebook_id='',
+        analog=np.full((rows, scenario.n_elements), 0.5))
 
 
 def beam(scenario, cycle_id, amplitude=1e-3, expected_bps=1e6):
     digital = np.full((scenario.n_subbands, scenario.n_feeds), amplitude + 0j)
-    return m.Beam(cycle_id, 1, '', 0, np.full(scenario.n_elements, 0.5), digital, expected_bps)
+    return m.Beam(
+        cycle_id=cycle_id, user=1, codebook_id='', band=0,
+        analog=np.full(scenario.n_elements, 0.5), digital=digital, expected_bps=expected_bps)
 
 
 def send_plausible_pilot(stage):
@@ -123,7 +128,8 @@ def test_channel_survives_users_in_impossible_places(channel, place):
     place = element_positions(scenario)[1] if place == 'on an element' else place
     channel.send(truth(1, place), applied(scenario, 1), pilot(1),
                  applied(scenario, 1, m.Mode.TRANSMISSION), beam(scenario, 1),
-                 m.Data(1, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1.0, 1.0))
+                 m.Data(cycle_id=1, user=1, direction=m.Direction.DOWNLINK,
+                     stage=m.Stage.OFFERED, duration_s=1.0, bits=1.0))
     send_plausible_pilot(channel)
 
 
@@ -133,9 +139,12 @@ def test_channel_survives_huge_numbers(channel, number):
     channel.send(
         truth(1), applied(scenario, 1), pilot(1, number),
         applied(scenario, 1, m.Mode.TRANSMISSION), beam(scenario, 1),
-        m.Data(1, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, number, number),
+        m.Data(
+            cycle_id=1, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
+            duration_s=number, bits=number),
         truth(2), applied(scenario, 2, m.Mode.TRANSMISSION), beam(scenario, 2, number),
-        m.Data(2, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1.0, 1.0))
+        m.Data(cycle_id=2, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
+            duration_s=1.0, bits=1.0))
     send_plausible_pilot(channel)
 
 
@@ -143,13 +152,16 @@ def test_channel_survives_messages_with_unknown_cycles(channel):
     last = 2**64 - 1
     for cycle_id in (0, last):
         channel.send(pilot(cycle_id), applied(channel.scenario, cycle_id), truth(cycle_id),
-                     m.Data(cycle_id, 0, m.Direction.UPLINK, m.Stage.DELIVERED, -1.0, -1.0))
+                     m.Data(cycle_id=cycle_id, user=0, direction=m.Direction.UPLINK,
+                         stage=m.Stage.DELIVERED, duration_s=-1.0, bits=-1.0))
     send_plausible_pilot(channel)
 
 
 def estimate(stage, cycle_id, place=PLACE):
-    return m.PositionEstimate(cycle_id, 1, stage.codebook.id, np.asarray(place, float),
-                              np.eye(3), 0.1, 'rogue', 0.1)
+    return m.PositionEstimate(
+        cycle_id=cycle_id, user=1, codebook_id=stage.codebook.id,
+        position=np.asarray(place, float), covariance_m2=np.eye(3), crlb_m2=0.1, estimator='rogue',
+        latency_s=0.1)
 
 
 @pytest.mark.parametrize('place', [
@@ -172,7 +184,8 @@ def test_positioner_survives_huge_signals(stage, number):
     scenario, codebook = stage.scenario, stage.codebook
     shape = codebook.digital.shape[:3]
     plausible = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(0))[0]
-    received = m.ReceivedSignals(1, 1, codebook.id, np.full(shape, number * (1 + 1j)))
+    received = m.ReceivedSignals(cycle_id=1, user=1, codebook_id=codebook.id,
+        signals=np.full(shape, number * (1 + 1j)))
     stage.send(received)
     stage.send(dataclasses.replace(received, cycle_id=9, signals=plausible.reshape(shape)))
     stage.until_answer(9)

@@ -30,7 +30,8 @@ def rotation(q):
 
 def an_estimate(covariance_m2, user=1):
     return m.PositionEstimate(
-        5, user, 'cb', np.array([9.0, -1.0, 0.5]), covariance_m2, 0.1, 'bayes', 0.01)
+        cycle_id=5, user=user, codebook_id='cb', position=np.array([9.0, -1.0, 0.5]),
+        covariance_m2=covariance_m2, crlb_m2=0.1, estimator='bayes', latency_s=0.01)
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -55,7 +56,8 @@ def test_each_user_has_one_hue_for_truth_and_estimate():
     hues = {}
     for user in (1, 2, 2**32 - 1):
         position = np.array([user % 7, 0.0, 0.0], float)
-        one = markers.truth(m.GroundTruth(0, user, position, np.zeros(3)), STAMP)
+        one = markers.truth(m.GroundTruth(
+            cycle_id=0, user=user, position=position, velocity=np.zeros(3)), STAMP)
         other = markers.estimate(an_estimate(np.eye(3), user), STAMP)
         assert of(one.pose.position) == pytest.approx(position)
         assert (one.ns, one.id) != (other.ns, other.id)

@@ -53,7 +53,8 @@ def send(bench, node, codebooks):
         rng = np.random.default_rng(cycle_id)
         signals = factor * simulate_received(node.scenario, codebook, PLACE[None], rng)[0]
         message = m.ReceivedSignals(
-            cycle_id, 1, codebook.id, signals.reshape(codebook.digital.shape[:3]))
+            cycle_id=cycle_id, user=1, codebook_id=codebook.id,
+                signals=signals.reshape(codebook.digital.shape[:3]))
         publishers[0].publish(convert.to_ros(message, node.get_clock().now().to_msg()))
         return signals
     return send

@@ -95,11 +95,12 @@ def radio(example, small):
 
 def configuration(cycle_id, band=0):
     return m.RhsConfiguration(
-        cycle_id, m.Mode.POSITIONING, band, 'c', np.array([[0.1, 0.2], [0.3, 0.4]]))
+        cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=band, codebook_id='c',
+        analog=np.array([[0.1, 0.2], [0.3, 0.4]]))
 
 
 def pilot(cycle_id, frame=0, band=0):
-    return m.Pilot(cycle_id, 1, band, frame, 1.0, 0.0)
+    return m.Pilot(cycle_id=cycle_id, user=1, band=band, frame=frame, symbol_re=1.0, symbol_im=0.0)
 
 
 def answers(radio, event):
@@ -131,7 +132,8 @@ def test_the_oldest_unanswered_pilots_are_discarded(radio):
 
 
 def test_data_are_delivered_as_far_as_the_radio_carries_them(radio):
-    offered = m.Data(5, 1, m.Direction.DOWNLINK, m.Stage.OFFERED, 1e-3, 100.0)
+    offered = m.Data(cycle_id=5, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
+        duration_s=1e-3, bits=100.0)
     (delivered,) = answers(radio, offered)
     assert (delivered.stage, delivered.bits) == (m.Stage.DELIVERED, 3.0)
     assert (delivered.cycle_id, delivered.user, delivered.direction) == (

@@ -98,19 +98,20 @@ def test_many_malformed_messages_do_not_fill_the_log(bench, start, probe, capfd)
     publisher = bench.publisher(probe, m.RhsCommand)
     for part in range(10):
         for band in range(50):
-            message = m.RhsCommand(1, 2 + 50 * part + band, '')
+            message = m.RhsCommand(cycle_id=1, band=2 + 50 * part + band, codebook_id='')
             publisher.publish(convert.to_ros(message, None))
         bench.until(lambda part=part: role.counters['malformed'] == 50 * (part + 1), 'all of them')
     assert 1 <= capfd.readouterr().err.count('dropped: ') <= 100
 
 
 def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capfd):
-    bad, good = m.FeedSignals(1, 1, 0, 0, NAN), feed_signals(user=2)
+    bad, good = m.FeedSignals(cycle_id=1, user=1, band=0, frame=0, signals=NAN),
+        feed_signals(user=2)
     role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)],
                     sends=[m.FeedSignals])
     node = start(each_bench, role)
     received = each_bench.collect(each_bench.add(Node, 'probe'), m.FeedSignals)
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: received, 'the good message')
     assert [message.user for message in received] == [2]
     log = capfd.readouterr().err
@@ -121,7 +122,7 @@ def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capf
 def test_log_messages_are_logged_with_their_severity(bench, start, capfd):
     role = Scripted(
         lambda role, event, now_s: [LogMessage('information'), LogMessage('a warning', True)])
-    start(bench, role).dispatch(m.Ack(1, 1))
+    start(bench, role).dispatch(m.Ack(cycle_id=1, user=1))
     first, second = capfd.readouterr().err.strip().splitlines()
     assert '[INFO]' in first
     assert first.endswith('[scripted]: information')
@@ -131,14 +132,15 @@ def test_log_messages_are_logged_with_their_severity(bench, start, capfd):
 
 def test_messages_keep_their_order(each_bench, start):
     role = Scripted(lambda role, event, now_s: [
-        Send(m.Grant(event.cycle_id, event.user)), Send(m.Grant(event.cycle_id, 99))],
+        Send(m.Grant(cycle_id=event.cycle_id, user=event.user)),
+            Send(m.Grant(cycle_id=event.cycle_id, user=99))],
         sends=[m.Grant], receives=[m.Ack])
     start(each_bench, role)
     probe = each_bench.add(Node, 'probe')
     received = each_bench.collect(probe, m.Grant)
     publisher = each_bench.publisher(probe, m.Ack)
     for user in range(1, 51):
-        publisher.publish(convert.to_ros(m.Ack(3, user), None))
+        publisher.publish(convert.to_ros(m.Ack(cycle_id=3, user=user), None))
     each_bench.until(lambda: len(received) == 100, 'the last grant')
     assert [message.user for message in received] == [
         user for number in range(1, 51) for user in (number, 99)]
@@ -156,7 +158,7 @@ def test_a_role_may_connect_to_its_topics_later_and_only_once(bench, probe):
     publisher = bench.publisher(probe, m.Ack)
     assert node.count_publishers('grant') == publisher.get_subscription_count() == 1
     for user in (1, 2):
-        publisher.publish(convert.to_ros(m.Ack(1, user), None))
+        publisher.publish(convert.to_ros(m.Ack(cycle_id=1, user=user), None))
     bench.until(lambda: len(role.events) >= 2, 'both messages')
     assert [event.user for event, _ in role.events] == [1, 2]
 
@@ -190,7 +192,7 @@ def deadlines(*delays_s):
 def test_a_tick_follows_each_deadline(each_bench, start):
     role = deadlines(0.05, 0.02, 0.1)
     node = start(each_bench, role)
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     assert not role.ticks_s
     each_bench.until(lambda: len(role.ticks_s) == 3, 'the last tick')
     for deadline_s, tick_s in zip(role.deadlines_s[:3], role.ticks_s, strict=True):
@@ -201,8 +203,8 @@ def test_a_tick_follows_each_deadline(each_bench, start):
 def test_an_earlier_deadline_replaces_a_later_one(each_bench, start):
     role = deadlines(3000.0, 0.05)
     node = start(each_bench, role)
-    node.dispatch(m.Ack(1, 1))
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
     assert role.ticks_s[0] >= role.deadlines_s[1]
 
@@ -210,8 +212,8 @@ def test_an_earlier_deadline_replaces_a_later_one(each_bench, start):
 def test_a_later_deadline_replaces_an_earlier_one(each_bench, start):
     role = deadlines(0.02, 0.3)
     node = start(each_bench, role)
-    node.dispatch(m.Ack(1, 1))
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: role.ticks_s, 'the tick')
     assert role.ticks_s[0] >= role.deadlines_s[1]
     assert len(role.events) == 3
@@ -220,21 +222,21 @@ def test_a_later_deadline_replaces_an_earlier_one(each_bench, start):
 def test_a_cancelled_deadline_causes_no_tick(each_bench, start):
     cancelled, later = deadlines(0.02, None), deadlines(0.2)
     node = start(each_bench, cancelled)
-    node.dispatch(m.Ack(1, 1))
-    node.dispatch(m.Ack(1, 1))
-    start(each_bench, later, name='later').dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
+    start(each_bench, later, name='later').dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: later.ticks_s, 'the later tick')
     assert not cancelled.ticks_s
     # The node accepts a new deadline afterwards.
     cancelled._script = deadlines(0.02)._script
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     each_bench.until(lambda: cancelled.ticks_s, 'the tick')
 
 
 def test_a_deadline_in_the_past_causes_a_tick_at_once(bench, start):
     role = deadlines(-1.0, 0.0, -5.0, 0.02)
     node = start(bench, role)
-    node.dispatch(m.Ack(1, 1))
+    node.dispatch(m.Ack(cycle_id=1, user=1))
     assert [type(event) for event, _ in role.events] == [m.Ack, Tick, Tick, Tick]
     bench.until(lambda: len(role.ticks_s) == 4, 'the tick that was not due')
 
@@ -256,7 +258,7 @@ def test_deadlines_are_kept_while_messages_arrive(each_bench, start):
     start(each_bench, role)
     publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.Ack)
     for number in range(120):
-        publisher.publish(convert.to_ros(m.Ack(1, 1 + number), None))
+        publisher.publish(convert.to_ros(m.Ack(cycle_id=1, user=1 + number), None))
         # Short deadlines get time to pass.
         each_bench.until(lambda number=number: len(deadlines_s) > number and (
             number % 2 or role.deadline_s is None or number % 6 == 4), 'message or tick')
@@ -273,8 +275,10 @@ def test_every_message_has_the_listed_topic(bench, start, probe):
 def test_a_late_joiner_receives_the_latest_statistics(bench, start):
     node = start(bench, Scripted(sends=[m.CapacityStatistics]))
     for n in (1, 2):
-        assert node.publish(m.CapacityStatistics(
-            n, n, *(number * np.arange(3.0) for number in (3, 2, 4, 1, 5))))
+        quartiles = {name: factor * np.arange(3.0) for name, factor in (
+            ('expected_bps', 3), ('actual_bps', 2), ('perfect_bps', 4), ('loss_bps', 1),
+            ('loss_percent', 5))}
+        assert node.publish(m.CapacityStatistics(cycle_id=n, n_reports=n, **quartiles))
     late, received, kind = bench.add(Node, 'late'), [], m.CapacityStatistics
     late.create_subscription(
         convert.ros_type(kind), topics.NAMES[kind], received.append, qos.LATCHED)

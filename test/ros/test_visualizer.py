@@ -40,7 +40,8 @@ def test_the_scene_is_shown_before_any_message(bench, shown):
 
 
 def ground_truth(user, x):
-    return m.GroundTruth(0, user, np.array([x, user, 0.0]), np.zeros(3))
+    return m.GroundTruth(cycle_id=0, user=user, position=np.array([x, user, 0.0]),
+        velocity=np.zeros(3))
 
 
 def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
@@ -50,7 +51,8 @@ def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
     for user in (1, 2):
         truths.publish(convert.to_ros(ground_truth(user, 9.0), stamp))
     estimates.publish(convert.to_ros(m.PositionEstimate(
-        1, 2, 'cb', np.array([8.0, 2.5, 0.1]), np.eye(3), 0.1, 'bayes', 0.01), stamp))
+        cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
+        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), stamp))
     bench.until(lambda: {('truth', 1), ('truth', 2), ('estimate', 2)} <= shown.keys(), 'the users')
     assert shown['truth', 2].pose.position.y == 2.0
     assert shown['estimate', 2].pose.position.x == 8.0
@@ -64,7 +66,8 @@ def test_the_board_has_the_colours_of_its_configuration(bench, probe, shown, sma
     scenario = small.scenario
     analog = np.ones((scenario.n_frames, scenario.n_elements))
     publisher.publish(ros.RhsConfiguration(cycle_id=1))
-    publisher.publish(convert.to_ros(m.RhsConfiguration(1, m.Mode.POSITIONING, 0, 'cb', analog),
+    publisher.publish(convert.to_ros(m.RhsConfiguration(cycle_id=1, mode=m.Mode.POSITIONING,
+        band=0, codebook_id='cb', analog=analog),
                                   probe.get_clock().now().to_msg()))
     bench.until(lambda: shown and shown['board', 0].colors[0].r == 1.0, 'the colours')
 
@@ -74,8 +77,8 @@ def test_a_user_without_messages_is_removed(bench, probe, shown, small):
     """Its beam and its topics are removed as well; the other user stays."""
     truths, beams = (bench.publisher(probe, kind) for kind in (m.GroundTruth, m.Beam))
     stamp, sizes = probe.get_clock().now().to_msg(), small.scenario.sizes
-    beam = m.Beam(1, 1, 'cb', 0, np.ones(sizes['N_E']),
-                  np.ones((sizes['N_SB'], sizes['K']), complex), 1.0)
+    beam = m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(sizes['N_E']),
+                  digital=np.ones((sizes['N_SB'], sizes['K']), complex), expected_bps=1.0)
     sending = {1, 2}
 
     def send():
@@ -108,7 +111,8 @@ def test_each_user_has_a_path(bench, probe, shown):
     for cycle_id, x in enumerate((8.0, 8.5, 9.0), start=1):
         truths.publish(convert.to_ros(ground_truth(7, x), stamp))
         estimates.publish(convert.to_ros(m.PositionEstimate(
-            cycle_id, 7, 'cb', np.array([x + 0.1, 2.5, 0.1]), np.eye(3), 0.1, 'bayes', 0.01),
+            cycle_id=cycle_id, user=7, codebook_id='cb', position=np.array([x + 0.1, 2.5, 0.1]),
+            covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01),
             stamp))
 
     def xs(name):

@@ -24,14 +24,19 @@ def make_scene(scenario, n_users):
     for user in range(1, n_users + 1):
         position = POSITIONS[user % 3]
         for step in range(5):
-            scene.add(m.GroundTruth(user, user, position + 0.2 * step, np.zeros(3)), 0.0)
+            scene.add(m.GroundTruth(cycle_id=user, user=user, position=position + 0.2 * step,
+                velocity=np.zeros(3)), 0.0)
         for cycle_id in (user, 100 + user):
             scene.add(m.PositionEstimate(
-                cycle_id, user, 'cb', position + 0.1, COVARIANCE_M2, 0.1, 'bayes', 0.01), 0.0)
+                cycle_id=cycle_id, user=user, codebook_id='cb', position=position + 0.1,
+                    covariance_m2=COVARIANCE_M2, crlb_m2=0.1, estimator='bayes', latency_s=0.01),
+                    0.0)
     configuration = rng.uniform(size=(scenario.n_frames, scenario.n_elements))
-    scene.add(m.RhsConfiguration(1, m.Mode.POSITIONING, 1, 'cb', configuration), 0.0)
+    scene.add(m.RhsConfiguration(cycle_id=1, mode=m.Mode.POSITIONING, band=1, codebook_id='cb',
+        analog=configuration), 0.0)
     beam = steer(scenario, POSITIONS[n_users % 3])
-    scene.add(m.Beam(1, n_users, 'cb', 0, beam.analog, beam.digital, 1e6), 0.0)
+    scene.add(m.Beam(cycle_id=1, user=n_users, codebook_id='cb', band=0, analog=beam.analog,
+        digital=beam.digital, expected_bps=1e6), 0.0)
     return scene
 
 
@@ -92,7 +97,8 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
 def test_the_surface_is_shown_from_the_front(small):
     scene = SceneState()
     configuration = np.linspace(0, 1, small.scenario.n_elements)[None]
-    scene.add(m.RhsConfiguration(1, m.Mode.TRANSMISSION, 0, 'cb', configuration), 0.0)
+    scene.add(m.RhsConfiguration(
+        cycle_id=1, mode=m.Mode.TRANSMISSION, band=0, codebook_id='cb', analog=configuration), 0.0)
     figure = compose(scene, small.scenario)
     (axes,) = [axes for axes in figure.axes if axes.images]
     # Rows increase with z, and columns with y, which points to the right from the front.

@@ -36,10 +36,11 @@ def test_the_view_of_an_empty_overview():
 
 def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
     overview = Overview()
-    overview.add(m.Beacon(1795288682616, 0), 1.0)
+    overview.add(m.Beacon(cycle_id=1795288682616, attempt=0), 1.0)
     overview.add(m.ProtocolState(
-        1795288682616, 12, m.Phase.BEACONING, 'rhs_silent', np.zeros(4), 0.0), 2.0)
-    overview.add(m.Beacon(1795288682617, 0), 3.0)
+        cycle_id=1795288682616, user=12, phase=m.Phase.BEACONING, outcome='rhs_silent',
+            began_s=np.zeros(4), elapsed_s=0.0), 2.0)
+    overview.add(m.Beacon(cycle_id=1795288682617, attempt=0), 3.0)
     overview.add_report('lab/bs', Report(True, 'waiting for positioner', {
         'phase': 'waiting', 'dropped.late_ack': '3', 'cycles.no_fix': '2'}), 1.0)
     overview.add_report('lab/channel', Report(False, 'no fault', {}), 3.0)
@@ -54,7 +55,8 @@ def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
 def test_received_strings_are_neither_markup_nor_control_sequences():
     overview = Overview()
     overview.add(m.ProtocolState(
-        1, 2, m.Phase.BEACONING, '\x1b[2J[/red]', np.zeros(4), 0.0), 1.0)
+        cycle_id=1, user=2, phase=m.Phase.BEACONING, outcome='\x1b[2J[/red]',
+            began_s=np.zeros(4), elapsed_s=0.0), 1.0)
     overview.add_report('a[/b]\x1b[31m', Report(True, '[bold]\n[/x]', {
         'phase': '[/', 'dropped.[/]\x07': '3', 'dropped.long': '9' * 5000}), 1.0)
     text = text_of(overview, 2.0, width=120)

@@ -31,7 +31,8 @@ def hops_of(scenario: Scenario) -> int:
 def ping_pong(scenario: Scenario) -> np.ndarray:
     """Measure round trips between this process and another one, float64 [N] [s]."""
     feeds = np.ones((scenario.n_subbands, scenario.n_feeds), complex)
-    message = convert.to_ros(m.FeedSignals(1, 1, 0, 0, feeds), None)
+    message = convert.to_ros(m.FeedSignals(cycle_id=1, user=1, band=0, frame=0, signals=feeds),
+        None)
     times_s: list[float] = []
     node = Node('ping')
     publisher = node.create_publisher(FeedSignals, 'benchmark/ping', qos.EXCHANGE)

@@ -1,0 +1,61 @@
+"""States of the base station, their time-outs, and the memory of a cycle."""
+
+import dataclasses
+import enum
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
+from rhs_isac_ros.protocol.settings import BaseStationSettings
+
+
+class State(enum.Enum):
+    """States of the base station."""
+
+    WAITING = 'waiting'            # for a codebook and for the other roles
+    RESTING = 'resting'            # between cycles
+    BEACONING = 'beaconing'        # for acks
+    CONFIGURING = 'configuring'    # for the RHS to apply a band's configurations
+    SOUNDING = 'sounding'          # for the feed signals of a band
+    ESTIMATING = 'estimating'      # for the position
+    STEERING = 'steering'          # for the beam, and for the RHS to apply it
+    TRANSMITTING = 'transmitting'  # for the uplink data
+
+
+# Steps of a granted cycle: each waits for a reply and may request it again.
+STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
+NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
+
+
+def timeouts(settings: BaseStationSettings) -> dict[State, float]:
+    """Return the time-outs by state [s]; a step's time is shared evenly by its retries."""
+    attempt_s = settings.step_timeout_s / (settings.retries + 1)
+    return {State.RESTING: settings.rest_s, State.BEACONING: settings.ack_timeout_s,
+            **dict.fromkeys(STEPS, attempt_s)}
+
+
+@dataclasses.dataclass
+class Cycle:
+    """The memory of one cycle.
+
+    Attributes
+    ----------
+    attempt
+        Number of beacons sent before the present one.
+    user
+        User that was granted the cycle; 0 before the grant.
+    band
+        Band that is being sounded.
+    received
+        Signals that were sent to the positioner, once all frames are complete.
+    beam_applied
+        Whether the RHS has reported the configuration of the beam.
+    """
+
+    id: int
+    frames: FrameBuffer
+    attempt: int = 0
+    user: int = 0
+    band: int = 0
+    received: m.ReceivedSignals | None = None
+    beam: m.Beam | None = None
+    beam_applied: bool = False

@@ -1,0 +1,178 @@
+"""The actions of the base station's table."""
+
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_guards import BaseStationGuards
+from rhs_isac_ros.protocol.base_station_states import Cycle
+from rhs_isac_ros.protocol.events import (
+    Action,
+    CodebookOffered,
+    Event,
+    PeersChanged,
+    Send,
+    SettingsOffered,
+    Tick,
+)
+from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
+from rhs_isac_ros.protocol.outcomes import Outcome
+
+
+class BaseStationSteps(BaseStationGuards):
+    """The guards and actions of a base station's table."""
+
+    # Between cycles
+
+    def store_codebook(self, event: CodebookOffered, now_s: float) -> None:
+        """Use a codebook from the next cycle on."""
+        self._offered = event.codebook
+
+    def store_peers(self, event: PeersChanged, now_s: float) -> None:
+        """Store which roles are missing."""
+        self._missing = event.missing
+
+    def store_settings(self, event: SettingsOffered, now_s: float) -> None:
+        """Store settings until they may be applied."""
+        self._settings.newest = event.settings
+
+    def apply_settings(self, event: Event, now_s: float) -> list[Action]:
+        """Apply the newest settings."""
+        return self._apply_settings()
+
+    def _apply_settings(self) -> list[Action]:
+        messages = self._settings.apply()
+        if messages:
+            self._use(self._settings.in_use)
+        return [*messages]
+
+    def log_not_ready(self, event: Event, now_s: float) -> list[Action]:
+        """Log what is missing, once the presence of the other roles is known."""
+        if self._missing is None:
+            return []
+        codebook = () if self._offered else ('codebook',)
+        return [*self._outages.log_waiting((*self._missing, *codebook))]
+
+    # Beaconing
+
+    def begin_cycle(self, event: Event, now_s: float) -> list[Action]:
+        """Begin a cycle with its first beacon."""
+        self._outages.clear_waiting()
+        self._cycle = Cycle(self._cycle.id + 1, FrameBuffer(self._scenario.sizes))
+        self._users.begin_cycle()
+        return self._beacon(now_s)
+
+    def beacon_again(self, event: Tick, now_s: float) -> list[Action]:
+        """Send another beacon of the cycle."""
+        self._cycle.attempt += 1
+        return self._beacon(now_s)
+
+    def _beacon(self, now_s: float) -> list[Action]:
+        # Nothing in the cycle depends on the codebook before the grant.
+        self._codebook = self._offered
+        self._times.start(now_s)
+        return [Send(m.Beacon(cycle_id=self._cycle.id, attempt=self._cycle.attempt))]
+
+    def count_ack(self, event: m.Ack, now_s: float) -> None:
+        """Count an ack against the user's rate."""
+        self._ack_filter.count(event.user, now_s)
+
+    def accept_ack(self, event: m.Ack, now_s: float) -> None:
+        """Add a user to those that may be granted the cycle."""
+        self._users.add_answer(event.user)
+
+    def register_user(self, event: m.Ack, now_s: float) -> None:
+        """Wait for a user from the next cycle on."""
+        self._users.register(event.user)
+
+    def grant(self, event: m.Ack | Tick, now_s: float) -> list[Action]:
+        """Grant the cycle to one of the users that answered."""
+        lost = self._users.remove_absent()
+        self.count(Outcome.USER_LOST, len(lost))
+        self._cycle.user = self._users.select()
+        self._cycle.band = -1
+        return [Send(m.Grant(cycle_id=self._cycle.id, user=self._cycle.user)),
+                *self._outages.log_lost_users(lost)]
+
+    # Positioning
+
+    def announce_positioning(self, event: Event, now_s: float) -> list[Action]:
+        """Publish the phase."""
+        return self._announce(m.Phase.POSITIONING, now_s)
+
+    def command_next_band(self, event: Event, now_s: float) -> list[Action]:
+        """Request the configurations of the next band."""
+        self._cycle.band += 1
+        return self.command_band(event, now_s)
+
+    def command_band(self, event: Event, now_s: float) -> list[Action]:
+        """Request the configurations of the band."""
+        return [Send(m.RhsCommand(
+            cycle_id=self._cycle.id, band=self._cycle.band, codebook_id=self._codebook_id))]
+
+    def request_pilots(self, event: Event, now_s: float) -> list[Action]:
+        """Request the pilots of the band."""
+        return [Send(m.PilotRequest(
+            cycle_id=self._cycle.id, user=self._cycle.user, band=self._cycle.band,
+            n_frames=self._scenario.n_frames))]
+
+    def store_frame(self, event: m.FeedSignals, now_s: float) -> None:
+        """Store the feed signals of a frame."""
+        self._cycle.frames.add(event)
+
+    def send_signals(self, event: m.FeedSignals, now_s: float) -> list[Action]:
+        """Combine all frames and send the received signals to the positioner."""
+        assert self._codebook
+        cycle = self._cycle
+        signals = self._receiver(self._codebook, cycle.frames.stack(), cycle.user, cycle.id,
+                                 self._settings.in_use.receiver_noise)
+        cycle.received = m.ReceivedSignals(
+            cycle_id=cycle.id, user=cycle.user, codebook_id=self._codebook_id, signals=signals)
+        return [Send(cycle.received), *self._announce(m.Phase.ESTIMATING, now_s)]
+
+    def resend_signals(self, event: Tick, now_s: float) -> list[Action]:
+        """Send the received signals again."""
+        assert self._cycle.received
+        return [Send(self._cycle.received)]
+
+    # Transmission and end of the cycle
+
+    def store_beam(self, event: m.Beam, now_s: float) -> None:
+        """Store the beam."""
+        self._cycle.beam = event
+
+    def store_beam_applied(self, event: m.RhsConfiguration, now_s: float) -> None:
+        """Store that the RHS has applied the beam."""
+        self._cycle.beam_applied = True
+
+    def begin_transmission(self, event: Event, now_s: float) -> list[Action]:
+        """Send the downlink data and publish the phase."""
+        return [*self.send_downlink(event, now_s),
+                *self._announce(m.Phase.TRANSMITTING, now_s)]
+
+    def send_downlink(self, event: Event, now_s: float) -> list[Action]:
+        """Send as much data as the beam is expected to carry."""
+        assert self._cycle.beam
+        duration_s = self._settings.in_use.data_duration_s
+        return [Send(m.Data(
+            cycle_id=self._cycle.id, user=self._cycle.user, direction=m.Direction.DOWNLINK,
+            stage=m.Stage.OFFERED, duration_s=duration_s,
+            bits=self._cycle.beam.expected_bps * duration_s // 1))]
+
+    def remove_user(self, event: Tick, now_s: float) -> None:
+        """Stop waiting for the user until it answers again."""
+        self._users.remove(self._cycle.user)
+
+    def abandon(self, outcome: Outcome, now_s: float) -> list[Action]:
+        """End the cycle without service."""
+        cycle, reason = self._cycle, outcome.value
+        return [Send(self._times.end_cycle(reason, cycle.id, cycle.user, now_s)),
+                *self._outages.log_lost_cycle(cycle.id, cycle.user, reason),
+                *self._apply_settings()]
+
+    def finish(self, event: m.Data, now_s: float) -> list[Action]:
+        """End the cycle: the user was served."""
+        cycle = self._cycle
+        return [Send(self._times.end_cycle('served', cycle.id, cycle.user, now_s)),
+                *self._outages.log_served_cycle(cycle.id, cycle.user),
+                *self._apply_settings()]
+
+    def _announce(self, phase: m.Phase, now_s: float) -> list[Action]:
+        return [Send(self._times.begin_phase(phase, self._cycle.id, self._cycle.user, now_s))]

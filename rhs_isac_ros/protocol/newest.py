@@ -1,0 +1,40 @@
+"""Dictionaries of bounded size."""
+
+from typing import TypeVar
+
+Key = TypeVar('Key')
+Value = TypeVar('Value')
+
+
+class NewestDict(dict[Key, Value]):
+    """A dictionary that keeps only its newest entries; `put` adds them.
+
+    Parameters
+    ----------
+    max_size
+        Number of entries that it keeps.
+    """
+
+    def __init__(self, max_size: int) -> None:
+        super().__init__()
+        self.max_size = max_size
+
+    def put(self, key: Key, value: Value, pinned: Key | None = None) -> int:
+        """Store an entry as the newest and discard the oldest beyond the limit.
+
+        Parameters
+        ----------
+        pinned
+            Key of an entry that is neither discarded nor counted towards the limit.
+
+        Returns
+        -------
+        int
+            Number of entries that were discarded.
+        """
+        self.pop(key, None)
+        self[key] = value
+        surplus = [known for known in self if known != pinned][:-self.max_size]
+        for known in surplus:
+            del self[known]
+        return len(surplus)

@@ -1,0 +1,184 @@
+"""The channel."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.events import Send
+
+PLACE = np.array([8.0, -2.0, 0.5])
+
+
+def feed(role, events):
+    """Return the messages that a role sends, one list for each event."""
+    return [[action.message for action in role.handle(event, float(n))
+             if isinstance(action, Send)] for n, event in enumerate(events)]
+
+
+@pytest.fixture
+def truth():
+    return m.GroundTruth(cycle_id=3, user=1, position=PLACE, velocity=np.zeros(3))
+
+
+@pytest.fixture
+def configuration(codebooks):
+    return m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.POSITIONING, band=0, codebook_id=codebooks[0].id,
+        analog=codebooks[0].analog[0])
+
+
+@pytest.fixture
+def pilots():
+    return [m.Pilot(
+        cycle_id=3, user=1, band=0, frame=frame, symbol_re=1.0, symbol_im=0.0) for frame in (0, 1)]
+
+
+@pytest.fixture
+def beam(scenario):
+    found = steer(scenario, PLACE)
+    return m.Beam(
+        cycle_id=3, user=1, codebook_id='x', band=0, analog=found.analog, digital=found.digital,
+        expected_bps=5e6)
+
+
+@pytest.fixture
+def applied(beam):
+    return m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=beam.analog[None])
+
+
+@pytest.fixture
+def downlink():
+    return m.Data(
+        cycle_id=3, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED, duration_s=1e-3,
+        bits=1e9)
+
+
+def test_the_channel_answers_pilots_for_any_order_of_messages(
+        scenario, truth, configuration, pilots):
+    answers = []
+    for order in itertools.permutations([truth, configuration, *pilots]):
+        sent = feed(Channel(scenario, 0), order)
+        # No answer before all messages that it needs have arrived.
+        known = max(order.index(truth), order.index(configuration))
+        assert all(not s for s in sent[:known])
+        answers.append({f.frame: f for batch in sent for f in batch})
+    for found in answers:
+        assert found.keys() == {0, 1}
+        for frame, feeds in found.items():
+            assert (feeds.cycle_id, feeds.user, feeds.band) == (3, 1, 0)
+            np.testing.assert_array_equal(feeds.signals, answers[0][frame].signals)
+    assert not np.isclose(answers[0][0].signals, answers[0][1].signals).any()
+
+
+def test_feed_signals_follow_configuration_and_symbol(scenario, truth, configuration, pilots):
+    def signals(analog, symbol):
+        report = m.RhsConfiguration(
+            cycle_id=3, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=analog)
+        pilot = m.Pilot(
+            cycle_id=3, user=1, band=0, frame=0, symbol_re=symbol.real, symbol_im=symbol.imag)
+        (feeds,) = feed(Channel(scenario, 0), [truth, report, pilot])[-1]
+        return feeds.signals
+
+    analog = configuration.analog
+    plain = signals(analog, 1 + 0j)
+    np.testing.assert_allclose(signals(analog, 0.6 - 0.8j), (0.6 - 0.8j) * plain)
+    np.testing.assert_allclose(signals(analog / 2, 1 + 0j), plain / 2)
+    assert (signals(0 * analog, 1 + 0j) == 0).all()
+    # Element by element: the path, including on-board propagation.
+    single = [signals(np.eye(16)[m_][None] * np.ones((2, 1)), 1 + 0j) for m_ in range(16)]
+    np.testing.assert_allclose(signals(np.ones((2, 16)), 1 + 0j), sum(single))
+
+
+def test_the_multipath_has_zero_mean_and_the_line_of_sight_is_1(scenario, configuration, pilots):
+    sums, n = 0, 400
+    for cycle_id in range(1, n + 1):
+        events = [m.GroundTruth(cycle_id=cycle_id, user=1, position=PLACE, velocity=np.zeros(3)),
+                  m.RhsConfiguration(
+                      cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0, codebook_id='x',
+                      analog=np.ones((2, 16))),
+                  m.Pilot(
+                      cycle_id=cycle_id, user=1, band=0, frame=0, symbol_re=1.0, symbol_im=0.0)]
+        ((feeds,),) = feed(Channel(scenario, 0), events)[-1:]
+        sums = sums + np.array([feeds.signals, np.abs(feeds.signals)**2])
+    mean, power = sums / n
+    los = los_gain(scenario, PLACE[None], 0)[0]
+    expected = np.einsum('jm,jkm->jk', los, onboard_matrix(scenario)[0])
+    spread = np.sqrt(np.maximum(power.real - np.abs(mean)**2, 0) / n)
+    assert (spread > 0).all()
+    assert (np.abs(mean - expected) < 4 * spread).all()
+
+
+def test_a_pilot_of_another_user_is_not_answered(scenario, truth, configuration, example):
+    channel = Channel(scenario, 0)
+    pilot = example(m.Pilot, cycle_id=3, user=2)
+    assert feed(channel, [truth, configuration, pilot]) == [[], [], []]
+    assert channel.counters == {'wrong_user': 1}
+
+
+@pytest.mark.parametrize('cycle_id', [2, 4])
+def test_a_pilot_of_another_cycle_is_discarded_with_the_next_cycle(
+        scenario, truth, configuration, example, cycle_id):
+    channel = Channel(scenario, 0)
+    pilot = example(m.Pilot, cycle_id=cycle_id, user=1)
+    later = m.GroundTruth(cycle_id=5, user=1, position=PLACE, velocity=np.zeros(3))
+    assert feed(channel, [truth, configuration, pilot, later]) == [[]] * 4
+    assert channel.counters == {'stale': 1}
+
+
+def test_a_pilot_of_the_next_cycle_waits_for_it(scenario, truth, configuration, codebooks):
+    channel = Channel(scenario, 0)
+    later = m.RhsConfiguration(
+        cycle_id=4, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=configuration.analog)
+    events = [truth, configuration, m.Pilot(
+        cycle_id=4, user=1, band=0, frame=0, symbol_re=1.0, symbol_im=0.0), later,
+              m.GroundTruth(cycle_id=4, user=1, position=PLACE, velocity=np.zeros(3))]
+    sent = feed(channel, events)
+    assert sent[:4] == [[]] * 4
+    assert [f.cycle_id for f in sent[4]] == [4]
+
+
+def test_the_channel_delivers_data_for_any_order_of_messages(
+        scenario, truth, beam, applied, downlink):
+    for order in itertools.permutations([truth, beam, applied, downlink]):
+        sent = [s for batch in feed(Channel(scenario, 0), order) for s in batch]
+        assert [(s.stage, s.bits) for s in sent] == [(m.Stage.DELIVERED, sent[0].bits)]
+
+
+def test_the_channel_delivers_the_capacity_at_the_true_position(
+        scenario, truth, beam, applied, downlink):
+    channel = Channel(scenario, 0)
+    feed(channel, [truth, beam, applied])
+    rate = capacity(scenario, Beam(beam.analog, beam.digital), PLACE[None])[0]
+    ((delivered,),) = feed(channel, [downlink])
+    assert delivered.bits == math.floor(rate * 1e-3)
+    assert (delivered.direction, delivered.stage) == (m.Direction.DOWNLINK, m.Stage.DELIVERED)
+    few = m.Data(
+        cycle_id=3, user=1, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED, duration_s=1e-3,
+        bits=10.0)
+    ((delivered,),) = feed(channel, [few])
+    assert (delivered.direction, delivered.bits) == (m.Direction.UPLINK, 10.0)
+
+
+def test_the_channel_uses_the_reported_configuration_of_the_surface(
+        scenario, truth, beam, downlink):
+    off = m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=np.zeros((1, 16)))
+    (_, _, _, (delivered,)) = feed(Channel(scenario, 0), [truth, beam, off, downlink])
+    assert delivered.bits == 0
+
+
+@pytest.fixture
+def signals(codebooks, example):
+    """Function that returns received signals of a cycle with one of the codebooks."""
+    def make(cycle_id, number=0):
+        return example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
+                       codebook_id=codebooks[number].id)
+    return make

@@ -1,0 +1,188 @@
+"""Roles that crash, restart or are missing at first."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import mobility
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol import user as user_role
+from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.events import PeersChanged
+
+ROLE_FAULTS = [
+    ('rhs_controller', State.CONFIGURING, 'rhs_silent'),
+    ('rhs_controller', State.ESTIMATING, 'transmission_silent'),
+    ('channel', State.CONFIGURING, 'user_gone'),
+    ('channel', State.SOUNDING, 'user_gone'),
+    ('channel', State.ESTIMATING, 'data_lost'),
+    ('positioner', State.SOUNDING, 'positioner_silent'),
+    ('transmission', State.SOUNDING, 'transmission_silent'),
+]
+
+
+@pytest.mark.parametrize(('role', 'state', 'reason'), ROLE_FAULTS)
+@pytest.mark.parametrize('noticed', [True, False])
+def test_a_lost_role_causes_a_timeout_and_may_return(network, role, state, reason, noticed):
+    net = network()
+    net.run_cycles(1)
+    net.run_to(state)
+    gone_s = net.now_s
+    net.remove(role, noticed)
+    net.run_cycles(1)
+    assert net.outcomes()[-1] == (2, 1, reason)
+    assert net.now_s - gone_s < 1.1
+    assert net['bs'].counters == {reason: 1}
+    assert net['bs'].state is State.RESTING
+    net.run(limit_s=10.0)
+    if noticed:
+        assert net['bs'].state is State.WAITING
+        assert net['bs'].counters == {reason: 1}
+    else:
+        assert net['bs'].state is not State.WAITING
+        assert net['bs'].counters.total() > 5
+        assert net.served() == [1]
+    net.add(role)
+    net.run_cycles(3)
+    assert net.served()[-2:] == [1, 1]
+    net.verify()
+
+
+@pytest.mark.parametrize('role', ['rhs_controller', 'positioner', 'transmission', 'channel'])
+@pytest.mark.parametrize('state', [
+    State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
+    State.TRANSMITTING, State.RESTING])
+def test_a_role_that_restarts_costs_one_cycle_at_most(network, role, state):
+    net = network(2)
+    net.run_cycles(4)
+    net.run_to(state)
+    net.restart(role)
+    net.run_cycles(4)
+    outcomes = [outcome for _, _, outcome in net.outcomes()[4:]]
+    assert outcomes[1:] == ['served'] * 3
+    net.verify()
+
+
+@pytest.mark.parametrize('role', ['rhs_controller', 'channel', 'positioner', 'transmission'])
+def test_the_base_station_waits_for_a_role_and_logs_it_once(network, role):
+    net = network(absent=[role])
+    net.run(limit_s=30.0)
+    assert net.sent(m.Beacon) == []
+    assert net['bs'].state is State.WAITING
+    assert net.logged('bs') == [f'waiting for {role}']
+    net.add(role)
+    net.run_cycles(2)
+    assert net.served() == [1, 1]
+    assert net.logged('bs') == [f'waiting for {role}']
+    if role == 'channel':
+        assert net.counters() == {}
+    else:
+        assert net.counters() == {'user1': {'no_beacon': 1}}
+        assert net.logged('user1')[1:] == ['no beacon for 3 s', 'beacons resumed']
+
+
+def test_every_change_of_the_missing_roles_is_logged_once(network):
+    net = network(absent=['positioner', 'channel'])
+    net.run(limit_s=5.0)
+    net.add('channel')
+    net.run(limit_s=5.0)
+    net.remove('transmission')
+    net.run(limit_s=5.0)
+    net.add('positioner')
+    net.add('transmission')
+    assert net.logged('bs') == [
+        'waiting for channel, positioner', 'waiting for positioner',
+        'waiting for positioner, transmission', 'waiting for transmission']
+    net.run_cycles(1)
+    net.remove('transmission')
+    net.run(limit_s=5.0)
+    assert net.logged('bs')[4:] == ['waiting for transmission']
+
+
+def test_missing_roles_are_not_logged_again_without_a_change(network, codebooks):
+    net = network(absent=['positioner'])
+    for codebook in codebooks:
+        net.offer(codebook)
+        net.dispatch('bs', PeersChanged(('positioner',)))
+    assert net.logged('bs') == ['waiting for positioner']
+
+
+def test_a_role_missing_briefly_between_cycles_costs_no_cycle(network):
+    net = network()
+    net.run_cycles(1)
+    net.restart('positioner', noticed=True)
+    net.run_cycles(2)
+    assert net.served() == [1, 1, 1]
+    assert net.logged('bs') == []
+
+
+def test_a_user_without_a_base_station_waits_and_logs_it_once(network):
+    net = network(absent=['bs'])
+    net.run(limit_s=30.0)
+    assert net.logged('user1') == ['waiting for bs']
+    assert net['user1'].state is user_role.State.DISCONNECTED
+    net.publish(m.Beacon(cycle_id=7, attempt=0))
+    net.run(limit_s=1.0)
+    assert net.sent(m.Ack) == []
+    net.add('bs')
+    net.run_cycles(1)
+    assert net.served() == [1]
+    assert net.logged('user1') == ['waiting for bs', 'listening for beacons']
+
+
+@pytest.mark.parametrize('noticed', [True, False])
+@pytest.mark.parametrize('cycles', [0, 3])
+@pytest.mark.parametrize('state', [
+    State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
+    State.TRANSMITTING, State.RESTING])
+def test_a_restarted_base_station_is_answered(network, state, cycles, noticed):
+    net = network(2)
+    net.run_cycles(cycles)
+    net.run_to(state)
+    net.restart('bs', noticed)
+    mark, n_ends = len(net.log), len(net.outcomes())
+    net.run_cycles(6)
+    ends = [(user, outcome) for _, user, outcome in net.outcomes()[n_ends:]]
+    assert {user for user, outcome in ends if outcome == 'served'} == {1, 2}
+    assert [outcome for _, outcome in ends[2:]] == ['served'] * 4
+    assert {ack.user for ack in net.sent(m.Ack, mark)} == {1, 2}
+    net.verify()
+
+
+@pytest.mark.parametrize('state', [State.SOUNDING, State.STEERING])
+def test_a_restarted_base_station_uses_the_present_position_of_the_user(network, scenario, state):
+    """The number of the interrupted cycle is not used again."""
+    walk = mobility.RandomWalk(scenario, 50.0, np.random.default_rng(0))
+    net = network({1: walk})
+    net.run_to(state)
+    net.restart('bs')
+    net.run_cycles(2)
+    assert net.served() == [1, 1]
+    before, again, _ = net.sent(m.GroundTruth)
+    assert before.cycle_id == 1 < again.cycle_id
+    assert np.linalg.norm(again.position - before.position) > 0.1
+    net.verify()
+
+
+def test_users_wait_without_a_base_station(network):
+    net = network(2)
+    net.run_cycles(2)
+    net.run_to(State.SOUNDING)
+    net.remove('bs')
+    assert [net[u].state for u in ('user1', 'user2')] == [user_role.State.DISCONNECTED] * 2
+    net.run(limit_s=5.0)
+    assert net.logged('user1')[-1] == 'waiting for bs'
+
+
+def test_a_base_station_without_acks_detects_a_missing_role(network):
+    net = network()
+    net.run_cycles(1)
+    net.remove('user1')
+    net.run(limit_s=2.0)
+    assert net['bs'].state is State.BEACONING
+    net.remove('positioner')
+    net.run(limit_s=2.0)
+    assert net['bs'].state is State.WAITING
+    assert net.logged('bs') == ['waiting for positioner']
+    net.add('positioner')
+    net.run(limit_s=2.0)
+    assert net['bs'].state is State.BEACONING

@@ -1,0 +1,81 @@
+"""Cycles without a position estimate."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.positioning import Estimate
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_states import State
+
+
+def matches(message, kind, fields):
+    return isinstance(message, kind) and all(
+        getattr(message, name) == value for name, value in fields.items())
+
+
+class LosesFirst:
+    """Loses the first message of a class to one recipient, or to all."""
+
+    def __init__(self, kind, fields, recipient=''):
+        self.kind, self.fields, self.recipient = kind, fields, recipient
+        self.lost = None
+
+    def __call__(self, message, recipient):
+        if matches(message, self.kind, self.fields) and recipient.startswith(self.recipient):
+            self.lost = self.lost or message
+            if message is self.lost:
+                return []
+        return [(1e-3, message)]
+
+
+class Blind:
+    """An estimator without a fix in the given cycles."""
+
+    name = 'blind'
+
+    def __init__(self, cycles):
+        self._cycles, self._cycle = cycles, 0
+
+    def estimate(self, received):
+        self._cycle += 1
+        if self._cycle in self._cycles:
+            return Estimate(np.full(3, np.nan), np.full((3, 3), np.nan), 'nothing fits')
+        return Estimate(np.array([10.0, 0.0, 0.0]), np.eye(3))
+
+
+def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
+    net = network(make=lambda codebook: Blind({2}))
+    net.run_cycles(3)
+    assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'no_fix'), (3, 1, 'served')]
+    assert [e.cycle_id for e in net.sent(m.PositionEstimate)] == [1, 3]
+    assert not net.sent(m.Beam, cycle_id=2)
+    (told,) = net.sent(m.NoFix)
+    assert (told.cycle_id, told.user, told.reason) == (2, 1, 'nothing fits')
+    (signals_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ReceivedSignals)
+                    and s.message.cycle_id == 2]
+    (end_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ProtocolState)
+                and s.message.outcome == 'no_fix']
+    assert end_s - signals_s < 0.01
+    assert net.counters() == {
+        'bs': {'no_fix': 1}, 'positioner': {'no_fix': 1}, 'user1': {'abandoned': 1}}
+    net.verify()
+
+
+def test_a_lost_no_fix_costs_the_timeout_of_one_step(network):
+    net = network(make=lambda codebook: Blind({2}), transport=LosesFirst(m.NoFix, {}))
+    net.run_cycles(3)
+    assert net.transport.lost is not None
+    assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'positioner_silent'), (3, 1, 'served')]
+    net.verify()
+
+
+@pytest.mark.parametrize('changes', [{'cycle_id': 1}, {'user': 2}, {'codebook_id': 'x'}], ids=str)
+def test_a_no_fix_of_another_cycle_does_not_end_the_cycle(network, codebooks, changes):
+    net = network()
+    net.run_cycles(1)
+    net.run_to(State.ESTIMATING)
+    net.publish(m.NoFix(**{'cycle_id': 2, 'user': 1, 'codebook_id': codebooks[0].id,
+                           'reason': ''} | changes))
+    net.run_cycles(1)
+    assert net.served() == [1, 1]
+    assert sum(net['bs'].counters.values()) == 1

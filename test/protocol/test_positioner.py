@@ -1,0 +1,205 @@
+"""The positioner."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.positioning import Estimate, SignalError
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import (
+    BuildEstimator,
+    CodebookOffered,
+    EstimatorFailed,
+    EstimatorReady,
+    LogMessage,
+    Send,
+)
+from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
+
+PLACE = np.array([8.0, -2.0, 0.5])
+
+
+def feed(role, events):
+    """Return the messages that a role sends, one list for each event."""
+    return [[action.message for action in role.handle(event, float(n))
+             if isinstance(action, Send)] for n, event in enumerate(events)]
+
+
+class Fixed:
+    """An estimator with a fixed result that holds its codebook."""
+
+    def __init__(self, codebook):
+        self.name = f'fixed {codebook.id}'
+
+    def estimate(self, received):
+        return Estimate(PLACE, 4 * np.eye(3))
+
+
+@pytest.fixture
+def positioner(scenario):
+    """A positioner whose stopwatch advances by a second at each call."""
+    watch = itertools.count(10.0)
+    return Positioner(scenario, lambda: next(watch))
+
+
+@pytest.fixture
+def signals(codebooks, example):
+    """Function that returns received signals of a cycle with one of the codebooks."""
+    def make(cycle_id, number=0):
+        return example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
+                       codebook_id=codebooks[number].id)
+    return make
+
+
+def ready(codebook, estimator=None):
+    return EstimatorReady(codebook, estimator or Fixed(codebook), 1.5)
+
+
+def requested(actions):
+    """Return the ids of the codebooks for which estimators are requested."""
+    return [action.codebook.id for action in actions if isinstance(action, BuildEstimator)]
+
+
+def test_the_codebook_of_the_signals_selects_the_estimator(
+        positioner, scenario, codebooks, signals):
+    for codebook in codebooks[:2]:
+        assert requested(positioner.handle(CodebookOffered(codebook), 0.0)) == [codebook.id]
+        assert positioner.handle(ready(codebook), 0.0) == [
+            LogMessage(f'fixed {codebook.id} is ready for codebook {codebook.id} after 1.5 s')]
+    for number in (0, 1, 0, 1):
+        codebook = codebooks[number]
+        ((estimate,),) = feed(positioner, [signals(5, number)])
+        assert (estimate.cycle_id, estimate.user) == (5, 2)
+        assert estimate.codebook_id == codebook.id
+        assert estimate.estimator == f'fixed {codebook.id}'
+        assert (estimate.position == PLACE).all()
+        assert (estimate.covariance_m2 == 4 * np.eye(3)).all()
+        assert estimate.crlb_m2 == pytest.approx(crlb(scenario, codebook, PLACE[None])[0])
+        assert estimate.latency_s == 1.0
+
+
+def test_duplicate_signals_are_answered_twice_and_estimated_once(
+        positioner, codebooks, signals):
+    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0])])
+    (first,), (again,), (other,) = feed(positioner, [signals(5), signals(5), signals(6)])
+    assert again is first
+    assert other.cycle_id == 6
+    assert positioner.counters == {'duplicate': 1}
+
+
+def test_the_positioner_drops_signals_of_an_unknown_codebook(
+        positioner, codebooks, signals):
+    assert feed(positioner, [signals(1)]) == [[]]
+    feed(positioner, [CodebookOffered(codebooks[1]), ready(codebooks[1])])
+    assert feed(positioner, [signals(1)]) == [[]]
+    assert positioner.counters == {'wrong_codebook': 2}
+
+
+def test_the_positioner_requests_one_estimator_for_a_codebook(positioner, codebooks):
+    offers = [positioner.handle(CodebookOffered(codebooks[0]), 0.0) for _ in range(3)]
+    assert list(map(requested, offers)) == [[codebooks[0].id], [], []]
+    positioner.handle(ready(codebooks[0]), 0.0)
+    assert positioner.handle(CodebookOffered(codebooks[0]), 0.0) == []
+
+
+def test_the_old_estimator_is_used_while_the_new_one_is_built(
+        positioner, codebooks, signals):
+    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0]),
+                      CodebookOffered(codebooks[1])])
+    (old,), nothing, (old_again,), (new,) = feed(
+        positioner, [signals(1), signals(2, 1), signals(3), ready(codebooks[1])])
+    assert nothing == []
+    assert [e.cycle_id for e in (old, old_again, new)] == [1, 3, 2]
+    assert new.codebook_id == codebooks[1].id
+    assert positioner.counters == {}
+
+
+def test_the_newest_of_waiting_signals_are_used(positioner, codebooks, signals):
+    *before, (estimate,), after = feed(
+        positioner, [CodebookOffered(codebooks[0]), signals(1), signals(2), ready(codebooks[0]),
+                     CodebookOffered(codebooks[0])])
+    assert before == [[], [], []]
+    assert estimate.cycle_id == 2
+    assert after == []
+
+
+def test_estimators_are_built_one_at_a_time_the_newest_next(
+        positioner, codebooks, signals):
+    first, second, third = codebooks
+    offers = [requested(positioner.handle(CodebookOffered(codebook), 0.0))
+              for codebook in codebooks]
+    assert offers == [[first.id], [], []]
+    positioner.handle(signals(7, 2), 0.0)
+    assert requested(positioner.handle(ready(first), 0.0)) == [third.id]
+    ((estimate,),) = feed(positioner, [ready(third)])
+    assert (estimate.cycle_id, estimate.codebook_id) == (7, third.id)
+    assert feed(positioner, [signals(8, 1)]) == [[]]
+    assert positioner.counters == {'wrong_codebook': 1}
+
+
+def test_no_estimator_is_built_for_a_codebook_replaced_meanwhile(positioner, codebooks):
+    first, second, _ = codebooks
+    feed(positioner, [CodebookOffered(c) for c in (first, second, first)])
+    assert requested(positioner.handle(ready(first), 0.0)) == []
+
+
+def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(positioner, codebooks, signals):
+    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0]),
+                      CodebookOffered(codebooks[1]), signals(4, 1)])
+    assert positioner.handle(EstimatorFailed(codebooks[1], 'no model'), 0.0) == [
+        LogMessage(f'no estimator for codebook {codebooks[1].id}: no model', warning=True)]
+    assert [len(sent) for sent in feed(positioner, [signals(5), signals(6, 1)])] == [1, 0]
+    assert positioner.counters == {'wrong_codebook': 2}
+    # The codebook may be offered again.
+    assert requested(positioner.handle(CodebookOffered(codebooks[1]), 0.0)) == [codebooks[1].id]
+
+
+class Lost(Fixed):
+    """An estimator that returns no fix, or raises an error."""
+
+    def __init__(self, codebook, error=False):
+        super().__init__(codebook)
+        self._error = error
+
+    def estimate(self, received):
+        if self._error:
+            raise SignalError('received: all wrong')
+        return Estimate(np.full(3, np.nan), np.full((3, 3), np.nan), 'received: all wrong')
+
+
+@pytest.mark.parametrize('error', [False, True])
+def test_without_a_fix_the_positioner_reports_the_reason(positioner, codebooks, signals, error):
+    lost = Lost(codebooks[0], error)
+    feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0], lost)])
+    send, note = positioner.handle(signals(9), 0.0)
+    assert isinstance(send.message, m.NoFix)
+    assert (send.message.cycle_id, send.message.user) == (9, 2)
+    assert send.message.codebook_id == codebooks[0].id
+    assert send.message.reason == 'received: all wrong'
+    assert note == LogMessage('cycle 9: no fix: received: all wrong', warning=True)
+    assert positioner.counters == {'no_fix': 1}
+
+
+@pytest.mark.parametrize('error', [ValueError('bad model'), OSError('disk full'), MemoryError()])
+def test_an_error_while_an_estimator_is_built_is_an_event(codebooks, error):
+    def make(codebook):
+        raise error
+    event = build_estimator(codebooks[0], make, lambda: 0.0)
+    assert isinstance(event, EstimatorFailed)
+    assert event.codebook is codebooks[0]
+    assert event.reason == (str(error) or 'MemoryError')
+
+
+def test_a_built_estimator_is_returned_with_its_duration(codebooks):
+    watch = iter([3.0, 5.5])
+    event = build_estimator(codebooks[0], Fixed, lambda: next(watch))
+    assert (event.codebook, event.elapsed_s) == (codebooks[0], 2.5)
+    assert event.estimator.name == f'fixed {codebooks[0].id}'
+
+
+@pytest.fixture
+def estimate(codebooks, example):
+    return example(m.PositionEstimate, cycle_id=3, user=1, codebook_id=codebooks[0].id,
+                   position=PLACE + [0.5, 0.5, 0.0])

@@ -1,0 +1,240 @@
+"""The transmission."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    LogMessage,
+    Send,
+    SettingsOffered,
+)
+from rhs_isac_ros.protocol.settings import TransmissionSettings
+from rhs_isac_ros.protocol.transmission import Transmission
+
+PLACE = np.array([8.0, -2.0, 0.5])
+
+
+def feed(role, events):
+    """Return the messages that a role sends, one list for each event."""
+    return [[action.message for action in role.handle(event, float(n))
+             if isinstance(action, Send)] for n, event in enumerate(events)]
+
+
+@pytest.fixture
+def truth():
+    return m.GroundTruth(cycle_id=3, user=1, position=PLACE, velocity=np.zeros(3))
+
+
+@pytest.fixture
+def beam(scenario):
+    found = steer(scenario, PLACE)
+    return m.Beam(
+        cycle_id=3, user=1, codebook_id='x', band=0, analog=found.analog, digital=found.digital,
+        expected_bps=5e6)
+
+
+@pytest.fixture
+def applied(beam):
+    return m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.TRANSMISSION, band=0, codebook_id='x', analog=beam.analog[None])
+
+
+def configured(beam):
+    """The report of the surface after it has applied a beam."""
+    return m.RhsConfiguration(
+        cycle_id=beam.cycle_id, mode=m.Mode.TRANSMISSION, band=beam.band,
+        codebook_id=beam.codebook_id, analog=beam.analog[None])
+
+
+@pytest.fixture
+def transmission(scenario, codebooks):
+    role = Transmission(scenario)
+    role.handle(CodebookOffered(codebooks[0]), 0.0)
+    return role
+
+
+@pytest.fixture
+def estimate(codebooks, example):
+    return example(m.PositionEstimate, cycle_id=3, user=1, codebook_id=codebooks[0].id,
+                   position=PLACE + [0.5, 0.5, 0.0])
+
+
+def test_the_transmission_reports_the_capacity_of_the_applied_beam(
+        transmission, scenario, truth, estimate):
+    ((beam,),) = feed(transmission, [estimate])
+    assert (beam.cycle_id, beam.user, beam.codebook_id) == (3, 1, estimate.codebook_id)
+    weaker = m.RhsConfiguration(
+        cycle_id=3, mode=m.Mode.TRANSMISSION, band=beam.band, codebook_id=beam.codebook_id,
+        analog=beam.analog[None] / 2)
+    (_, (report, _)) = feed(transmission, [truth, weaker])
+    used = Beam(beam.analog / 2, beam.digital)
+    assert report.actual_bps == pytest.approx(capacity(scenario, used, PLACE[None])[0])
+    assert report.actual_bps < report.perfect_bps
+    assert report.loss_bps == report.perfect_bps - report.actual_bps
+
+
+def test_no_beam_exceeds_the_perfect_one(transmission, scenario, codebooks, example):
+    """The search may find a local maximum, but never one much below another."""
+    rng = np.random.default_rng(0)
+    for cycle_id, place in enumerate(scenario.sample_positions(20, rng), 1):
+        near = place + rng.normal(scale=0.2, size=3)
+        estimate = example(m.PositionEstimate, cycle_id=cycle_id, user=1, position=near,
+                           codebook_id=codebooks[0].id)
+        ((beam,),) = feed(transmission, [estimate])
+        truth = m.GroundTruth(cycle_id=cycle_id, user=1, position=place, velocity=np.zeros(3))
+        applied = configured(beam)
+        (_, (report, _)) = feed(transmission, [truth, applied])
+        assert -0.05 <= report.loss_percent < 100
+
+
+@pytest.mark.parametrize('other', [{'cycle_id': 2}, {'cycle_id': 4}, {'user': 2}])
+def test_the_position_of_another_cycle_or_user_is_not_used(
+        transmission, example, estimate, other):
+    truth = example(m.GroundTruth, **{'cycle_id': 3, 'user': 1} | other)
+    ((beam,), _) = feed(transmission, [estimate, truth])
+    applied = configured(beam)
+    ((report,),) = feed(transmission, [applied])
+    assert math.isnan(report.actual_bps)
+    assert math.isnan(report.perfect_bps)
+    assert report.expected_bps == beam.expected_bps
+
+
+def test_a_duplicate_estimate_is_answered_with_the_same_beam(
+        transmission, estimate, truth, monkeypatch):
+    ((beam,),) = feed(transmission, [estimate])
+    monkeypatch.setattr('rhs_isac_ros.protocol.transmission.choose_beam', None)
+    ((again,),) = feed(transmission, [dataclasses.replace(estimate)])
+    assert again is beam
+    assert transmission.counters == {'duplicate': 1}
+
+
+def test_a_report_without_a_beam_is_counted(transmission, applied):
+    assert feed(transmission, [applied]) == [[]]
+    assert transmission.counters == {'wrong_cycle': 1}
+
+
+@pytest.mark.parametrize(('changes', 'reason'), [
+    ({'codebook_id': 'x'}, 'wrong_codebook'), ({'band': 1}, 'wrong_band'),
+    ({'cycle_id': 4}, 'wrong_cycle')])
+def test_a_report_of_another_beam_is_counted(transmission, estimate, changes, reason):
+    ((beam,),) = feed(transmission, [estimate])
+    other = {'band': 1 - beam.band} if 'band' in changes else changes
+    assert feed(transmission, [dataclasses.replace(configured(beam), **other)]) == [[]]
+    assert transmission.counters == {reason: 1}
+
+
+def test_late_messages_of_an_older_cycle_do_not_replace_the_present_one(
+        transmission, estimate, truth):
+    later = dataclasses.replace(estimate, cycle_id=4)
+    place = dataclasses.replace(truth, cycle_id=4)
+    ((beam,), *_) = feed(transmission, [later, place, estimate, truth])
+    ((report, _),) = feed(transmission, [configured(beam)])
+    assert report.cycle_id == 4
+    assert math.isfinite(report.actual_bps)
+    assert transmission.counters == {}
+
+
+def reported(transmission, scenario, example, codebook, places, cycle_id=1):
+    """Return the messages of one cycle for each position, with estimates off by half a metre."""
+    sent = []
+    for n, place in enumerate(places, cycle_id):
+        estimate = example(m.PositionEstimate, cycle_id=n, user=1, codebook_id=codebook.id,
+                           position=place + [0.0, 0.5, 0.0], covariance_m2=0.1 * np.eye(3))
+        ((beam,),) = feed(transmission, [estimate])
+        applied = m.RhsConfiguration(
+            cycle_id=n, mode=m.Mode.TRANSMISSION, band=beam.band, codebook_id=codebook.id,
+            analog=beam.analog[None])
+        sent.append(feed(transmission, [m.GroundTruth(
+            cycle_id=n, user=1, position=place, velocity=np.zeros(3)), applied])[1])
+    return sent
+
+
+def test_the_statistics_are_the_quartiles_of_the_reports(
+        transmission, scenario, example, codebooks):
+    places = scenario.sample_positions(12, np.random.default_rng(5))
+    sent = reported(transmission, scenario, example, codebooks[0], places)
+    for n, (report, statistics) in enumerate(sent, 1):
+        assert (statistics.cycle_id, statistics.n_reports) == (report.cycle_id, n)
+        for name in ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent'):
+            values = [getattr(earlier, name) for earlier, _ in sent[:n]]
+            np.testing.assert_allclose(
+                getattr(statistics, name), np.percentile(values, [25, 50, 75]), rtol=1e-12)
+    assert sent[-1][1].loss_percent[1] > 0
+
+
+def test_a_repeated_report_is_counted_once(transmission, scenario, example, codebooks):
+    (place,) = scenario.sample_positions(1, np.random.default_rng(5))
+    ((report, statistics),) = reported(transmission, scenario, example, codebooks[0], [place])
+    assert statistics.n_reports == 1
+    applied = m.RhsConfiguration(
+        cycle_id=1, mode=m.Mode.TRANSMISSION, band=report.band, codebook_id=report.codebook_id,
+        analog=np.ones((1, 16)))
+    ((again,),) = feed(transmission, [applied])
+    assert isinstance(again, m.Capacity)
+    ((_, statistics),) = reported(
+        transmission, scenario, example, codebooks[0], [place], cycle_id=2)
+    assert statistics.n_reports == 2
+
+
+def test_without_a_true_position_there_are_no_statistics(transmission, estimate):
+    ((beam,),) = feed(transmission, [estimate])
+    applied = configured(beam)
+    ((report,),) = feed(transmission, [applied])
+    assert isinstance(report, m.Capacity)
+
+
+def test_the_transmission_chooses_the_band_by_the_posterior(scenario, codebooks, example):
+    covariance = np.diag([0.5, 2.0, 0.3])
+    for position in scenario.sample_positions(5, np.random.default_rng(2)):
+        estimate = example(m.PositionEstimate, cycle_id=3, user=1, position=position,
+                           codebook_id=codebooks[0].id, covariance_m2=covariance)
+        (_, (beam,)) = feed(Transmission(scenario), [CodebookOffered(codebooks[0]), estimate])
+        choice = choose_beam(scenario, position, covariance)
+        assert (beam.band, beam.expected_bps) == (choice.beam.band, choice.expected_bps)
+        for band in range(scenario.n_bands):
+            other = steer(scenario, position, band)
+            assert expected_capacity(scenario, other, position, covariance) <= beam.expected_bps
+
+
+def test_the_perfect_beam_is_chosen_from_the_same_bands(
+        scenario, codebooks, truth, estimate):
+    for band in (-1, 0, 1):
+        role = Transmission(scenario, TransmissionSettings(band))
+        (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
+        applied = configured(beam)
+        (_, (report, _)) = feed(role, [truth, applied])
+        bands = range(2) if band < 0 else [band]
+        assert report.perfect_bps == pytest.approx(max(
+            capacity(scenario, steer(scenario, PLACE, b), PLACE[None])[0] for b in bands))
+
+
+def test_the_transmission_uses_the_configured_band(scenario, codebooks, estimate):
+    role = Transmission(scenario, TransmissionSettings(1))
+    (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
+    expected = steer(scenario, estimate.position, 1)
+    assert beam.band == 1
+    np.testing.assert_array_equal(beam.analog, expected.analog)
+    assert beam.expected_bps == capacity(scenario, expected, estimate.position[None])[0]
+
+
+def test_a_cycle_keeps_its_bands_when_the_settings_change(
+        scenario, codebooks, truth, estimate):
+    role = Transmission(scenario, TransmissionSettings(1))
+    (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
+    assert role.handle(SettingsOffered(TransmissionSettings(0)), 0.0) == [
+        LogMessage("from now on: band '0'")]
+    assert role.status()['parameter.band'] == '0'
+    moved = dataclasses.replace(estimate, position=estimate.position + 0.1)
+    (again,), (other,), _, (report, _) = feed(role, [estimate, moved, truth, configured(beam)])
+    assert again is beam
+    assert other.band == 1
+    assert report.perfect_bps == pytest.approx(
+        capacity(scenario, steer(scenario, PLACE, 1), PLACE[None])[0])
+    ((new,),) = feed(role, [dataclasses.replace(estimate, cycle_id=4)])
+    assert (new.cycle_id, new.band) == (4, 0)

@@ -1,0 +1,191 @@
+"""Messages that do not belong to a cycle are dropped and counted; late ones change nothing."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import mobility
+from rhs_isac_ros.protocol import messages as m
+
+POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
+DOWN = {'direction': m.Direction.DOWNLINK}
+UP = {'direction': m.Direction.UPLINK}
+OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
+
+
+def matches(message, kind, fields):
+    return isinstance(message, kind) and all(
+        getattr(message, name) == value for name, value in fields.items())
+
+
+class Adds:
+    """Sends an altered copy after, or before, the first message of a class to a recipient."""
+
+    def __init__(self, kind, fields, recipient, alter, before=False):
+        self.kind, self.fields, self.recipient = kind, fields, recipient
+        self.alter, self.before, self.done = alter, before, False
+
+    def __call__(self, message, recipient):
+        arriving = [(1e-3, message)]
+        if not self.done and recipient == self.recipient and matches(
+                message, self.kind, self.fields):
+            self.done = True
+            arriving.insert(0 if self.before else 1, (1e-3, self.alter(message)))
+        return arriving
+
+
+def replace(**changes):
+    def alter(message):
+        shift = changes.get('cycle_id', 0)
+        arrays = {f.name: 0.5 * getattr(message, f.name) for f in dataclasses.fields(message)
+                  if f.name in ('signals', 'analog', 'digital', 'position')}
+        fixed = {'cycle_id': message.cycle_id + shift}
+        return dataclasses.replace(message, **changes | fixed | arrays)
+    return alter
+
+
+# Messages that do not belong to the cycle and are dropped and counted; cycle_id is relative.
+WRONG = [
+    (m.Ack, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Ack, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
+    (m.Ack, {}, 'bs', {}, 'duplicate'),
+    (m.Ack, {}, 'bs', {'user': 2}, 'late_ack'),
+    (m.FeedSignals, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.FeedSignals, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
+    (m.FeedSignals, {}, 'bs', {'user': 2}, 'wrong_user'),
+    (m.FeedSignals, {}, 'bs', {'band': 1}, 'wrong_band'),
+    (m.FeedSignals, {'band': 1}, 'bs', {'band': 0}, 'wrong_band'),
+    (m.FeedSignals, {}, 'bs', {}, 'duplicate'),
+    (m.FeedSignals, {'frame': 1}, 'bs', {}, 'wrong_band'),
+    (m.FeedSignals, {'band': 1, 'frame': 1}, 'bs', {}, 'duplicate'),
+    (m.RhsConfiguration, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
+    (m.RhsConfiguration, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.RhsConfiguration, {}, 'bs', {'band': 1}, 'wrong_band'),
+    (m.RhsConfiguration, {}, 'bs', {}, ''),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {}, 'duplicate'),
+    (m.PositionEstimate, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.PositionEstimate, {}, 'bs', {'user': 2}, 'wrong_user'),
+    (m.PositionEstimate, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.Beam, {}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Beam, {}, 'bs', {'user': 2}, 'wrong_user'),
+    (m.Beam, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.Data, UP | DELIVERED, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Data, UP | DELIVERED, 'bs', {'user': 2}, 'wrong_user'),
+    (m.Grant, {}, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Grant, {}, 'user1', {}, ''),
+    (m.Grant, {}, 'user1', {'user': 2, 'cycle_id': -1}, ''),
+    (m.PilotRequest, {}, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.PilotRequest, {}, 'user1', {'user': 2}, ''),
+    (m.Data, DOWN | DELIVERED, 'user1', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Data, DOWN | DELIVERED, 'user1', {'user': 2}, ''),
+    (m.RhsCommand, {}, 'rhs_controller', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.Beam, {}, 'rhs_controller', {'cycle_id': -1}, 'wrong_cycle'),
+    (m.Beam, {}, 'rhs_controller', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.Beam, {}, 'rhs_controller', {'user': 2}, 'wrong_user'),
+    (m.RhsConfiguration, {}, 'channel', {'cycle_id': -1}, ''),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'channel', {'cycle_id': 1}, ''),
+    (m.Pilot, {}, 'channel', {'cycle_id': -1}, 'stale'),
+    (m.Pilot, {}, 'channel', {'user': 2}, 'wrong_user'),
+    (m.Beam, {}, 'channel', {'cycle_id': -1}, ''),
+    (m.Beam, {}, 'channel', {'user': 2}, ''),
+    (m.Data, DOWN | OFFERED, 'channel', {'cycle_id': -1}, 'stale'),
+    (m.Data, UP | OFFERED, 'channel', {'user': 2}, 'wrong_user'),
+    (m.ReceivedSignals, {}, 'positioner', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.PositionEstimate, {}, 'transmission', {'codebook_id': 'x'}, 'wrong_codebook'),
+    (m.RhsConfiguration, {'mode': TRANSMISSION}, 'transmission', {'cycle_id': -1},
+     'wrong_cycle'),
+]
+# Copies that are valid by themselves are sent after the original only.
+WRONG_CASES = [(*case, before) for case in WRONG for before in (False, True)
+               if not before or case[3] and case[4] != 'late_ack']
+WRONG_IDS = ['-'.join([kind.__name__, *map(str, fields.values()), recipient,
+                       *(f'{k}={v}' for k, v in changes.items()),
+                       'before' if before else 'after'])
+             for kind, fields, recipient, changes, _, before in WRONG_CASES]
+
+
+@pytest.mark.parametrize(
+    ('kind', 'fields', 'recipient', 'changes', 'counter', 'before'), WRONG_CASES, ids=WRONG_IDS)
+def test_altered_messages_are_dropped_and_counted(
+        network, places, kind, fields, recipient, changes, counter, before):
+    """The cycle continues as if the altered copy had not arrived."""
+    net = network(
+        transport=Adds(kind, fields, recipient, replace(**changes), before), seed=5)
+    plain = network(seed=5)
+    for other in (net, plain):
+        other.run_cycles(2)
+    assert net.transport.done
+    assert net.outcomes() == plain.outcomes() == [(1, 1, 'served'), (2, 1, 'served')]
+    net.run(limit_s=0.05)
+    assert net.counters() == ({recipient: {counter: 1}} if counter else {})
+    net.verify()
+    for kind, field in ((m.ReceivedSignals, 'signals'), (m.PositionEstimate, 'position'),
+                        (m.Beam, 'analog'), (m.Capacity, 'actual_bps'), (m.Data, 'bits')):
+        for a, b in zip(net.sent(kind), plain.sent(kind), strict=True):
+            np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    for kind in (m.Grant, m.RhsCommand, m.RhsConfiguration, m.Pilot, m.FeedSignals, m.Data):
+        assert len(net.sent(kind)) == len(plain.sent(kind))
+
+
+def test_a_duplicate_beacon_is_answered_once(network):
+    net = network(transport=Adds(m.Beacon, {}, 'user1', replace()))
+    net.run_cycles(2)
+    assert net.served() == [1, 1]
+    assert net.counters() == {'user1': {'stale_beacon': 1}}
+    net.verify()
+
+
+@pytest.mark.parametrize(('late_s', 'counter'), [(2.5e-3, 'duplicate'), (0.05, 'stale_command')])
+def test_a_duplicate_command_is_answered_again_unless_it_is_stale(network, late_s, counter):
+    def doubles(message, recipient):
+        again = recipient == 'rhs_controller' and matches(message, m.RhsCommand, {'band': 1})
+        return [(1e-3, message), *([(late_s, message)] if again else [])]
+
+    net = network(transport=doubles)
+    net.run_cycles(2)
+    net.run(limit_s=0.06)
+    assert net.served()[:2] == [1, 1]
+    assert net['rhs_controller'].counters.keys() == {counter}
+    net.verify()
+
+
+@pytest.mark.parametrize('late_s', [0.03, 0.11])
+def test_a_late_duplicate_grant_changes_no_position(network, scenario, late_s):
+    """The user has finished the cycle, and the channel has begun the next one."""
+    def doubles(message, recipient):
+        again = [(late_s, message)] if isinstance(message, m.Grant) else []
+        return [(1e-3, message), *again]
+
+    walk = mobility.RandomWalk(scenario, 50.0, np.random.default_rng(0))
+    net = network({1: walk}, transport=doubles, ordered=False)
+    net.run_cycles(4)
+    assert net.served() == [1] * 4
+    assert [truth.cycle_id for truth in net.sent(m.GroundTruth)] == [1, 2, 3, 4]
+    assert set(net['user1'].counters) <= {'late_grant', 'wrong_cycle'}
+    assert net['user1'].counters
+    net.verify()
+
+
+def test_an_unknown_codebook_is_logged_once_by_the_rhs_controller(network, example):
+    net = network()
+    net.run_cycles(1)
+    for _ in range(3):
+        net.publish(example(m.RhsCommand, cycle_id=2, codebook_id='strange'))
+    net.run_cycles(1)
+    complaints = [text for text in net.logged('rhs_controller') if 'strange' in text]
+    assert len(complaints) == 1
+    assert net['rhs_controller'].counters == {'wrong_codebook': 3}
+
+
+@pytest.mark.parametrize('kind', [m.Pilot, m.Beam, m.RhsConfiguration], ids=lambda k: k.__name__)
+def test_messages_of_incomplete_cycles_do_not_accumulate(network, example, kind):
+    net = network()
+    net.run_cycles(1)
+    for n in range(300):
+        net.publish(example(kind, cycle_id=1000 + n))
+    net.run_cycles(3)
+    assert net.served() == [1] * 4
+    assert net['channel'].counters['overflow'] >= 300 - 256
