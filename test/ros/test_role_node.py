@@ -105,8 +105,8 @@ def test_many_malformed_messages_do_not_fill_the_log(bench, start, probe, capfd)
 
 
 def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capfd):
-    bad, good = m.FeedSignals(cycle_id=1, user=1, band=0, frame=0, signals=NAN),
-        feed_signals(user=2)
+    bad = m.FeedSignals(cycle_id=1, user=1, band=0, frame=0, signals=NAN)
+    good = feed_signals(user=2)
     role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)],
                     sends=[m.FeedSignals])
     node = start(each_bench, role)
