@@ -139,7 +139,7 @@ def test_a_model_for_another_codebook_keeps_the_old_estimator(running, model):
     assert 'trained for codebook' in running.diagnostics['positioner']['failed.estimator']
     assert set(running.next_estimators().values()) == {'bayes'}
     assert running.get('positioner', 'estimator') == 'bayes'
-    assert running.process.log.count('estimator neural not used, bayes stays') == 1
+    assert running.process.log.count('estimator neural not used, keeping bayes') == 1
     # Set separately, the model comes first.
     assert running.set('positioner', model_file=model('first')).successful
     assert running.set('positioner', estimator='neural').successful

@@ -157,7 +157,7 @@ def test_the_error_names_a_missing_folder(tmp_path):
 def test_the_error_names_the_missing_library(tmp_path, monkeypatch):
     for name in ('mcap.writer', 'mcap.reader'):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(RecordingError, match=r'^recording needs mcap.*pip install mcap'):
+    with pytest.raises(RecordingError, match=r'^recording needs mcap.*rhs_isac_ros\[recording\]'):
         Recorder(tmp_path / 'run.mcap', Scenario())
     with pytest.raises(RecordingError, match='^reading a recording needs mcap'):
         list(read(tmp_path / 'run.mcap'))
