@@ -13,6 +13,7 @@ from rhs_isac_ros.model.optional import optional_import
 
 # Timeout for the scheduler of a cluster, and for its first worker.
 _TIMEOUT_S = 30
+_THREAD_TIMEOUT_S = 5
 
 
 def outcomes_here(
@@ -33,7 +34,7 @@ def outcomes_here(
     with optional_import('running jobs', extra='experiments'):
         import joblib
 
-    outcomes = None
+    outcomes, threads_before = None, set(threading.enumerate())
     try:
         with _interrupts_ignored(), joblib.parallel_config(
                 backend='loky', inner_max_num_threads=1):
@@ -51,6 +52,10 @@ def outcomes_here(
                 # Joblib warns about lost jobs; here they are abandoned deliberately.
                 warnings.simplefilter('ignore', UserWarning)
                 outcomes.close()
+            # A thread of the pool that the end of the interpreter stops may be releasing a
+            # semaphore, which the resource tracker of joblib then reports as leaked.
+            for thread in set(threading.enumerate()) - threads_before:
+                thread.join(_THREAD_TIMEOUT_S)
 
 
 def outcomes_on_cluster(
