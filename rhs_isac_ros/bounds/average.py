@@ -37,8 +37,8 @@ class Gradient(NamedTuple):
 class Average:
     """Mean loss of items, each of which depends on a codebook through a quadratic form.
 
-    The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where D_i has one column for each of
-    the item's G = `n_rows` rows. With derivatives as rows it is the Fisher information; with
+    The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where the G = `n_rows` columns of D_i
+    are the means of the item's rows. With derivatives as rows it is the Fisher information; with
     differences, it is twice the squared distance of two mean signals. `tolerance` is the
     relative error of the rows, see `CompressedRows`; 0 selects exact ones.
 

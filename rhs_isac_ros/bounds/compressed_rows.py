@@ -55,7 +55,7 @@ class CompressedRows:
 
 
 class _CompressedEvaluation:
-    """Evaluation with coefficients."""
+    """One evaluation of `CompressedRows`, in the basis of each band."""
 
     def __init__(self, coefficients: Sequence[np.ndarray], bases: Sequence[np.ndarray],
                  n_rows: int, model: MeasurementModel) -> None:

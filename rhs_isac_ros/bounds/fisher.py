@@ -13,7 +13,7 @@ _MIN_PIVOT = 1e-14
 
 
 def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
-    """Implements Eq. (11). Cramer-Rao lower bound of the squared positioning error.
+    """Implements Eq. (11). Cramer-Rao lower bound on the mean squared positioning error.
 
     Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite where
     the signals do not determine the position.
@@ -93,8 +93,9 @@ def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.
 def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     """Compute 2 Re(D^H Lambda^-1 D) of one band, float64 [N, G, G].
 
-    This is the band's share of Eq. (12) [1/m^2] if D is the derivative of the mean [1/m]; G is 3.
-    Takes L^-1 D with L L^H = Lambda and a row for each column of D, complex128 [N, G, N_SB F].
+    If D is the derivative of the mean [1/m], with G = 3, this is the term of one band in Eq. (12)
+    [1/m^2]. `whitened` is the transpose of L^-1 D, complex128 [N, G, N_SB F], where
+    L L^H = Lambda.
     """
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(float)

@@ -2,8 +2,8 @@
 
 A row is a linear function of one band's line-of-sight gains, such as their derivative with respect
 to one coordinate, or their difference between two positions. Its mean is the same function of the
-mean signals, by the kernel of Eq. (13). All objectives are made of whitened means, and most of
-their time is spent here.
+mean signals; `mean_derivative`, Eq. (13), computes it. The objectives are functions of whitened
+means, whose computation takes most of their time.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ from rhs_isac_ros.model.measurement import mean_derivative
 # Callable that takes (block of n items, band) and returns the items' rows, complex128
 # [n, G, N_SB, N_E].
 RowSource = Callable[[slice, int], np.ndarray]
-# Items per block, such that the arrays of a block fit the cache.
+# Items per block: the arrays of a block fit into the cache.
 _BLOCK = 128
 # Memory for exact rows that are kept between evaluations.
 _CACHE_BYTES = 1 << 30
@@ -26,7 +26,7 @@ _CACHE_BYTES = 1 << 30
 class GradientSums(NamedTuple):
     """Sums over all items from which the gradients of one band are computed.
 
-    With zeta = Lambda^-1 times the means, and w = Lambda^-1 times the weighted means:
+    Here, zeta is Lambda^-1 times the means, and w is Lambda^-1 times the weighted means.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class MeasurementRows(Protocol):
 
 
 class ExactRows:
-    """Rows without approximation, kept between evaluations if they fit the memory limit."""
+    """Rows without approximation, kept between evaluations if they fit within the memory limit."""
 
     def __init__(
             self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int) -> None:
@@ -84,7 +84,7 @@ class ExactRows:
         """Begin an evaluation with the radiation and whitening matrices of a model."""
         return _ExactEvaluation(self, model)
 
-    def of(self, block: slice, band: int) -> np.ndarray:
+    def rows(self, block: slice, band: int) -> np.ndarray:
         """Return the rows of a block, complex128 [n, G, N_SB, N_E], sub-bands first in memory."""
         key = block.start, band
         if key not in self._kept:
@@ -98,7 +98,7 @@ class ExactRows:
 
 
 class _ExactEvaluation:
-    """Evaluation with exact rows."""
+    """One evaluation of `ExactRows`; keeps the whitened means of the last block."""
 
     def __init__(self, rows: ExactRows, model: MeasurementModel) -> None:
         self._rows, self._radiation, self._whitener = rows, model.radiation, model.whitener
@@ -107,7 +107,7 @@ class _ExactEvaluation:
         self._last: list[np.ndarray] = [np.empty(0)] * len(self._radiation)
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
-        means = mean_derivative(self._rows.of(block, band), self._radiation[band])
+        means = mean_derivative(self._rows.rows(block, band), self._radiation[band])
         self._last[band] = means @ self._whitener[band].T
         return self._last[band]
 
@@ -117,7 +117,7 @@ class _ExactEvaluation:
         zeta = self._last[band].reshape(-1, n_measurements) @ np.conj(whitener)
         weights = weighted.reshape(-1, n_measurements) @ np.conj(whitener)
         self._covariance_term[band] += weights.T @ np.conj(zeta)
-        rows = self._rows.of(block, band)
+        rows = self._rows.rows(block, band)
         n, n_rows, n_subbands, n_elements = rows.shape
         stacked = np.moveaxis(rows, 2, 0).reshape(n_subbands, n * n_rows, n_elements)
         weights = np.conj(weights).reshape(n * n_rows, n_subbands, -1).transpose(1, 2, 0)
@@ -128,6 +128,6 @@ class _ExactEvaluation:
 
 
 def blocks(n_items: int) -> Iterator[slice]:
-    """Split the items, in order, into blocks that fit the cache."""
+    """Split the items, in order, into blocks that fit into the cache."""
     for start in range(0, n_items, _BLOCK):
         yield slice(start, min(start + _BLOCK, n_items))

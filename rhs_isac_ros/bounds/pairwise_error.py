@@ -17,7 +17,7 @@ class PairwiseErrorCost(Average):
 
     Parameters
     ----------
-    firsts, seconds
+    first_positions, second_positions
         The two positions of each pair, float64 [N, 3] [m].
     weights
         Weights of the pairs, float64 [N]; 1 by default.
@@ -32,27 +32,29 @@ class PairwiseErrorCost(Average):
     """
 
     def __init__(
-            self, scenario: Scenario, firsts: np.ndarray, seconds: np.ndarray,
+            self, scenario: Scenario, first_positions: np.ndarray, second_positions: np.ndarray,
             weights: np.ndarray | None = None, tolerance: float = 0.0) -> None:
-        firsts, seconds = checked_positions(firsts), checked_positions(seconds)
-        if not len(firsts) or firsts.shape != seconds.shape:
+        first_positions = checked_positions(first_positions)
+        second_positions = checked_positions(second_positions)
+        n = len(first_positions)
+        if n == 0 or len(second_positions) != n:
             raise ValueError(
-                f'seconds: {len(seconds)} positions, expected as many as firsts, {len(firsts)}, '
-                'and at least one')
-        weights = np.ones(len(firsts)) if weights is None else np.asarray(weights, dtype=float)
-        if weights.shape != (len(firsts),) or not (weights >= 0).all():
+                f'second_positions: {len(second_positions)} positions, expected as many as '
+                f'first_positions, {n}, and at least one')
+        weights = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
+        if weights.shape != (n,) or not (weights >= 0).all():
             raise ValueError(
-                f'weights: shape {weights.shape}, expected {(len(firsts),)}, none negative or NaN')
-        self._costs = weights * np.sum((firsts - seconds)**2, axis=1)
+                f'weights: shape {weights.shape}, expected {(n,)}, none negative or NaN')
+        self._costs = weights * np.sum((first_positions - second_positions)**2, axis=1)
         super().__init__(
             scenario,
             lambda block, band: (
-                los_gain(scenario, firsts[block], band)
-                - los_gain(scenario, seconds[block], band))[:, None],
-            len(firsts), 1, self._confusion, tolerance)
+                los_gain(scenario, first_positions[block], band)
+                - los_gain(scenario, second_positions[block], band))[:, None],
+            n, 1, self._confusion, tolerance)
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cost times Q(sqrt(q / 2)) [n], and its negative derivative by the form 2 q [n, 1, 1]."""
+        """Cost times Q(sqrt(q / 2)) [n], and minus its derivative d/d(2 q), [n, 1, 1]."""
         from scipy.special import ndtr
 
         root = np.sqrt(forms[:, 0, 0])

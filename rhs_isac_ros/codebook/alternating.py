@@ -5,15 +5,15 @@ import numpy as np
 from rhs_isac_ros.codebook.interior_point import minimize_interior_point
 from rhs_isac_ros.codebook.search import Search
 
-# N_itr of Table I. With the default number of steps, each sub-problem has N_us = 50 of them.
+# N_itr of Table I. With the default number of steps, each sub-problem takes N_us = 50 steps.
 _ITERATIONS = 4
 
 
 def minimize_alternating(search: Search) -> str:
-    """Implements Algorithm 1. Solve sP1 and sP2 alternately until neither changes its variables.
+    """Implements Algorithm 1. Solve sP1 and sP2 alternately until neither changes a variable.
 
-    The 2 N_itr sub-problems share the steps of the search evenly. Returns the reason for
-    stopping.
+    The steps of the search are divided evenly among the 2 N_itr sub-problems. Returns the reason
+    for stopping.
     """
     steps = max(search.max_steps // (2 * _ITERATIONS), 1)
     remaining = search.max_steps

@@ -84,7 +84,7 @@ class Codebook:
 
     @functools.cached_property
     def id(self) -> str:
-        """Hash of the content: 16 hex digits after ``cb``, so that YAML never parses a number."""
+        """Hash of the content: ``cb`` and 16 hex digits, which YAML never parses as a number."""
         digest = hashlib.sha256(repr(self.shape).encode())
         digest.update(self.analog.astype('<f8').tobytes())
         digest.update(self.digital.astype('<c16').tobytes())
@@ -134,7 +134,7 @@ class Codebook:
                 f'codebook.shape: {shape!r}, expected [N_B, N_SB, F, K, N_E], all positive')
         n_bands, n_subbands, n_frames, n_feeds, n_elements = shape
         digital_shape = (n_bands, n_subbands, n_frames, n_feeds)
-        # Compares the sizes before memory is allocated for a shape that may be absurdly large.
+        # `_array` compares the sizes before memory is allocated for a shape that may be too large.
         real = _array(parameters, 'digital_re', digital_shape)
         imag = _array(parameters, 'digital_im', digital_shape)
         digital = np.empty(digital_shape, complex)
@@ -152,9 +152,9 @@ class Codebook:
         return codebook
 
     def save(self, path: str | Path) -> None:
-        """Write the codebook as a ROS 2 parameter file, replacing an old one atomically.
+        """Write the codebook as a ROS 2 parameter file, replacing an existing one atomically.
 
-        Raise OSError if the file cannot be written; an old one is then kept.
+        Raise OSError if the file cannot be written; an existing file is then kept.
         """
         values = {name.partition('.')[2]: value for name, value in self.to_parameters().items()}
         content = {PARAMETER_NODE: {'ros__parameters': {'codebook': values}}}

@@ -18,7 +18,7 @@ from rhs_isac_ros.codebook.optimize import (
     OptimizeResult,
     optimize,
 )
-from rhs_isac_ros.codebook.plot import draw_optimisation
+from rhs_isac_ros.codebook.plot import plot_optimization
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.codebook.start import STARTS
@@ -29,7 +29,7 @@ from rhs_isac_ros.model.optional import MissingLibraryError
 __all__ = ['ERRORS', 'HELD_OUT_POSITIONS', 'INTERRUPTED', 'add_options', 'run']
 # Positions for the average bound of the result, drawn independently of the samples.
 HELD_OUT_POSITIONS = 2000
-# Errors that the user can correct; their messages say how.
+# Errors that the user can correct; their messages state the expected values.
 ERRORS = (ScenarioError, CodebookError, MissingLibraryError, ValueError, OSError)
 
 
@@ -37,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of an optimisation to a parser."""
     add = parser.add_argument
     add('--output', type=Path, default=Path('codebook.yaml'),
-        help='file to write; an old one is replaced at the end')
+        help='file to write; an existing file is replaced at the end')
     add('--scenario', type=Path,
         help="YAML file of the scenario; the paper's Table I if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
@@ -47,13 +47,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
     add('--positions', type=int, default=DEFAULT_POSITIONS, help='number of samples')
-    add('--steps', type=int, help="limit of update steps; the method's own if omitted")
-    add('--evaluations', type=int, help='limit of evaluations; none if omitted')
+    add('--steps', type=int,
+        help='maximum number of update steps; the default of the method if omitted')
+    add('--evaluations', type=int,
+        help='maximum number of evaluations; unlimited if omitted')
     add('--seed', type=int, default=0, help='seed of the samples, the start and the method')
     add('--start', help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
     add('--resume', action='store_true',
         help='continue from OUTPUT.part, which an unfinished run leaves, or from OUTPUT')
-    add('--plot', type=Path, help='picture to draw, with convergence, bound and beam patterns')
+    add('--plot', type=Path,
+        help='file for a plot of convergence, bound and beam patterns')
     add('--quiet', action='store_true', help='show no progress')
 
 
@@ -72,7 +75,8 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     Raises
     ------
     ScenarioError, CodebookError, MissingLibraryError, ValueError, OSError
-        If an option or a file is invalid, or a library is missing; an old output file is kept.
+        If an option or a file is invalid, or a library is missing; an existing output file is
+        kept.
     """
     output, partial = options.output, options.output.with_name(options.output.name + '.part')
     for path in filter(None, (output, options.plot)):
@@ -97,7 +101,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     print(f'{output}: average CRLB {average:.5f} m^2 (standard error {error:.5f}) over '
           f'{HELD_OUT_POSITIONS} held-out positions; {result.reason}')
     if options.plot:
-        draw_optimisation(scenario, codebook, result.history, options.plot)
+        plot_optimization(scenario, codebook, result.history, options.plot)
     return codebook, result.reason
 
 

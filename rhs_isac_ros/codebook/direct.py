@@ -1,4 +1,4 @@
-"""A benchmark of the paper: the interior point method on all variables at once."""
+"""A benchmark from the paper: the interior-point method on all variables at once."""
 
 import numpy as np
 

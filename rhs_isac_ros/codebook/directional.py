@@ -1,4 +1,4 @@
-"""A benchmark of the paper: focused beams that scan the region of interest."""
+"""A benchmark from the paper: focused beams that scan the region of interest."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
 
 def directional_codebook(
         scenario: Scenario, rng: np.random.Generator | None = None) -> Codebook:
-    """Focus each of the N_B F frames on a point of its own: the paper's `Directional`.
+    """Focus each of the N_B F frames on a different point: the paper's `Directional`.
 
     The focal points are spread across the width of the region of interest. Consecutive points
     belong to different bands, so that each band scans the whole width. Frames alternate between

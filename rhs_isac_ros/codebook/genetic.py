@@ -1,4 +1,4 @@
-"""A benchmark of the paper: a genetic algorithm."""
+"""A benchmark from the paper: a genetic algorithm."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def minimize_genetic(search: Search) -> str:
     [-1, 1]. The first generation contains the start. Returns the reason for stopping; raises
     MissingLibraryError if pymoo is not installed.
     """
-    with optional_import("method: 'genetic'", extra='genetic'):
+    with optional_import("method 'genetic'", extra='genetic'):
         from pymoo.algorithms.soo.nonconvex.ga import GA
         from pymoo.optimize import minimize
         from pymoo.problems.functional import FunctionalProblem

@@ -1,4 +1,4 @@
-"""The interior point method of the paper, on a subset of the variables."""
+"""The interior-point method of the paper, on a subset of the variables."""
 
 import warnings
 

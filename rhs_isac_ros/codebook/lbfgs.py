@@ -2,7 +2,8 @@
 
 from rhs_isac_ros.codebook.search import Search
 
-# Corrections that approximate the Hessian. An evaluation is expensive, so more of them pay off.
+# Number of corrections that approximate the Hessian. Evaluations are expensive, so more
+# corrections than SciPy's default of 10 pay off.
 _MEMORY = 30
 
 

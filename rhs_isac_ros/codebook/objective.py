@@ -6,13 +6,14 @@ import numpy as np
 
 from rhs_isac_ros.bounds import AverageCrlb, PairwiseErrorCost
 from rhs_isac_ros.bounds.average import Average
-from rhs_isac_ros.codebook.sampling import confusable
+from rhs_isac_ros.codebook.sampling import draw_confusable
 from rhs_isac_ros.model import Scenario
 
 # Relative error of an objective's rows. The error of its value is then below 0.1 %, far less than
 # the sampling error, and the gradient is exact for that value.
 ROW_TOLERANCE = 3e-5
-# Confusable positions for each sampled one. Few, close pairs dominate the mean.
+# Confusable positions for each sampled position: many, because a few close pairs dominate the
+# mean.
 _PAIRS_PER_POSITION = 128
 
 
@@ -32,9 +33,10 @@ def ambiguity(
     The positions are float64 [N_sam, 3] [m]; `rng` draws those that they may be confused with.
     Raise ValueError if `positions` is empty or not a finite [N, 3] array.
     """
-    firsts = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
+    first_positions = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
+    second_positions = draw_confusable(scenario, first_positions, rng)
     return PairwiseErrorCost(
-        scenario, firsts, confusable(scenario, firsts, rng), tolerance=ROW_TOLERANCE)
+        scenario, first_positions, second_positions, tolerance=ROW_TOLERANCE)
 
 
 OBJECTIVES: Mapping[str, Callable[[Scenario, np.ndarray, np.random.Generator], Average]] = {

@@ -28,10 +28,10 @@ INTERRUPTED = 'interrupted'
 
 
 class Method(NamedTuple):
-    """An optimisation method with its default limit of update steps.
+    """An optimisation method with its default limit on update steps.
 
-    `minimize` takes a `Search` and returns the reason for stopping; it is None if the start is
-    the result.
+    `minimize` takes a `Search` and returns the reason for stopping. `minimize` is None for a
+    method whose result is its start.
     """
 
     minimize: Callable[[Search], str] | None
@@ -50,7 +50,7 @@ METHODS: Mapping[str, Method] = {
 
 @dataclasses.dataclass(frozen=True)
 class OptimizeResult:
-    """Outcome of an optimisation.
+    """Result of an optimisation.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ def optimize(
         One of `METHODS`.
     objective
         One of `OBJECTIVES`: ``crlb``, the average bound, or ``ambiguity``, which penalises
-        confusion between distant positions, which a local bound ignores.
+        confusion between distant positions. A local bound ignores this confusion.
     sampling
         One of `SAMPLINGS`: ``sobol``, or ``monte_carlo`` as in the paper.
     n_positions
@@ -99,9 +99,9 @@ def optimize(
         Result of an earlier call with the same arguments, to continue from; its steps and
         evaluations count towards the limits.
     max_steps
-        Limit of update steps; by default that of the method.
+        Maximum number of update steps; by default that of the method.
     max_evaluations
-        Limit of evaluations of the objective; by default none.
+        Maximum number of evaluations of the objective; by default unlimited.
     progress
         Called after each step.
     keep
@@ -147,7 +147,7 @@ def optimize(
     def result(reason: str) -> OptimizeResult:
         best = problem.unpack(search.best)
         bound = float(crlb(scenario, best, positions).mean())
-        text = provenance.of_result(search.history[-1], reason)
+        text = provenance.to_yaml(search.history[-1], reason)
         return OptimizeResult(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
             tuple(search.history), reason)
@@ -180,7 +180,7 @@ def _run(search: Search, minimize: Callable[[Search], str] | None) -> str:
 
 
 class _PeriodicCall:
-    """Progress callback that also calls `keep`, but at most once a period."""
+    """Progress callback that also calls `keep`, but at most once per period."""
 
     _PERIOD_S = 10.0
 

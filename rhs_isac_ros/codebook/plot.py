@@ -1,4 +1,4 @@
-"""A picture of an optimisation and of the resulting codebook."""
+"""A plot of an optimisation and of the resulting codebook."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,10 +19,10 @@ _N_MAP_POINTS = 60
 _N_AZIMUTHS = 361
 
 
-def draw_optimisation(
+def plot_optimization(
         scenario: Scenario, codebook: Codebook, history: Sequence[Progress],
         path: str | Path) -> None:
-    """Draw convergence, the bound over the region of interest, and the beam patterns.
+    """Plot convergence, the bound over the region of interest, and the beam patterns.
 
     The suffix of `path` determines the file format.
 
@@ -35,7 +35,7 @@ def draw_optimisation(
     OSError
         If the file cannot be written.
     """
-    with optional_import('plot', extra='plot'):
+    with optional_import('plotting', extra='plot'):
         from matplotlib.figure import Figure
 
     rows = -(-scenario.n_bands // 3)

@@ -36,7 +36,7 @@ class Problem:
             [codebook.analog.ravel(), digital.real.ravel(), digital.imag.ravel()])
 
     def unpack(self, variables: np.ndarray) -> Codebook:
-        """Return the codebook of such variables; it satisfies both constraints."""
+        """Return the codebook of variables from `pack`; it satisfies both constraints."""
         analog, raw, norm = self._split(variables)
         return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
 
@@ -55,7 +55,7 @@ class Problem:
             [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
 
     def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return configurations, unscaled combining vectors, and the norm of each frame's."""
+        """Return configurations, unscaled combining vectors, and their norm in each frame."""
         analog = np.clip(variables[:self.n_analog], 0.0, 1.0).reshape(self._analog_shape)
         real, imag = np.split(variables[self.n_analog:], 2)
         raw = (real + 1j * imag).reshape(self._digital_shape)

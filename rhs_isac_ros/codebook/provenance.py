@@ -42,7 +42,7 @@ class Provenance:
     value_m2: float = float('nan')
     reason: str = ''
 
-    def of_result(self, end: Progress, reason: str) -> str:
+    def to_yaml(self, end: Progress, reason: str) -> str:
         """Return one line of YAML that describes a result, for `Codebook.provenance`."""
         result = dataclasses.replace(
             self, steps=end.step, evaluations=end.evaluations, value_m2=float(end.value_m2),
@@ -68,7 +68,7 @@ class Provenance:
 
     @classmethod
     def parse(cls, text: str) -> 'Provenance | None':
-        """Parse the text that `of_result` returns; return None for any other text."""
+        """Parse the text that `to_yaml` returns; return None for any other text."""
         try:
             return cls(**yaml.safe_load(text))
         except (yaml.YAMLError, TypeError, ValueError, RecursionError):

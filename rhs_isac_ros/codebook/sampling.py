@@ -40,9 +40,9 @@ SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarra
     'monte_carlo': monte_carlo, 'sobol': sobol}
 
 
-def confusable(
+def draw_confusable(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """For each position in the region of interest, draw another one whose signals look similar.
+    """Draw for each position another one in the region of interest that has similar signals.
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
     wavelengths in every band, so range lags are drawn with a density proportional to

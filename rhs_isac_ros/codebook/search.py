@@ -32,7 +32,7 @@ class Progress:
 
 
 class BudgetSpent(Exception):
-    """No evaluation is left; methods let it propagate."""
+    """No evaluation is left; methods let this exception propagate."""
 
 
 class Search:
@@ -43,9 +43,9 @@ class Search:
     start
         First point, float64 [n].
     max_steps
-        Limit of update steps; each method defines what a step is.
+        Maximum number of update steps; each method defines what a step is.
     max_evaluations
-        Limit of evaluations; None for no limit.
+        Maximum number of evaluations; None if unlimited.
     progress
         Called after each step.
     done
@@ -113,7 +113,7 @@ class Search:
         return self._last[1:]
 
     def on_step(self) -> None:
-        """Record a step; methods call this after each of theirs."""
+        """Record a step; methods call this after each of their steps."""
         elapsed = time.perf_counter() - self._begin
         step = self._first_step + len(self.history)
         entry = Progress(step, self._evaluations, self.value_m2, elapsed)

@@ -1,4 +1,4 @@
-"""The codebooks that come with the package, in a clone as in an installation."""
+"""The codebooks that come with the package, both in a clone and in an installation."""
 
 from pathlib import Path
 
@@ -13,8 +13,8 @@ def default_codebook_file() -> Path:
     CodebookError
         If the package was installed without its data files.
     """
-    # Every installation scheme puts share/ beside a folder that contains the modules: the prefix
-    # of pip and colcon, or pip's --target. A clone has config/ beside the package.
+    # Every installation scheme puts share/ into a folder above the modules: the prefix of pip and
+    # colcon, or the folder of pip's --target. A clone has config/ beside the package.
     package = Path(__file__).resolve().parents[1]
     folders = [package.parent / 'config',
                *(folder / 'share' / 'rhs_isac_ros' / 'config' for folder in package.parents)]

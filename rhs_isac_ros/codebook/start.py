@@ -10,7 +10,7 @@ from rhs_isac_ros.model import Scenario
 
 
 def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
-    """Draw random configurations: the paper's `Random`, and where its optimisation starts.
+    """Draw random configurations: the paper's `Random`, and the start of its optimisation.
 
     C is uniform in [0, 1]; every entry of S is sqrt(P_max / (K N_SB)).
     """

@@ -37,7 +37,7 @@ def parse_options(
         prog=f'scripts/reproduce {name}', description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     count = parser.add_mutually_exclusive_group()
-    count.add_argument('--quick', action='store_true', help=f'{quick_trials} trials only')
+    count.add_argument('--quick', action='store_true', help=f'run only {quick_trials} trials')
     count.add_argument('--trials', type=positive_int, metavar='N',
                        help=f'number of trials (default: {trials})')
     if add:
@@ -46,8 +46,8 @@ def parse_options(
                         help='number of parallel jobs (default: one per core)')
     parser.add_argument('--dask', metavar='ADDRESS',
                         help='scheduler of a Dask cluster to use instead of this machine; '
-                             'its workers need this package, and a single thread each for '
-                             'accurate times')
+                             'its workers need this package, and one thread each for '
+                             'accurate timing')
     parser.add_argument('--output', type=Path, default=Path('results', name), metavar='DIR',
                         help='folder of the results (default: %(default)s); jobs that have '
                              'results there are not repeated')
@@ -64,10 +64,11 @@ def run_command(experiment: Callable[[], None]) -> int:
     try:
         experiment()
     except KeyboardInterrupt:
-        print('interrupted: finished jobs are kept, the same command resumes', file=sys.stderr)
+        print('interrupted: finished jobs are kept; repeat the command to resume',
+              file=sys.stderr)
         return _INTERRUPTED
     except (JobError, MissingLibraryError, OSError) as error:
-        print(f'error: {error}\nfinished jobs are kept, the same command resumes',
+        print(f'error: {error}\nfinished jobs are kept; repeat the command to resume',
               file=sys.stderr)
         return 1
     return 0

@@ -26,8 +26,8 @@ class Job:
     arguments: Mapping[str, Any]
 
 
-class Outcome(NamedTuple):
-    """Result of a job as JSON, or its error as text; the other is empty.
+class JobResult(NamedTuple):
+    """Result of a job as JSON in `text`, or the text of its error in `error`; the other is empty.
 
     `version` is that of this package in the process that ran the job.
     """
@@ -38,15 +38,15 @@ class Outcome(NamedTuple):
     version: str = __version__
 
 
-def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> Outcome:
+def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
     """Run a job in the current process.
 
     The function takes the job's arguments and returns a mapping that JSON can serialise.
     Exceptions are returned as text, because not all of them can be pickled.
     """
     try:
-        return Outcome(job, text=json.dumps(function(**job.arguments)))
+        return JobResult(job, text=json.dumps(function(**job.arguments)))
     except MissingLibraryError as error:
-        return Outcome(job, error=str(error))
+        return JobResult(job, error=str(error))
     except Exception:
-        return Outcome(job, error=traceback.format_exc())
+        return JobResult(job, error=traceback.format_exc())

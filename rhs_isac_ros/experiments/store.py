@@ -11,7 +11,7 @@ from rhs_isac_ros.model.files import write_whole
 
 
 class ResultStore:
-    """Stores each result in a JSON file of a folder, which it creates, for later runs to reuse."""
+    """Folder with one JSON file per result, which later runs reuse; it is created if necessary."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -39,7 +39,7 @@ class ResultStore:
         return result
 
     def write(self, job: Job, result: Mapping[str, Any]) -> None:
-        """Store the result of a job, replacing an old one atomically, or raise OSError."""
+        """Store the result of a job, replacing an existing one atomically, or raise OSError."""
         record = {**_settings(job), 'result': result}
         write_whole(self.path(job), json.dumps(record, indent=1) + '\n')
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.experiments.jobs import Job, JobError, Outcome
+from rhs_isac_ros.experiments.jobs import Job, JobError, JobResult
 from rhs_isac_ros.experiments.store import ResultStore
-from rhs_isac_ros.experiments.workers import outcomes_here, outcomes_on_cluster
+from rhs_isac_ros.experiments.workers import run_locally, run_on_cluster
 from rhs_isac_ros.model.optional import optional_import
 
 
@@ -46,7 +46,7 @@ def run_jobs(
         If a library is not installed.
     """
     if len({job.name for job in jobs}) < len(jobs):
-        raise ValueError('jobs: two of the same name, expected each name once')
+        raise ValueError('jobs: two have the same name, expected unique names')
     with optional_import('showing progress', extra='experiments'):
         from tqdm import tqdm
 
@@ -56,22 +56,23 @@ def run_jobs(
     # None disables the bar if stderr is not a terminal.
     with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None) as bar:
         if pending:
-            outcomes = (outcomes_on_cluster(function, pending, dask) if dask
-                        else outcomes_here(function, pending, n_jobs))
-            with contextlib.closing(outcomes):
-                for outcome in outcomes:
-                    known[outcome.job.name] = result = _result(outcome)
-                    store.write(outcome.job, result)
+            job_results = (run_on_cluster(function, pending, dask) if dask
+                           else run_locally(function, pending, n_jobs))
+            with contextlib.closing(job_results):
+                for job_result in job_results:
+                    known[job_result.job.name] = result = _decoded(job_result)
+                    store.write(job_result.job, result)
                     bar.update()
     return [known[job.name] for job in jobs]
 
 
-def _result(outcome: Outcome) -> dict[str, Any]:
-    """Return the result of a job, or raise JobError if it failed or ran in another version."""
-    if outcome.error:
-        raise JobError(f'job {outcome.job.name} failed: {outcome.error.strip()}')
-    if outcome.version != __version__:
-        raise JobError(f'job {outcome.job.name}: its worker has rhs_isac_ros {outcome.version}, '
-                       f'expected {__version__} as here')
-    result: dict[str, Any] = json.loads(outcome.text)
+def _decoded(job_result: JobResult) -> dict[str, Any]:
+    """Decode the result of a job, or raise JobError if it failed or ran in another version."""
+    name = job_result.job.name
+    if job_result.error:
+        raise JobError(f'job {name} failed: {job_result.error.strip()}')
+    if job_result.version != __version__:
+        raise JobError(f'job {name}: the worker has rhs_isac_ros {job_result.version}, expected '
+                       f'{__version__}, the version of this machine')
+    result: dict[str, Any] = json.loads(job_result.text)
     return result

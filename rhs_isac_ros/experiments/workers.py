@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from typing import Any
 
-from rhs_isac_ros.experiments.jobs import Job, JobError, Outcome, attempt
+from rhs_isac_ros.experiments.jobs import Job, JobError, JobResult, attempt
 from rhs_isac_ros.model.optional import optional_import
 
 # Timeout for the scheduler of a cluster, and for its first worker.
@@ -16,12 +16,12 @@ _TIMEOUT_S = 30
 _THREAD_TIMEOUT_S = 5
 
 
-def outcomes_here(
+def run_locally(
         function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], n_jobs: int
-) -> Generator[Outcome, None, None]:
-    """Run jobs in single-threaded processes on this machine; yield each outcome when it is ready.
+) -> Generator[JobResult, None, None]:
+    """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
-    There are `n_jobs` processes; -1 stands for one per core, and 1 for none but this process.
+    There are `n_jobs` processes: -1 selects one per core; 1 runs all jobs in this process.
     Closing the generator ends them.
 
     Raises
@@ -34,34 +34,34 @@ def outcomes_here(
     with optional_import('running jobs', extra='experiments'):
         import joblib
 
-    outcomes, threads_before = None, set(threading.enumerate())
+    results, threads_before = None, set(threading.enumerate())
     try:
         with _interrupts_ignored(), joblib.parallel_config(
                 backend='loky', inner_max_num_threads=1):
-            outcomes = joblib.Parallel(
+            results = joblib.Parallel(
                 n_jobs=n_jobs, batch_size=1, return_as='generator_unordered')(
                     joblib.delayed(attempt)(function, job) for job in jobs)
         # `yield from` would close the generator outside the filter for warnings below.
-        while outcome := next(outcomes, None):
-            yield outcome
+        while result := next(results, None):
+            yield result
     except BrokenExecutor as error:
         raise JobError(f'a process died, possibly out of memory: {error}') from error
     finally:
-        if outcomes:
+        if results:
             with warnings.catch_warnings():
                 # Joblib warns about lost jobs; here they are abandoned deliberately.
                 warnings.simplefilter('ignore', UserWarning)
-                outcomes.close()
+                results.close()
             # A thread of the pool that the end of the interpreter stops may be releasing a
             # semaphore, which the resource tracker of joblib then reports as leaked.
             for thread in set(threading.enumerate()) - threads_before:
                 thread.join(_THREAD_TIMEOUT_S)
 
 
-def outcomes_on_cluster(
+def run_on_cluster(
         function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], address: str
-) -> Generator[Outcome, None, None]:
-    """Run jobs on a Dask cluster; yield each outcome when it is ready.
+) -> Generator[JobResult, None, None]:
+    """Run jobs on a Dask cluster; yield each result when it is ready.
 
     The address is that of the scheduler. Closing the generator cancels pending jobs. This uses
     `distributed` directly: through joblib, jobs for a cluster with a single thread run in this
@@ -91,7 +91,7 @@ def outcomes_on_cluster(
             try:
                 yield future.result()
             except Exception as error:  # the job killed its worker or could not be sent to one
-                yield Outcome(jobs_by_future[future], error=f'{type(error).__name__}: {error}')
+                yield JobResult(jobs_by_future[future], error=f'{type(error).__name__}: {error}')
 
 
 @contextlib.contextmanager
@@ -99,8 +99,8 @@ def _interrupts_ignored() -> Iterator[None]:
     """Ignore SIGINT inside the block, so that processes started there ignore it, too.
 
     A terminal sends SIGINT to the whole process group, but only this process may end the
-    workers. Ignored signals are inherited. Blocking the signal instead would not lose one that
-    arrives inside the block, but joblib unblocks it.
+    workers. Ignored signals are inherited. A blocked signal would be delivered after the block
+    instead of being lost, but joblib unblocks it.
     """
     # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
     if threading.current_thread() is not threading.main_thread():

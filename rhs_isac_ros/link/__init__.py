@@ -3,8 +3,14 @@
 from rhs_isac_ros.link.beam_pattern import BeamPattern, beam_pattern
 from rhs_isac_ros.link.capacity import Beam, capacity, expected_capacity
 from rhs_isac_ros.link.quartiles import RunningQuartiles
-from rhs_isac_ros.link.steering import Choice, Outcome, choose_beam, outcome, steer
+from rhs_isac_ros.link.steering import (
+    CapacityReport,
+    Choice,
+    capacity_report,
+    choose_beam,
+    steer,
+)
 
 __all__ = [
-    'Beam', 'BeamPattern', 'Choice', 'Outcome', 'RunningQuartiles', 'beam_pattern', 'capacity',
-    'choose_beam', 'expected_capacity', 'outcome', 'steer']
+    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'RunningQuartiles', 'beam_pattern',
+    'capacity', 'capacity_report', 'choose_beam', 'expected_capacity', 'steer']

@@ -29,7 +29,7 @@ class BandLink:
         V_i, which is real, float64 [N_E, N_E].
     modes
         The strongest modes of V_i, float64 [N_E, r]: G with G G^T close to V_i.
-    noise_w, power_w
+    noise_power_w, power_w
         Noise power of a sub-band, and power of the digital part over all sub-bands [W].
     """
 
@@ -37,7 +37,7 @@ class BandLink:
     los: np.ndarray
     spatial: np.ndarray
     modes: np.ndarray
-    noise_w: float
+    noise_power_w: float
     power_w: float
 
     @classmethod
@@ -57,18 +57,18 @@ class BandLink:
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
         """Return the best digital part for a configuration, complex128 [N_SB, K] [sqrt(W)].
 
-        It follows the principal directions of the K x K channels, with the power divided by
-        water-filling. The configuration is float64 [N_E].
+        It follows the principal eigenvectors of the correlation matrices of the channels at the
+        feeds, with the power divided by water-filling. The configuration is float64 [N_E].
         """
-        gains, directions = np.linalg.eigh(self._channels(analog))
-        power = water_filling(gains[:, -1] / self.noise_w, self.power_w)
+        gains, directions = np.linalg.eigh(self._correlations(analog))
+        power = water_filling(gains[:, -1] / self.noise_power_w, self.power_w)
         # s is a row: s M s^H is largest along the conjugate of the eigenvector.
         digital: np.ndarray = np.conj(directions[:, :, -1]) * np.sqrt(power)[:, None]
         return digital
 
     def best_rate(self, analog: np.ndarray) -> float:
         """Return the capacity with the best digital part [nat/symbol], summed over sub-bands."""
-        gains = np.linalg.eigvalsh(self._channels(analog))[:, -1] / self.noise_w
+        gains = np.linalg.eigvalsh(self._correlations(analog))[:, -1] / self.noise_power_w
         return float(np.log1p(gains * water_filling(gains, self.power_w)).sum())
 
     def scatter(self, weights: np.ndarray) -> np.ndarray:
@@ -78,13 +78,13 @@ class BandLink:
         result.real, result.imag = weights.real @ self.spatial, weights.imag @ self.spatial
         return result
 
-    def _channels(self, analog: np.ndarray) -> np.ndarray:
-        """K x K channels between feeds and user, complex128 [N_SB, K, K]."""
+    def _correlations(self, analog: np.ndarray) -> np.ndarray:
+        """Correlation matrices of the channels at the feeds, complex128 [N_SB, K, K]."""
         configured = self.onboard * analog
         direct = np.matmul(configured, self.los[:, :, None])
-        channels: np.ndarray = direct * np.conj(np.swapaxes(direct, 1, 2))
-        channels += np.matmul(self.scatter(configured), np.conj(np.swapaxes(configured, 1, 2)))
-        return channels
+        correlations: np.ndarray = direct * np.conj(np.swapaxes(direct, 1, 2))
+        correlations += np.matmul(self.scatter(configured), np.conj(np.swapaxes(configured, 1, 2)))
+        return correlations
 
 
 @functools.lru_cache(maxsize=16)

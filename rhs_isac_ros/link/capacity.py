@@ -27,7 +27,7 @@ class Beam:
     analog
         Configuration c-hat, float64 [N_E], each entry in [0, 1].
     digital
-        Combining vectors s-hat, complex128 [N_SB, K] [sqrt(W)].
+        Digital beamforming vectors s-hat, complex128 [N_SB, K] [sqrt(W)].
     band
         Index of the band, from 0.
     """
@@ -65,7 +65,7 @@ def expected_capacity(
     Raises
     ------
     ValueError
-        If mean or covariance have another shape or are not finite, or the beam does not fit the
+        If `mean` or `covariance` has a wrong shape or is not finite, or the beam does not fit the
         scenario.
     """
     points, weights = posterior_points(scenario, mean, covariance)
@@ -91,8 +91,8 @@ def posterior_points(
     the covariance, exact for polynomials up to the fifth degree in each axis. All weights are
     positive, so that an average of capacities lies between the smallest and the largest of them.
     An axis without variance has one node. Nodes closer to the surface than both the region of
-    interest and the mean are moved out to the closer of the two, because the tail of a Gaussian
-    behind the surface or among its elements would contribute capacities that cannot occur.
+    interest and the mean are moved out to the closer of the two. Otherwise, a tail of the
+    Gaussian at or behind the surface would contribute capacities that cannot occur.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def posterior_points(
     Raises
     ------
     ValueError
-        If mean or covariance have another shape or are not finite.
+        If `mean` or `covariance` has a wrong shape or is not finite.
     """
     for name, value, shape in (('mean', mean, (3,)), ('covariance', covariance, (3, 3))):
         if np.shape(value) != shape or not np.isfinite(value).all():

@@ -8,7 +8,7 @@ from rhs_isac_ros.link.band_link import BandLink
 
 _N_STARTS = 320
 # Number of starts that remain after each round.
-_SURVIVORS = (320, 320, 160, 80, 80, 80, 80, 80, 80)
+_N_KEPT = (320, 320, 160, 80, 80, 80, 80, 80, 80)
 # Lower limit of a norm, which avoids a division by zero.
 _MIN_NORM = 1e-300
 # Sub-bands whose phases drift apart by more than this over the surface are searched separately,
@@ -20,11 +20,11 @@ _MAX_SUBBANDS = 16
 def candidate_configurations(link: BandLink, max_count: int) -> np.ndarray:
     """Find configurations of high capacity.
 
-    By the holographic principle, a configuration passes those elements where a wave on the board,
-    s B, and a wave in the air, G w, are in phase. The waves in the air are the line of sight and
-    the modes of the multipath, the columns of G. Starting from fixed pairs of waves, spread over
-    all directions, the search improves waves and configuration in turn: the best pair for a
-    configuration belongs to the largest singular value of B diag(c) G.
+    By the holographic principle, a configuration enables those elements at which a wave on the
+    board, s B, and a wave in the air, G w, are in phase. The waves in the air are the line of
+    sight and the modes of the multipath, the columns of G. Starting from fixed pairs of waves,
+    spread over all directions, the search improves waves and configuration in turn: the best pair
+    for a configuration belongs to the largest singular value of B diag(c) G.
 
     Returns up to `max_count` different configurations, float64 [n, N_E], each entry 0 or 1, in
     descending order of the capacity over the sub-bands and modes that are searched.
@@ -40,7 +40,7 @@ def candidate_configurations(link: BandLink, max_count: int) -> np.ndarray:
     first_pair = np.arange(_N_STARTS), np.arange(_N_STARTS) % n_subbands
     pairs[first_pair] = on_board[:, :, None] * in_air[:, None, :]
     on_board = np.repeat(on_board[:, None], n_subbands, axis=1)
-    for n_left in _SURVIVORS:
+    for n_left in _N_KEPT:
         product = np.conj(pairs).reshape(len(pairs), -1).view(float)
         analog = (product @ path_matrix.T > 0).astype(float)
         configured = (analog @ path_matrix).view(complex).reshape(pairs.shape)
@@ -72,22 +72,23 @@ def _improve_pairs(
 
 
 def _paths(link: BandLink) -> np.ndarray:
-    """Gain over noise from each feed by each element to each wave, complex128 [J, K, L, N_E].
+    """Gain over noise from each feed via each element to each wave, complex128 [J, K, L, N_E].
 
-    The power is divided evenly. One sub-band represents those that hardly differ.
+    The power is divided evenly among the sub-bands. One sub-band represents all that hardly
+    differ.
     """
     n_subbands = len(link.los)
     subbands = _representative_subbands(link)
     in_air = np.concatenate([
         link.los[subbands][:, None], np.broadcast_to(
             link.modes.T, (len(subbands), *link.modes.T.shape))], axis=1)
-    scale = np.sqrt(link.power_w / n_subbands / link.noise_w)
+    scale = np.sqrt(link.power_w / n_subbands / link.noise_power_w)
     paths: np.ndarray = scale * link.onboard[subbands][:, :, None] * in_air[:, None]
     return paths
 
 
 def _representative_subbands(link: BandLink) -> np.ndarray:
-    """Indices of evenly spread sub-bands, enough that the phases drift little between them."""
+    """Indices of evenly spread sub-bands, so close that the phases drift little between them."""
     n_subbands = len(link.los)
     # Rotation of the last sub-band against the first, without the rotation common to all elements.
     rotation = link.onboard[-1] * link.los[-1] * np.conj(link.onboard[0] * link.los[0])

@@ -27,7 +27,7 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class CapacityReport:
     """Capacities of the beam in use and of the beam chosen with the true position [bit/s]."""
 
     actual_bps: float
@@ -47,10 +47,10 @@ class Outcome:
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
     """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
 
-    A search from many starts proposes configurations. The best few among these and the matched
-    filter are then improved together with the digital part, so that the beam is never worse than
-    the matched filter. It has the power P_max over all sub-bands. The same position always
-    gives the same beam. Bands are counted from 0.
+    A search from many starts proposes configurations. The best few of these configurations and
+    the matched filter are then improved together with the digital part. The beam is therefore
+    never worse than the matched filter. It has the power P_max over all sub-bands. The same
+    position always gives the same beam. Bands are counted from 0.
 
     Raises
     ------
@@ -70,11 +70,11 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
 def choose_beam(
         scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
         bands: Sequence[int] | None = None) -> Choice:
-    """Steer each band to the mean of a position and choose the highest expected capacity.
+    """Steer a beam of each band to the mean position and choose that of highest mean capacity.
 
     The capacity at the mean alone would mislead: a band with a stronger but narrower beam may
-    lose more to the positioning error than it gains without one. Of equal bands, the first is
-    chosen.
+    lose more capacity to the positioning error than its strength adds. If several are equal, the
+    first is chosen.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def choose_beam(
     Raises
     ------
     ValueError
-        If mean or covariance have another shape or are not finite, or a band is out of range.
+        If `mean` or `covariance` has a wrong shape or is not finite, or a band is out of range.
     """
     covariance = np.zeros((3, 3)) if covariance is None else covariance
     choices = []
@@ -98,9 +98,9 @@ def choose_beam(
     return max(choices, key=lambda choice: choice.expected_bps)
 
 
-def outcome(
+def capacity_report(
         scenario: Scenario, beam: Beam, position: np.ndarray,
-        bands: Sequence[int] | None = None) -> Outcome:
+        bands: Sequence[int] | None = None) -> CapacityReport:
     """Compare a beam with the one chosen with the true position, float64 [3] [m].
 
     The latter is chosen from `bands`, as in `choose_beam`. The search for a beam ends slightly
@@ -114,4 +114,4 @@ def outcome(
     """
     perfect = choose_beam(scenario, position, bands=bands)
     actual = capacity(scenario, beam, np.asarray(position, dtype=float)[None])[0]
-    return Outcome(float(actual), perfect.expected_bps)
+    return CapacityReport(float(actual), perfect.expected_bps)

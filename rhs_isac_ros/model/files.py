@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
-    """Write a temporary file and rename it, so that the file never exists in part.
+    """Write a file atomically: write a temporary file, then rename it to `path`.
 
     The content is complete, or a callable that writes it to a binary stream.
 

@@ -1,8 +1,8 @@
-"""Gain patterns: amplitude gain of an antenna by the angle from its boresight.
+"""Gain patterns: amplitude gain of an antenna as a function of the angle from its boresight.
 
 The boresight of the elements is the x axis, and the user's antenna points in the opposite
 direction. The line between them therefore has the same angle theta from both boresights:
-cos theta = x / d for a user at the height x above the surface and the distance d from the element.
+cos theta = x / d for a user at the distance x from the surface's plane and d from the element.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ _STEP_RAD = 1e-3
 
 
 class PatternError(ValueError):
-    """A gain pattern has a wrong shape, is not finite, negative, or not the expected one."""
+    """A gain pattern has a wrong shape or digest, or values that are negative or not finite."""
 
 
 class GainPattern:
@@ -37,8 +37,9 @@ class GainPattern:
         Callable that takes an array of angles from 0 to pi [rad] and returns the amplitude
         gains, from 0 to 1e6, in the same shape. It must be deterministic.
     slope
-        Its derivative [1/rad], of the same form. By default, differences of fourth order, which
-        are accurate to ten digits where the pattern is smooth over some degrees.
+        Derivative of `amplitude` [1/rad], a callable of the same form. The default, fourth-order
+        finite differences, is accurate to ten digits where the pattern is smooth over a few
+        degrees.
     name
         Name of the plug-in; empty for other functions.
 
@@ -64,7 +65,7 @@ class GainPattern:
             raise PatternError(f'gain {gains[first]:g} at {_ANGLES[first]:.3f} rad, expected 0 to '
                                f'{_MAX_GAIN:g} at all angles from 0 to pi')
         if not gains[_ANGLES < np.pi / 2].any():
-            raise PatternError('gain 0 everywhere in front, expected some')
+            raise PatternError('gain 0 at all angles below pi/2, expected a positive gain')
         content = gains if slope is None else np.concatenate([gains, self.slope(_ANGLES)])
         # Machines may round the last digit of a sine differently, hence single precision.
         self.digest = hashlib.sha256(content.astype('<f4').tobytes()).hexdigest()[:16]
@@ -95,14 +96,15 @@ class GainPattern:
         Raises
         ------
         PatternError
-            If the digest differs, the name is empty, or the plug-in is no gain pattern.
+            If the digest differs, the name is empty, or the plug-in is not a gain pattern.
         PluginError
             If there is no such plug-in, or it cannot be loaded.
         """
         name, _, digest = text.partition('@')
         if not name:
-            raise PatternError(f'{text!r}: a function that is no plug-in, expected a number or '
-                               f'the name of a plug-in of {plugins.GAIN_PATTERNS}')
+            raise PatternError(
+                f'{text!r}: a function that is not a plug-in, expected a number or the name of a '
+                f'plug-in of {plugins.GAIN_PATTERNS}')
         source = plugins.load(plugins.GAIN_PATTERNS, name)
         origin = plugins.describe(plugins.GAIN_PATTERNS, name)
         try:
@@ -133,7 +135,7 @@ class GainPattern:
 
 
 def amplitude_of(gain: float | GainPattern, angles: np.ndarray) -> float | np.ndarray:
-    """Return a constant gain itself, or the gains of a pattern at angles [rad] in their shape."""
+    """Return a constant gain unchanged, or a pattern's gains at angles [rad], in their shape."""
     return gain.amplitude(angles) if isinstance(gain, GainPattern) else gain
 
 

@@ -13,7 +13,7 @@ def mean_wavelength_m(scenario: Scenario) -> float:
 
 
 def element_interval_m(scenario: Scenario) -> float:
-    """Return the interval Delta_E [m] between neighbouring elements."""
+    """Return the spacing Delta_E [m] of neighbouring elements."""
     return scenario.element_interval_wavelengths * mean_wavelength_m(scenario)
 
 
@@ -24,8 +24,8 @@ def element_positions(scenario: Scenario) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        Float64 [N_E, 3] [m], read-only; element row * side + column, columns along y, rows
-        along z.
+        Float64 [N_E, 3] [m], read-only. The index of an element is row * side + column; a row
+        runs along y, a column along z.
     """
     side = scenario.elements_per_side
     line = (np.arange(side) - (side - 1) / 2) * element_interval_m(scenario)

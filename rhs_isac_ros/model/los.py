@@ -1,7 +1,7 @@
 """Line-of-sight gains of the elements and their derivatives with respect to the user's position.
 
 Positions are those of the user, float64 [N, 3] [m]; `band` is an index from 0. Functions that take
-positions raise ValueError if their shape is another one or a value is not finite.
+positions raise ValueError if the shape is wrong or a value is not finite.
 """
 
 import numpy as np
@@ -25,8 +25,8 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
 def los_derivative(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
     """Compute the derivative of the line-of-sight gains, complex128 [N, 3, N_SB, N_E] [1/m].
 
-    The H-dot of Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d, plus, with a
-    gain pattern, the change of the gain with the angle from the boresight.
+    This is H-dot in Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d. A gain
+    pattern adds a term for the change of the gain with the angle from the boresight.
     """
     return los_and_derivative(scenario, positions, band)[1]
 
@@ -47,10 +47,11 @@ def los_derivative_terms(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Compute `los_gain` and the factors of its derivative.
 
-    The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. In a
-    weighted sum over the elements, p - p_m can be factored out. The boresight term b exists only
-    with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the angle theta from the
-    boresight, with dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
+    The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. A
+    weighted sum over the elements is therefore p times the sum of a, minus the sum of a p_m, plus
+    that of b e_x. The boresight term b exists only with a gain pattern, which adds
+    (dh/dtheta) (dtheta/dp) for the angle theta from the boresight, with
+    dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
 
     Returns h^LoS, complex128 [N, N_SB, N_E], and of the same shape the radial factor a [1/m^2]
     and the boresight term b [1/m], which is None without a gain pattern.
@@ -80,7 +81,7 @@ def checked_positions(positions: ArrayLike) -> np.ndarray:
     Raises
     ------
     ValueError
-        If the shape is another one or a value is not finite.
+        If the shape is wrong or a value is not finite.
     """
     array: np.ndarray = np.asarray(positions, dtype=float)
     if array.ndim != 2 or array.shape[1] != 3:
@@ -129,7 +130,8 @@ def _amplitude_slope(scenario: Scenario, offsets: np.ndarray) -> float | np.ndar
 def _gain(scenario: Scenario, distances: np.ndarray, band: int,
           amplitude: float | np.ndarray) -> np.ndarray:
     frequencies = subband_frequencies_hz(scenario)[band]
-    # Sub-bands are equally spaced: two exponentials and a running product replace N_SB of them.
+    # Sub-bands are equally spaced: two exponentials and a running product replace N_SB
+    # exponentials.
     phase_rate = -2j * np.pi / SPEED_OF_LIGHT_MPS * distances
     gain = np.empty((len(distances), scenario.n_subbands, distances.shape[1]), complex)
     gain[:, 0] = np.exp(phase_rate * frequencies[0])

@@ -71,7 +71,7 @@ class MeasurementModel:
     and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
 
     Positions are those of the user, float64 [N, 3] [m]. Methods that take them raise ValueError
-    if their shape is another one or a value is not finite. Measurements are sub-band-major.
+    if the shape is wrong or a value is not finite. Measurements are sub-band-major.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class MeasurementModel:
         return n_bands, n_measurements
 
     def covariance(self) -> np.ndarray:
-        """Compute Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W]; the result is not kept."""
+        """Compute Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W]; the result is not cached."""
         return signal_covariance(self.scenario, self.radiation)
 
     @functools.cached_property
@@ -125,7 +125,8 @@ class MeasurementModel:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
         positions = checked_positions(positions)
         mean = np.empty((len(positions), *self.shape), complex)
-        # Simulated signals of a seed keep their bytes only if this kernel and its blocks do.
+        # A change of this kernel or its block size would change the simulated signals of all
+        # seeds.
         for band, radiation in enumerate(self.radiation):
             for start in range(0, len(positions), _BLOCK):
                 block = slice(start, start + _BLOCK)
@@ -152,7 +153,7 @@ class MeasurementModel:
         return jacobian
 
     def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute `mean` and `jacobian` together, much faster and with other rounding."""
+        """Compute `mean` and `jacobian` together, much faster, but with different rounding."""
         positions = checked_positions(positions)
         mean = np.empty((len(positions), *self.shape), complex)
         jacobian = np.empty((len(positions), 3, *self.shape), complex)
@@ -168,7 +169,8 @@ class MeasurementModel:
         """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
 
         Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
-        draws the gain of every element, for the same distribution in a hundred times the time.
+        draws the gain of every element instead; the distribution is the same, but the call takes
+        a hundred times as long.
         """
         signals = self.mean(positions)
         white = complex_normal(signals.shape, rng)
@@ -187,7 +189,7 @@ class MeasurementModel:
 
     def _band_mean_and_jacobian(
             self, positions: np.ndarray, band: int) -> tuple[np.ndarray, np.ndarray]:
-        """Mean [N, N_SB F] and its derivative [3, N, N_SB F] with p - p_m factored out.
+        """Mean [N, N_SB F] and its derivative [3, N, N_SB F] from sums over the elements.
 
         Each sum over elements of a T_i (p - p_m) is p times the sum of a T_i, minus the sum of
         a T_i p_m: four sums of N_E terms that need no array of N_E by 3.

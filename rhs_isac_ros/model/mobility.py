@@ -31,14 +31,14 @@ class Static:
         self._position = _checked_position(position)
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s]."""
+        """Return the fixed position [3] [m] and velocity 0 [3] [m/s]."""
         return self._position.copy(), np.zeros(3)
 
 
 class Waypoints:
     """User that follows a closed polygon of waypoints, float64 [N, 3] [m], at constant speed.
 
-    The first call of `state` is at the first waypoint.
+    The first call of `state` returns the first waypoint.
     """
 
     def __init__(self, waypoints: ArrayLike, speed_mps: float) -> None:
@@ -50,7 +50,7 @@ class Waypoints:
         self._start_s: float | None = None
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s]."""
+        """Return position [3] [m] and velocity [3] [m/s] on the polygon."""
         if self._start_s is None:
             self._start_s = now_s
         perimeter = self._lengths.sum()
@@ -79,7 +79,10 @@ class RandomWalk:
         self._departure_s: float | None = None
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s]."""
+        """Return position [3] [m] and velocity [3] [m/s] on the current leg.
+
+        The next leg begins when the current one ends.
+        """
         if self._departure_s is None:
             self._departure_s = now_s
         if self._speed_mps == 0:
@@ -105,19 +108,20 @@ def make_plugin(
         start: Sequence[float] | None = None) -> Mobility:
     """Create the mobility of another package.
 
-    `name` is an entry point of the group `plugins.MOBILITIES`. Its object is called with the
-    other arguments, as `RandomWalk` is. It chooses the first position if `start` is None.
+    `name` is an entry point of the group `plugins.MOBILITIES`. The object of the entry point is
+    called with the other arguments, like `RandomWalk`. If `start` is None, the object chooses the
+    first position.
 
     Raises
     ------
     PluginError
-        If there is no such entry point, it cannot be loaded, fails, or returns no mobility.
+        If there is no such entry point, it cannot be loaded, fails, or does not return a mobility.
     """
     mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
     if not callable(getattr(mobility, 'state', None)):
         raise plugins.PluginError(
-            f'{plugins.describe(plugins.MOBILITIES, name)}: made {mobility!r}, expected a '
-            'mobility, with a method state')
+            f'{plugins.describe(plugins.MOBILITIES, name)}: returned {mobility!r}, expected '
+            'a mobility with a method state')
     return mobility
 
 

@@ -23,9 +23,9 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
 
     The power-angle profile is a product of two Laplacians of `angular_spread_deg`, normalised
     over the half space in front of the surface and scaled by the mean line-of-sight power in the
-    region of interest. It is even in azimuth and elevation, which makes the covariance real, and
-    it depends on the elements' lattice offsets only. A gain pattern of the elements weights the
-    profile. Returns V_i, complex128 [N_B, N_E, N_E], read-only.
+    region of interest. The profile is even in azimuth and elevation, so the covariance is real.
+    The covariance of two elements depends only on their lattice offset. A gain pattern of the
+    elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E], read-only.
     """
     side = scenario.elements_per_side
     azimuth, weights = _profile_quadrature(scenario)
@@ -74,7 +74,7 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
 
 def frequency_correlation(
         scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (3). Correlation rho_f of sub-bands, complex128; indices may broadcast."""
+    """Implements Eq. (3). Correlation rho_f of two sub-bands, complex128; indices broadcast."""
     frequencies = subband_frequencies_hz(scenario)[band]
     difference = frequencies[first] - frequencies[second]
     correlation: np.ndarray = 1 / (1 + 2j * np.pi * scenario.delay_spread_s * difference)
@@ -83,7 +83,7 @@ def frequency_correlation(
 
 def time_correlation(
         scenario: Scenario, band: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Implements Eq. (4). Correlation rho_t of frames, float64; indices may broadcast."""
+    """Implements Eq. (4). Correlation rho_t of two frames, float64; indices broadcast."""
     center_hz = scenario.center_frequencies_hz[band]
     doppler_hz = scenario.max_user_speed_mps * center_hz / SPEED_OF_LIGHT_MPS
     lag_s = (np.asarray(first) - np.asarray(second)) * scenario.frame_duration_s
@@ -153,7 +153,7 @@ def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
     angles = (nodes + 1) * np.pi / 4
     spread = np.deg2rad(scenario.angular_spread_deg)
-    # The cusp at zero is an end of the interval, and a narrow profile shortens the interval.
+    # The interval begins at the cusp, zero, and ends earlier for a narrow profile.
     reach = min(1.0, 30 * spread / (np.pi / 2))
     angles = angles * reach
     density = weights * np.exp(-np.sqrt(2) * angles / spread)

@@ -15,7 +15,7 @@ def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
     Parameters
     ----------
     purpose
-        What the library is needed for; the message begins with it.
+        Task that needs the library; the first words of the message.
     extra
         Extra of this package that installs the library, if there is one.
 

@@ -50,10 +50,11 @@ class Scenario:
     frame_duration_s: float = _field(4e-6, 1e-12, 1.0, 'Duration of a frame.', 's')
     elements_per_side: int = _field(10, 1, 128, 'Elements along one side of the square surface.')
     element_interval_wavelengths: float = _field(
-        0.3, 1e-3, 10.0, 'Interval of the elements, in mean wavelengths.')
+        0.3, 1e-3, 10.0, 'Spacing of the elements, in mean wavelengths.')
     n_feeds: int = _field(3, 1, 256, 'Feeds K of the surface.')
     feed_positions_m: tuple[tuple[float, float, float], ...] | None = _field(
-        None, -1e3, 1e3, 'Positions of the feeds; none: evenly on the centre line.', 'm')
+        None, -1e3, 1e3,
+        'Positions of the feeds; if null, they are evenly spaced on the centre line.', 'm')
     refractive_index: float = _field(2.1, 1.0, 100.0, 'Refractive index n_r of the board.')
     element_gain: float | GainPattern = _field(
         1.0, 1e-6, 1e6, 'Amplitude gain g^E of an element.')
@@ -64,8 +65,8 @@ class Scenario:
     angular_spread_deg: float = _field(
         10.0, 1e-2, 1e3, 'Angular spread of the multipath, in azimuth and elevation.', 'deg')
     noise_psd_dbm_hz: float = _field(
-        -174.0, -400.0, 100.0, 'Spectral power density P_N of the noise.', 'dBm/Hz')
-    max_power_w: float = _field(1e-3, 1e-15, 1e6, 'Power P_max of the digital weights.', 'W')
+        -174.0, -400.0, 100.0, 'Power spectral density P_N of the noise.', 'dBm/Hz')
+    max_power_w: float = _field(1e-3, 1e-15, 1e6, 'Power P_max of the combining vectors.', 'W')
     roi_center_m: tuple[float, float, float] = _field(
         (10.0, 0.0, 0.0), -1e6, 1e6, 'Centre of the region of interest.', 'm')
     roi_size_m: tuple[float, float, float] = _field(
@@ -122,7 +123,8 @@ class Scenario:
     def changes(self) -> dict[str, Any]:
         """Return the fields that differ from Table I, as values that `from_yaml` can read.
 
-        Gain patterns have their digest. A pattern that is no plug-in cannot be read again.
+        Gain patterns are written as name and digest. A pattern that is not a plug-in cannot be
+        read back.
         """
         return {field.name: _plain(value) for field in dataclasses.fields(self)
                 if (value := getattr(self, field.name)) != field.default}

@@ -6,7 +6,7 @@ from rhs_isac_ros.model.scenario import Scenario
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Check that an array has the dimensions `symbols`: keys of `Scenario.sizes` with blanks.
+    """Check the shape of an array against `symbols`: keys of `Scenario.sizes`, blanks between.
 
     Raises
     ------

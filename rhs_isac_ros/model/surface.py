@@ -29,7 +29,10 @@ class Beamforming(Protocol):
 
 
 def element_signals(los: np.ndarray, multipath: np.ndarray, symbol: complex) -> np.ndarray:
-    """Implements Eq. (1). Signals tau of the elements for the gains of both paths, [..., N_E]."""
+    """Implements Eq. (1). Element signals tau for line-of-sight and multipath gains.
+
+    Returns complex128 [..., N_E] for gains of the same shape.
+    """
     signals: np.ndarray = (los + multipath) * symbol
     return signals
 
@@ -112,10 +115,10 @@ def onboard_matrix(scenario: Scenario) -> np.ndarray:
 
 
 def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
-    """Configure the elements by the holographic principle, float64 [N_E] from 0 to 1.
+    """Compute a configuration by the holographic principle, float64 [N_E], entries in [0, 1].
 
-    An element radiates strongly where the wave on the board and the path to the user agree in
-    phase. Without any line of sight, all entries are 0.5.
+    An element radiates strongly where the wave on the board and the path to the user are in
+    phase. If all gains are 0, all entries are 0.5.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Estimators of the user's position from the received signals.
 
 An estimator is an object with the interface of `Estimator`: a string ``name``, and a method
-``estimate`` that takes received signals and returns an `Estimate`. It is created by a call with
-scenario and codebook, `make_estimator`. There are two ways to add one:
+``estimate`` that takes received signals and returns an `Estimate`. `make_estimator` creates it
+from a scenario and a codebook. There are two ways to add one:
 
 * In another package, without changes here: name a class, or a function that returns an
   estimator, in an entry point of the group ``rhs_isac_ros.estimators`` (`plugins.ESTIMATORS`).
@@ -45,7 +45,7 @@ def make_estimator(
     name
         A key of `ESTIMATORS`, or an entry point of the group `plugins.ESTIMATORS`.
     **options
-        ``table_folder``, a folder that keeps tables, for `bayes` and `ml`; ``model_file``, a
+        ``table_folder``, a folder for tables, for `bayes` and `ml`; ``model_file``, a
         `Network` or its file, for `neural`. Plug-ins define their own options.
 
     Raises
@@ -69,13 +69,13 @@ def make_estimator(
     if not (callable(getattr(estimator, 'estimate', None))
             and isinstance(getattr(estimator, 'name', None), str)):
         raise plugins.PluginError(
-            f'{plugins.describe(plugins.ESTIMATORS, name)}: made {estimator!r}, expected an '
-            'estimator, with a method estimate and a string name')
+            f'{plugins.describe(plugins.ESTIMATORS, name)}: returned {estimator!r}, expected '
+            'an object with a method estimate and a string name')
     return estimator
 
 
 def file_options(name: str, table_folder: Path, model_file: str | Path) -> dict[str, Any]:
-    """Return the options of `make_estimator` that give an estimator its files.
+    """Return the options of `make_estimator` that specify the files of an estimator.
 
     The table folder is for `bayes` and `ml`; the model file is for `neural` and, unless empty,
     for plug-ins.

@@ -53,7 +53,8 @@ class BayesEstimator(SearchEstimator):
         mean = flat @ positions.reshape(-1, 3)
         offsets = (positions - mean).reshape(-1, 3)
         covariance = (flat[:, None] * offsets).T @ offsets
-        # The mean of few samples is itself uncertain, by less than the prior at most.
+        # The mean of few samples is itself uncertain; its covariance never exceeds that of the
+        # prior.
         position_factors = np.matmul(jacobians, factors)
         within = np.einsum(
             'm,mab,mcb->ac', weights.sum(axis=1), position_factors, position_factors)

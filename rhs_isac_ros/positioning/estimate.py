@@ -9,7 +9,8 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 
-# Far above any received power [sqrt(W)]; its square still fits single precision after whitening.
+# Far above any received amplitude [sqrt(W)]; after whitening, its square is still finite in single
+# precision.
 _MAX_MAGNITUDE = 1e3
 
 
@@ -19,7 +20,7 @@ class SignalError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Estimate:
-    """A position and its uncertainty, or the reason why there is none; or N of them.
+    """A position and its uncertainty, or the reason why there is no position; or N of these.
 
     Attributes
     ----------
@@ -51,7 +52,7 @@ class Estimator(Protocol):
         """Estimate positions from received signals; `SignalError` if they cannot be used.
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
-        sub-band-major; the estimate has a leading N if they have one.
+        sub-band-major; the estimate has a leading dimension N if the signals have one.
         """
         ...
 
@@ -67,12 +68,13 @@ def estimate_each(
         Complex128 [N_B, N_SB F] or [N, N_B, N_SB F]; the codebook determines the sizes.
     locate
         Callable that takes checked signals [N, N_B, N_SB F] and yields mean [3], covariance
-        [3, 3] and reason for each phase. With a reason, mean and covariance are ignored.
+        [3, 3] and reason for each phase. If the reason is not empty, mean and covariance are
+        ignored.
 
     Raises
     ------
     SignalError
-        If the shape is another one, or a value is not finite or exceeds 1000.
+        If the shape is wrong, a value is not finite, or a magnitude exceeds 1000.
     """
     batch = checked_received(scenario, codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)

@@ -1,9 +1,10 @@
 """Tests of whether the model can explain received signals at all.
 
-Whitened signals y at a position with whitened mean t differ from it by unit noise:
-``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per measurement. Signals
-beyond its quantiles of `FALSE_ALARM` come from no position of the region. Possible causes are a
-user elsewhere, another codebook, or a silent or defective receiver. Such signals give no fix.
+Whitened signals y from a position with the whitened mean t differ from t by noise of unit
+variance: ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
+measurement. Signals beyond its quantiles at the probability `FALSE_ALARM` do not fit any position
+of the region. Possible causes are a user elsewhere, another codebook, or a silent or defective
+receiver. Such signals give no position.
 """
 
 # Share of valid signals that each test may reject.
@@ -13,13 +14,14 @@ FALSE_ALARM = 1e-9
 class FitTest:
     """Tests of whitened signals; each returns a reason, which is empty if the signals pass.
 
-    An energy is the square norm of a whitened signal, and `n_measurements` is the number of
+    An energy is the squared norm of a whitened signal, and `n_measurements` is the number of
     complex measurements of a positioning phase, N_B N_SB F.
 
     Attributes
     ----------
     min_energy, max_residual
-        Smallest energy of signals, that of noise alone, and largest energy of a residual.
+        Lower limit of the energy of signals, from noise alone, and upper limit of the energy of a
+        residual.
     """
 
     def __init__(self, n_measurements: int) -> None:

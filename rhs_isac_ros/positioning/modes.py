@@ -11,8 +11,8 @@ from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable, separat
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 _MAX_MODES = 32
-# How far a mode may lie below the best log-likelihood: on the table, which is accurate to one
-# Gauss-Newton step, and after the first exact step.
+# Maximum difference between the best log-likelihood and that of a mode: on the table, which is
+# accurate to one Gauss-Newton step, and after the first exact step.
 _TABLE_MARGIN = 10.0
 _EXACT_MARGIN = 8.0
 # Modes closer than this in all of (r [m], u, v) have converged to the same maximum.
@@ -35,7 +35,7 @@ class Modes(NamedTuple):
     curvature
         Curvature of the log-likelihood in these coordinates, float64 [M, 3, 3].
     log_likelihood
-        Minus the square norm of the whitened residual, float64 [M].
+        Minus the squared norm of the whitened residual, float64 [M].
     roi_offset
         Offset to the region of interest, from `offset_to_roi`, float64 [M, 3].
     """

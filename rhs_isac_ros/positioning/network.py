@@ -22,7 +22,7 @@ class ModelError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Network:
-    """A trained network, with the purpose and the result of its training.
+    """A trained network, with the arguments and results of its training.
 
     The input x consists of the real and imaginary parts of the received signals, [D] =
     [2 N_B N_SB F], each scaled to zero mean and unit variance; the position is
@@ -39,12 +39,12 @@ class Network:
     center
         Centre of the region of interest, float64 [3] [m].
     covariance
-        Mean product of the residuals of the validation pairs, float64 [3, 3] [m^2].
+        Second-moment matrix of the residuals of the validation pairs, float64 [3, 3] [m^2].
     max_energy
-        Largest square norm of the whitened mean signal at a training position.
+        Largest squared norm of the whitened mean signal at a training position.
     about
-        ``codebook``, its id; ``scenario``, its changes from Table I; ``seed``, ``pairs``,
-        ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
+        ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
+        ``seed``, ``pairs``, ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
     """
 
     input_mean: np.ndarray
@@ -95,7 +95,7 @@ class Network:
         Raises
         ------
         ModelError
-            If the file cannot be read, is damaged, or contains no model.
+            If the file cannot be read, is damaged, or does not contain a model.
         """
         try:
             with open(path, 'rb') as stream:
@@ -110,7 +110,7 @@ class Network:
         names = cls._names_by_key()
         if not isinstance(about, dict) or about.pop('format', 0) != _FORMAT or (
                 arrays.keys() != names.keys()):
-            raise ModelError(f'{path}: no model, expected one of format {_FORMAT}')
+            raise ModelError(f'{path}: not a model, expected a model file of format {_FORMAT}')
         try:
             return cls(**{names[key]: array.astype(float) for key, array in arrays.items()},
                        about=about)

@@ -16,9 +16,10 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 class NeuralEstimator:
     """Positions by a trained network.
 
-    The covariance is the same for all positions: the mean product of the residuals of the
-    validation pairs. The network cannot test whether signals fit its position. Signals weaker
-    than noise or stronger than from any position give no fix; all others give a position.
+    The covariance is the same for all positions: the second-moment matrix of the residuals of the
+    validation pairs. The network cannot test whether signals fit its position. Signals that are
+    weaker than noise, or stronger than those from any position, give no position; all others give
+    one.
 
     Raises
     ------
@@ -42,7 +43,7 @@ class NeuralEstimator:
             self._network, source = model_file, 'model'
         else:
             self._network, source = Network.load(model_file), str(model_file)
-        check_purpose(self._network, scenario, codebook, source)
+        check_trained_for(self._network, scenario, codebook, source)
         self._test = FitTest(int(np.prod(self._model.shape)))
 
     def estimate(self, received: np.ndarray) -> Estimate:
@@ -60,7 +61,7 @@ class NeuralEstimator:
             yield position, self._network.covariance, reason
 
 
-def check_purpose(
+def check_trained_for(
         network: Network, scenario: Scenario, codebook: Codebook, source: str) -> None:
     """Raise `ModelError` unless a model was trained for a scenario and codebook.
 

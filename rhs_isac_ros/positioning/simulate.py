@@ -5,8 +5,8 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 
-# Pairs that share a random generator and every matrix product. A seed yields other pairs with
-# another size.
+# Pairs that share a random generator and every matrix product. A different size changes the pairs
+# of every seed.
 _CHUNK = 512
 
 
@@ -15,15 +15,16 @@ def simulate_pairs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate positioning phases at random positions of the region of interest.
 
-    A seed stands for one endless sequence of pairs. This returns a part of it, bit for bit the
-    same however the sequence is divided. Signals are drawn by `MeasurementModel.sample`.
+    A seed defines an infinite sequence of pairs. This function returns a part of it, which is
+    identical bit for bit however the sequence is divided. Signals are drawn by
+    `MeasurementModel.sample`.
 
     Parameters
     ----------
     n
         Number of pairs.
     seed
-        Number of the sequence.
+        Seed of the sequence.
     first
         Index of the first pair in the sequence.
 
@@ -52,7 +53,7 @@ def simulate_pairs(
         begin = chunk * _CHUNK
         part = slice(max(first - begin, 0), min(first + n - begin, _CHUNK))
         target = slice(begin + part.start - first, begin + part.stop - first)
-        # Always the whole chunk, because rounding in products depends on their sizes.
+        # Draw the whole chunk, because the rounding of matrix products depends on their sizes.
         rng = streams.generator(seed, streams.PHASES, chunk)
         drawn = scenario.sample_positions(_CHUNK, rng)
         positions[target] = drawn[part]

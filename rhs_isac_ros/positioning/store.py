@@ -15,7 +15,7 @@ from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import templates
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
-# Number of tables that a folder keeps; the oldest ones beyond it are deleted.
+# Maximum number of tables in a folder; the least recently used ones beyond it are deleted.
 _MAX_TABLES = 16
 _PREFIX = 'table-'
 # Version of the contents of a table; tables of another version are not used.
@@ -29,7 +29,7 @@ def default_folder() -> Path:
 
 
 def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str, np.ndarray]:
-    """Load the table of a model from a folder, or compute it and keep it there.
+    """Load the table of a model from a folder, or compute it and store it there.
 
     The result contains the arrays of `tabulate`; from a folder, they are read-only and mapped
     into memory. Without a folder, the table is in memory only.
@@ -50,7 +50,7 @@ def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str,
     try:
         _write(path, key, table)
     except OSError as error:
-        warnings.warn(f'the table is not kept: {error}', RuntimeWarning, stacklevel=2)
+        warnings.warn(f'the table cannot be stored: {error}', RuntimeWarning, stacklevel=2)
         return table
     return _read(path, key) or table
 

@@ -13,7 +13,7 @@ from rhs_isac_ros.positioning.polar import to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.templates import RANGE_CELL_M, carrier_wavenumbers
 
-# Fine range steps in the shortest wavelength; the posterior needs four or more.
+# Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
 STEPS_PER_WAVELENGTH = 8
 # Number of grid points, and of peaks along their range, that the search examines closely.
 _MAX_CELLS = 192
@@ -25,7 +25,8 @@ _MIN_SEPARATION = (0.3, 0.05, 0.05)
 # Error of a mode's log-likelihood due to the grid, as a share of the template's energy.
 _GRID_ERROR = 0.05
 # Curvature of the log-likelihood in (r, u, v) [1/m^2, 1, 1] to add everywhere. It keeps matrices
-# regular where the signals carry no information; any region of interest is more precise.
+# regular where the signals carry no information, and is weaker than the prior on any usual region
+# of interest.
 MIN_CURVATURE = (1e-3, 1e-1, 1e-1)
 # The linear model does not hold for longer steps.
 _STEP_LIMITS = np.array([0.02, 0.03, 0.03])
@@ -44,7 +45,7 @@ class TemplateTable:
     points
         Grid (r [m], u, v), float64 [G, 3].
     range_offsets_m
-        Fine range steps around that of a grid point, float64 [D] [m].
+        Offsets of the fine range steps from the range of a grid point, float64 [D] [m].
     normal
         Points that represent a standard Gaussian, float64 [128, 3].
     """
@@ -79,9 +80,10 @@ class TemplateTable:
     def modes(self, whitened: np.ndarray, max_modes: int, margin: float) -> np.ndarray:
         """Find the most likely separate modes, to the accuracy of one Gauss-Newton step.
 
-        The whitened signals are those of one positioning phase, complex128 [N_B, N_SB F]. A mode
-        may lie below the best log-likelihood by `margin`, in addition to grid errors. The result
-        is (r [m], u, v), float64 [M, 3], the most likely first, with 1 <= M <= max_modes.
+        The whitened signals are those of one positioning phase, complex128 [N_B, N_SB F]. The
+        log-likelihood of a mode may be lower than the best by up to `margin` plus the error of
+        the grid. The result is (r [m], u, v), float64 [M, 3], the most likely first, with
+        1 <= M <= max_modes.
         """
         cell, offset_m, value = self._peaks(self.log_likelihood(whitened))
         # One Gauss-Newton step from each peak: between grid points, a sharp mode is much higher.
@@ -141,7 +143,7 @@ class TemplateTable:
 
 
 def separate(points: np.ndarray, max_points: int) -> list[int]:
-    """Return indices of points that are separate from each other, the first of close ones.
+    """Return indices of points that are separate from each other; of close points, the first.
 
     Points, float64 [N, D], are separate if they are at least 1 apart in some coordinate.
     """

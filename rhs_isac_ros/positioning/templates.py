@@ -13,7 +13,7 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 RANGE_CELL_M = 0.5
 DIRECTION_STEP = 0.025
-# Number of points that represent a Gaussian truncated to the region of interest.
+# Number of points that represent a standard Gaussian.
 _N_NORMAL = 128
 # Number of grid points to compute at a time.
 _BLOCK = 256
@@ -31,10 +31,10 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
     dict of numpy.ndarray
         By name, for G grid points: ``points`` (r [m], u, v), float64 [G, 3]; ``filters``, the
         conjugate templates, complex64 [N_B, G, N_SB F]; ``slope_filters``, the conjugate
-        derivatives of the templates by the point, complex64 [G, 3, N_B N_SB F]; ``energy`` of the
-        templates, float32 [G]; ``energy_slope``, its derivative, float64 [G, 3]; ``curvature`` of
-        the log-likelihood, float64 [G, 3, 3]; and, independent of the codebook, ``normal``,
-        points that represent a standard Gaussian, float64 [128, 3].
+        derivatives of the templates with respect to the point, complex64 [G, 3, N_B N_SB F];
+        ``energy`` of the templates, float32 [G]; ``energy_slope``, its derivative, float64
+        [G, 3]; ``curvature`` of the log-likelihood, float64 [G, 3, 3]; and, independent of the
+        codebook, ``normal``, points that represent a standard Gaussian, float64 [128, 3].
     """
     points = polar_grid(model.scenario)
     n, (n_bands, n_rows) = len(points), model.shape

@@ -1,9 +1,10 @@
 """Training of the paper's network: 10^5 simulated pairs, split 7 : 1.5 : 1.5.
 
-The paper leaves the rest open. Chosen here are 512 rectified hidden units, the squared error in
-metres as the loss, and Adam with a learning rate of 10^-3. When the validation error has not
-decreased for some epochs, the batch size grows, which reduces the noise of the steps. Training
-stops after the largest batches, and the weights of the best epoch are used.
+The paper does not specify the rest. This implementation uses 512 hidden units with the ReLU
+activation, the squared position error as the loss, and Adam with a learning rate of 10^-3. When
+the validation error has not decreased for some epochs, the batch size grows, which reduces the
+noise of the steps. Training stops after the largest batches, and the weights of the best epoch
+are used.
 """
 
 import copy
@@ -69,7 +70,9 @@ def train(
     CodebookError
         If the codebook does not fit the scenario.
     ValueError
-        If a number is too small, or scikit-learn is not installed.
+        If a number is too small.
+    MissingLibraryError
+        If scikit-learn is not installed.
     """
     for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
                                  ('max_epochs', max_epochs, 1)):
@@ -99,7 +102,7 @@ def train(
 
     # A single thread: more threads change the rounding and do not speed up such small products.
     with limit_threads(1):
-        best_epoch, best_mse = _descend(
+        best_epoch, best_mse = _fit(
             regressor, inputs[training], targets[training], max_epochs, after_epoch)
     errors, test_errors = residuals(validation), residuals(test)
     (w_in, w_out), (b_in, b_out) = (
@@ -121,10 +124,10 @@ def _split(n_pairs: int) -> tuple[slice, slice, slice]:
     return slice(first), slice(first, second), slice(second, None)
 
 
-def _descend(
+def _fit(
         regressor: Any, inputs: np.ndarray, targets: np.ndarray, max_epochs: int,
         after_epoch: Callable[[int, float], float]) -> tuple[int, float]:
-    """Fit epoch after epoch and leave the best weights; return their epoch and error.
+    """Train up to `max_epochs` epochs, restore the best weights, return their epoch and error.
 
     `after_epoch` takes an epoch's number and the smallest error so far, and returns the epoch's
     error.

@@ -6,7 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.link import Beam, Outcome, RunningQuartiles, capacity, choose_beam, outcome
+from rhs_isac_ros.link import (
+    Beam,
+    CapacityReport,
+    RunningQuartiles,
+    capacity,
+    capacity_report,
+    choose_beam,
+)
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import outcomes
@@ -115,10 +122,10 @@ class Transmission(PlainRole):
             self.count(outcomes.Outcome.WRONG_BAND)
             return []
         truth = self._truths.get(applied.cycle_id)
-        result = Outcome(math.nan, math.nan)
+        result = CapacityReport(math.nan, math.nan)
         if truth and truth.user == beam.user:
             used = Beam(applied.analog[0], beam.digital, beam.band)
-            result = outcome(self._scenario, used, truth.position, steered.bands)
+            result = capacity_report(self._scenario, used, truth.position, steered.bands)
         report = m.Capacity(
             cycle_id=beam.cycle_id, user=beam.user, codebook_id=beam.codebook_id, band=beam.band,
             expected_bps=beam.expected_bps, actual_bps=result.actual_bps,

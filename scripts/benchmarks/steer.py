@@ -115,7 +115,7 @@ def negative_capacity(link: BandLink) -> Callable[[np.ndarray], tuple[float, np.
 
     def evaluate(analog: np.ndarray) -> tuple[float, np.ndarray]:
         digital = link.best_digital(analog)
-        feeding = np.matmul(digital[:, None, :], link.onboard)[:, 0] / np.sqrt(link.noise_w)
+        feeding = np.matmul(digital[:, None, :], link.onboard)[:, 0] / np.sqrt(link.noise_power_w)
         received = np.matmul((feeding * analog)[:, None, :], modes)[:, 0]
         snr = np.sum(np.abs(received)**2, axis=1)
         back = np.matmul(modes, np.conj(received)[:, :, None])[:, :, 0]

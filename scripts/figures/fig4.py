@@ -37,7 +37,7 @@ from rhs_isac_ros.experiments import (
     run_command,
     run_jobs,
 )
-from rhs_isac_ros.link import Outcome, capacity, choose_beam
+from rhs_isac_ros.link import CapacityReport, capacity, choose_beam
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import optional_import
@@ -93,8 +93,9 @@ def capacity_losses(first: int, estimates: Mapping[str, Mapping[str, Any]]) -> d
         for position, best_bps, mean, covariance in zip(
                 truth, perfect_bps, estimate['means'], estimate['covariances'], strict=True):
             beam = choose_beam(scenario, np.array(mean), np.array(covariance)).beam
-            outcome = Outcome(float(capacity(scenario, beam, position[None])[0]), best_bps)
-            losses[name].append([outcome.loss_bps, outcome.loss_percent])
+            report = CapacityReport(
+                float(capacity(scenario, beam, position[None])[0]), best_bps)
+            losses[name].append([report.loss_bps, report.loss_percent])
     return losses
 
 

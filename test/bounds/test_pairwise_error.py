@@ -237,11 +237,11 @@ def test_malformed_positions_are_errors(scenario, bad, tolerance):
             PairwiseErrorCost(scenario, np.array(first), np.array(second), tolerance=tolerance)
 
 
-@pytest.mark.parametrize(('n_firsts', 'n_seconds'), [(0, 0), (3, 2), (1, 3), (2, 0)])
-def test_positions_that_are_not_pairs_are_errors(scenario, n_firsts, n_seconds):
+@pytest.mark.parametrize(('n_first', 'n_second'), [(0, 0), (3, 2), (1, 3), (2, 0)])
+def test_positions_that_are_not_pairs_are_errors(scenario, n_first, n_second):
     with pytest.raises(
-            ValueError, match=f'^seconds: {n_seconds} positions, expected .* {n_firsts}, '):
-        PairwiseErrorCost(scenario, np.ones((n_firsts, 3)), np.ones((n_seconds, 3)))
+            ValueError, match=f'^second_positions: {n_second} positions, expected .* {n_first}, '):
+        PairwiseErrorCost(scenario, np.ones((n_first, 3)), np.ones((n_second, 3)))
 
 
 @pytest.mark.parametrize('tolerance', [1e-8, -1.0, np.nan])

@@ -8,7 +8,7 @@ from rhs_isac_ros.codebook.alternating import minimize_alternating
 
 
 class Phase:
-    """One call of the interior point method."""
+    """One call of the interior-point method."""
 
     def __init__(self, start, free, max_steps):
         self.start, self.free, self.max_steps = np.array(start), np.array(free), max_steps

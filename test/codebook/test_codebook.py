@@ -12,7 +12,7 @@ import yaml
 
 from rhs_isac_ros.bounds import PairwiseErrorCost, crlb
 from rhs_isac_ros.codebook import Codebook, CodebookError, Provenance, directional_codebook
-from rhs_isac_ros.codebook.sampling import confusable
+from rhs_isac_ros.codebook.sampling import draw_confusable
 from rhs_isac_ros.model import Scenario
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -297,7 +297,7 @@ def test_the_default_codebook_confuses_fewer_positions():
     scenario, rng = Scenario(), np.random.default_rng(77)
     firsts = scenario.sample_positions(4000, rng)
     held_out = PairwiseErrorCost(
-        scenario, firsts, confusable(scenario, firsts, rng), tolerance=1e-3)
+        scenario, firsts, draw_confusable(scenario, firsts, rng), tolerance=1e-3)
     values = {name: held_out.value(Codebook.load(CONFIG / name)) for name in SHIPPED}
     assert values['codebook.yaml'] < 0.8 * values['codebook_crlb.yaml']
     assert values['codebook.yaml'] < 0.6 * held_out.value(directional_codebook(scenario))

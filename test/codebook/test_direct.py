@@ -1,4 +1,4 @@
-"""The interior point method on all variables at once."""
+"""The interior-point method on all variables at once."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The interior point method, on functions with a known minimum."""
+"""The interior-point method, on functions with a known minimum."""
 
 import numpy as np
 import pytest

@@ -9,7 +9,7 @@ from rhs_isac_ros.bounds import PairwiseErrorCost, crlb
 from rhs_isac_ros.codebook import OBJECTIVES, objective, optimize, random_codebook
 from rhs_isac_ros.codebook.objective import ambiguity, average_bound
 from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.codebook.sampling import confusable
+from rhs_isac_ros.codebook.sampling import draw_confusable
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 
@@ -44,7 +44,7 @@ def test_ambiguity_is_the_pairwise_error_cost_of_the_plain_equations(
     codebook, positions = random_beams(scenario, rng), scenario.sample_positions(4, rng)
     value = ambiguity(scenario, positions, np.random.default_rng(seed)).value(codebook)
     firsts = np.array([position for position in positions for _ in range(5)])
-    seconds = confusable(scenario, firsts, np.random.default_rng(seed))
+    seconds = draw_confusable(scenario, firsts, np.random.default_rng(seed))
     p = plain(scenario, codebook.analog, codebook.digital)
     inverse = np.linalg.inv(p.covariance(0, multipath_covariance(scenario)[0]))
     total = 0.0
@@ -83,7 +83,7 @@ def test_optimising_the_ambiguity_lowers_it_on_held_out_pairs(scenario):
                       max_steps=30)
     rng = np.random.default_rng(99)
     firsts = scenario.sample_positions(1500, rng)
-    held_out = PairwiseErrorCost(scenario, firsts, confusable(scenario, firsts, rng))
+    held_out = PairwiseErrorCost(scenario, firsts, draw_confusable(scenario, firsts, rng))
     start = random_codebook(scenario, np.random.default_rng(1))
     bound = optimize(scenario, n_positions=128, seed=1, max_steps=30)
     found = held_out.value(result.codebook)

@@ -1,4 +1,4 @@
-"""The picture of an optimisation."""
+"""The plot of an optimisation."""
 
 import sys
 
@@ -7,7 +7,7 @@ import pytest
 
 from rhs_isac_ros.codebook import Progress, directional_codebook, plot
 from rhs_isac_ros.codebook.directional import focal_points
-from rhs_isac_ros.codebook.plot import beam_powers, draw_optimisation
+from rhs_isac_ros.codebook.plot import beam_powers, plot_optimization
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.optional import MissingLibraryError
 
@@ -24,21 +24,22 @@ def test_draws_any_number_of_bands(scenario, n_bands, tmp_path):
     pytest.importorskip('matplotlib')
     changed = Scenario(**scenario.changes() | {
         'center_frequencies_hz': [2.5e9 + 1e8 * i for i in range(n_bands)]})
-    draw_optimisation(changed, directional_codebook(changed), HISTORY, tmp_path / 'p.png')
+    plot_optimization(changed, directional_codebook(changed), HISTORY, tmp_path / 'p.png')
     assert (tmp_path / 'p.png').read_bytes().startswith(b'\x89PNG')
 
 
 def test_an_unknown_format_is_an_error(scenario, tmp_path):
     pytest.importorskip('matplotlib')
     with pytest.raises(ValueError, match='xyz'):
-        draw_optimisation(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.xyz')
+        plot_optimization(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.xyz')
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_matplotlib_the_error_names_the_extra(scenario, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
-    with pytest.raises(MissingLibraryError, match='^plot needs matplotlib, .*rhs_isac_ros.plot'):
-        draw_optimisation(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.png')
+    with pytest.raises(
+            MissingLibraryError, match='^plotting needs matplotlib, .*rhs_isac_ros.plot'):
+        plot_optimization(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.png')
 
 
 def test_beams_point_at_their_focal_points():

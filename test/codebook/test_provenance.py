@@ -16,7 +16,7 @@ END = Progress(step=5, evaluations=9, value_m2=0.1 + 0.2, elapsed_s=1.5)
 
 
 def text_of(provenance=PLAIN, end=END, reason='done', **changes):
-    return dataclasses.replace(provenance, **changes).of_result(end, reason)
+    return dataclasses.replace(provenance, **changes).to_yaml(end, reason)
 
 
 def test_the_text_is_one_line_of_yaml_with_all_fields():

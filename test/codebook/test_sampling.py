@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import SAMPLINGS
-from rhs_isac_ros.codebook.sampling import confusable, monte_carlo, sobol
+from rhs_isac_ros.codebook.sampling import draw_confusable, monte_carlo, sobol
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 
 LOPSIDED = Scenario(roi_center_m=(4, 1, -2), roi_size_m=(2, 6, 1))
@@ -75,7 +75,7 @@ def test_confusable_positions_differ_and_are_in_the_region(region, bands):
         scenario.sample_positions(300, np.random.default_rng(0)), scenario.roi_bounds_m])
     before = positions.copy()
     one, same, other = (
-        confusable(scenario, positions, np.random.default_rng(seed)) for seed in (1, 1, 2))
+        draw_confusable(scenario, positions, np.random.default_rng(seed)) for seed in (1, 1, 2))
     np.testing.assert_array_equal(positions, before)
     assert one.shape == positions.shape
     assert ((one >= low) & (one <= high)).all()
@@ -90,7 +90,7 @@ def lags_of(bands, n=20_000):
     """Return the range lags below 20 m of positions at the centre of a wide region."""
     scenario = dataclasses.replace(WIDE, center_frequencies_hz=BANDS[bands])
     positions = np.tile([50.0, 0, 0], (n, 1))
-    others = confusable(scenario, positions, np.random.default_rng(3))
+    others = draw_confusable(scenario, positions, np.random.default_rng(3))
     lags = np.linalg.norm(others, axis=1) - 50
     same = np.abs(lags) < 1e-9
     assert same.mean() == pytest.approx(0.3, abs=0.02)
@@ -140,7 +140,7 @@ def test_confusable_positions_lie_within_a_beam(side):
     """Smaller surfaces have wider beams; the elements are 0.3 wavelengths apart."""
     scenario = dataclasses.replace(WIDE, elements_per_side=side)
     positions = np.tile([50.0, 0, 0], (5000, 1))
-    others = confusable(scenario, positions, np.random.default_rng(3))
+    others = draw_confusable(scenario, positions, np.random.default_rng(3))
     angles = np.arctan2(np.linalg.norm(others[:, 1:], axis=1), others[:, 0])
     wavelengths = SPEED_OF_LIGHT_MPS / np.array([2.5e9, 3e9])
     width = wavelengths.min() / (side * 0.3 * wavelengths.mean())
@@ -155,7 +155,7 @@ def test_confusable_positions_lie_within_a_beam(side):
 def test_thin_regions_have_confusable_pairs(size):
     scenario = Scenario(roi_size_m=size)
     positions = scenario.sample_positions(200, np.random.default_rng(0))
-    others = confusable(scenario, positions, np.random.default_rng(1))
+    others = draw_confusable(scenario, positions, np.random.default_rng(1))
     low, high = scenario.roi_bounds_m
     assert ((others >= low) & (others <= high)).all()
     assert np.mean((others != positions).any(axis=1)) > 0.9

@@ -48,7 +48,8 @@ def test_invalid_options_exit_with_code_2(arguments, capsys):
     (None, 0, ''), (JobError('job a failed'), 1, 'error: job a failed'),
     (MissingLibraryError('needs joblib'), 1, 'error: needs joblib'),
     (OSError('disk'), 1, 'error: disk'),
-    (KeyboardInterrupt(), 130, 'interrupted: finished jobs are kept, the same command resumes')])
+    (KeyboardInterrupt(), 130,
+     'interrupted: finished jobs are kept; repeat the command to resume')])
 def test_exit_codes_and_messages(error, code, text, capsys):
     def experiment():
         if error:

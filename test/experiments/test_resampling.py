@@ -18,11 +18,11 @@ def test_the_reduction_is_that_of_the_statistics():
 
 def test_paired_samples_have_narrower_intervals():
     rng = np.random.default_rng(0)
-    theirs = rng.exponential(size=500)
-    ours = 0.6 * theirs
-    less, low, high = reduction(ours, theirs, mean)
+    baseline = rng.exponential(size=500)
+    samples = 0.6 * baseline
+    less, low, high = reduction(samples, baseline, mean)
     assert (less, low, high) == pytest.approx((40, 40, 40))
-    less, low, high = reduction(ours, theirs, mean, paired=False)
+    less, low, high = reduction(samples, baseline, mean, paired=False)
     assert less == pytest.approx(40)
     assert high - low > 5
 
@@ -31,17 +31,17 @@ def test_intervals_have_their_nominal_coverage():
     rng = np.random.default_rng(1)
     inside = 0
     for _ in range(100):
-        ours, theirs = rng.normal(3.0, 1.0, 60), rng.normal(4.0, 1.0, 60)
-        _, low, high = reduction(ours, theirs, mean)
+        samples, baseline = rng.normal(3.0, 1.0, 60), rng.normal(4.0, 1.0, 60)
+        _, low, high = reduction(samples, baseline, mean)
         inside += low <= 25 <= high
     assert 88 <= inside <= 99
 
 
-@pytest.mark.parametrize(('ours', 'theirs', 'paired'), [
+@pytest.mark.parametrize(('samples', 'baseline', 'paired'), [
     ([], [1.0], False), ([1.0], [], False), ([1.0], [1.0, 2.0], True)])
-def test_empty_or_mismatched_samples_are_errors(ours, theirs, paired):
-    with pytest.raises(ValueError, match='^ours, theirs: '):
-        reduction(ours, theirs, mean, paired)
+def test_empty_or_mismatched_samples_are_errors(samples, baseline, paired):
+    with pytest.raises(ValueError, match='^samples, baseline: '):
+        reduction(samples, baseline, mean, paired)
 
 
 def test_the_reduction_from_zero_is_nan():

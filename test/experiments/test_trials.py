@@ -103,7 +103,7 @@ def test_a_job_of_another_version_is_repeated(tmp_path, monkeypatch):
 
 def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(trials_module, '__version__', '9.9.9')
-    with pytest.raises(JobError, match=r'square-0: its worker has .*, expected 9\.9\.9'):
+    with pytest.raises(JobError, match=r'square-0: the worker has .*, expected 9\.9\.9'):
         run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
 
 
@@ -162,7 +162,7 @@ def test_ctrl_c_ends_all_processes_and_the_run_resumes(tmp_path):
         [sys.executable, '-c', INTERRUPTED, str(tmp_path)], capture_output=True, text=True,
         timeout=60, start_new_session=True, check=False)
     assert done.returncode == 130, done.stderr
-    assert done.stderr == 'interrupted: finished jobs are kept, the same command resumes\n'
+    assert done.stderr == 'interrupted: finished jobs are kept; repeat the command to resume\n'
     jobs = [Job(str(number), {'number': number}) for number in range(4)]
     results = run_jobs(lambda number: {'number': number}, jobs, tmp_path, n_jobs=1)
     assert [result['number'] for result in results] == [0, 1, 2, 3]
@@ -208,7 +208,7 @@ def test_a_dask_cluster_without_workers_is_an_error(tmp_path, monkeypatch):
 
 
 def test_duplicate_names_are_an_error(tmp_path):
-    with pytest.raises(ValueError, match='two of the same name'):
+    with pytest.raises(ValueError, match='two have the same name'):
         run_jobs(Worker(), [JOBS[0], JOBS[0]], tmp_path, n_jobs=1)
 
 

@@ -8,11 +8,11 @@ import pytest
 
 from rhs_isac_ros.link import (
     Beam,
-    Outcome,
+    CapacityReport,
     capacity,
+    capacity_report,
     choose_beam,
     expected_capacity,
-    outcome,
     steer,
 )
 from rhs_isac_ros.model import Scenario
@@ -227,7 +227,7 @@ def test_choosing_from_a_band_out_of_range_is_an_error(table1, bands):
 def test_capacities_of_the_outcome_match_the_reference(table1, reference_link, band):
     scenario, link = table1.scenario, reference_link(table1, band)
     used = steer(scenario, POSITION + [0.5, 0.6, 0.0], band)
-    found = outcome(scenario, used, POSITION, [band])
+    found = capacity_report(scenario, used, POSITION, [band])
     assert found.actual_bps == pytest.approx(link.capacity(used, POSITION), rel=1e-6)
     assert found.perfect_bps == pytest.approx(
         link.capacity(steer(scenario, POSITION, band), POSITION), rel=1e-6)
@@ -239,24 +239,24 @@ def test_a_beam_in_another_band_than_the_best_loses_capacity(table1):
     scenario = table1.scenario
     best = choose_beam(scenario, POSITION).beam.band
     other = steer(scenario, POSITION, 1 - best)
-    assert outcome(scenario, other, POSITION).loss_percent > 0.1
-    assert outcome(scenario, other, POSITION, [1 - best]).loss_bps == 0
+    assert capacity_report(scenario, other, POSITION).loss_percent > 0.1
+    assert capacity_report(scenario, other, POSITION, [1 - best]).loss_bps == 0
 
 
 def test_a_surface_that_is_off_loses_all_capacity(table1):
     scenario = table1.scenario
     beam = steer(scenario, POSITION)
     off = Beam(np.zeros_like(beam.analog), beam.digital, beam.band)
-    assert outcome(scenario, off, POSITION).loss_percent == 100
+    assert capacity_report(scenario, off, POSITION).loss_percent == 100
 
 
 def test_the_relative_loss_of_no_capacity_is_nan():
-    assert math.isnan(Outcome(0.0, 0.0).loss_percent)
-    assert math.isnan(Outcome(math.nan, math.nan).loss_percent)
+    assert math.isnan(CapacityReport(0.0, 0.0).loss_percent)
+    assert math.isnan(CapacityReport(math.nan, math.nan).loss_percent)
 
 
 @pytest.mark.parametrize('position', [(1.0, 2.0), (9.0, np.nan, 0.0)])
 def test_an_outcome_at_an_invalid_position_is_an_error(table1, position):
     beam = steer(table1.scenario, POSITION)
     with pytest.raises(ValueError, match='expected'):
-        outcome(table1.scenario, beam, np.array(position))
+        capacity_report(table1.scenario, beam, np.array(position))

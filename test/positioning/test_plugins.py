@@ -65,8 +65,8 @@ def test_the_error_for_an_unknown_name_lists_all_estimators(small):
 @pytest.mark.parametrize(('name', 'options', 'message'), [
     ('absent', {}, 'absent = guesses:Absent of guesses: cannot be loaded: AttributeError'),
     ('no_estimator', {},
-     'no_estimator = guesses:no_estimator of guesses: made None, expected an estimator'),
-    ('nameless', {}, r'nameless = guesses:Nameless of guesses: made <.*>, expected an estimator'),
+     'no_estimator = guesses:no_estimator of guesses: returned None, expected an object'),
+    ('nameless', {}, r'nameless = guesses:Nameless of guesses: returned <.*>, expected an object'),
     ('centre', {'table': 1}, 'centre = guesses:Centre of guesses: failed: TypeError: .*table'),
 ])
 def test_the_error_for_an_invalid_plug_in_names_its_entry_point(small, name, options, message):

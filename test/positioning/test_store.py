@@ -122,7 +122,7 @@ def test_estimates_with_a_table_from_disk_are_identical(tmp_path, scenario, mode
 
 def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, model):
     (tmp_path / 'file').write_text('')
-    with pytest.warns(RuntimeWarning, match='the table is not kept: .*file'):
+    with pytest.warns(RuntimeWarning, match='the table cannot be stored: .*file'):
         assert_same(store.load_table(model, tmp_path / 'file'), model)
 
 

@@ -10,7 +10,7 @@ from hypothesis import example as explicit
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rhs_isac_ros.link import Beam, Outcome
+from rhs_isac_ros.link import Beam, CapacityReport
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import transmission
@@ -110,7 +110,8 @@ def plain_beams():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(transmission, 'choose_beam', choose)
-        patch.setattr(transmission, 'outcome', lambda *_: Outcome(1e6, 1.1e6))
+        patch.setattr(
+            transmission, 'capacity_report', lambda *_: CapacityReport(1e6, 1.1e6))
         yield
 
 

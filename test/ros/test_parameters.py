@@ -301,7 +301,7 @@ def test_a_plug_in_moves_the_user(bench, install, position, place):
 @pytest.mark.parametrize(('name', 'words'), [
     ('fly', "mobility: 'fly', expected one of static, waypoints, random_walk or a plug-in of "
             'rhs_isac_ros.mobilities; installed: climb, nothing'),
-    ('nothing', 'mobility: entry point .*: nothing = moves:nothing of moves: made None'),
+    ('nothing', 'mobility: entry point .*: nothing = moves:nothing of moves: returned None'),
 ])
 def test_an_invalid_mobility_is_refused(bench, install, name, words):
     install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb', 'nothing': 'nothing'}})

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments import JobError, markdown_table
-from rhs_isac_ros.link import choose_beam, outcome
+from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
@@ -49,7 +49,8 @@ def compare(codebook_file: Path, cycles: int, output: Path) -> None:
     signals = simulate_received(scenario, codebook, truth, np.random.default_rng(SEED))
     simulated = estimator.estimate(signals)
     losses = np.array([
-        outcome(scenario, choose_beam(scenario, mean, covariance).beam, position).loss_bps
+        capacity_report(
+            scenario, choose_beam(scenario, mean, covariance).beam, position).loss_bps
         for position, mean, covariance in zip(
             truth, simulated.mean, simulated.covariance, strict=True)])
     samples = {
