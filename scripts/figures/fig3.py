@@ -145,7 +145,7 @@ class Summary:
             for rival in RIVALS:
                 other = self.of(name, rival, n)
                 holds &= bool(own.mean() < other.mean())
-                rivals.append(f'{other.mean():.4f} {unit} of {rival} (lower in '
+                rivals.append(f'{other.mean():.4f} {unit} of {rival} ({PROPOSED} is lower in '
                                f'{np.sum(own < other)} of {self.count} trials)')
             details.append(f'With N_B = {n}: {own.mean():.4f} {unit} against '
                              f'{" and ".join(rivals)}.')
