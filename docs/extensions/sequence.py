@@ -38,7 +38,7 @@ _STYLE = ('text{font:11px monospace;fill:#222}.role{font-weight:bold;font-size:1
 
 
 class _Centre:
-    """A fast estimator: the diagram does not show positions."""
+    """Estimator that returns the centre of the region; the diagram does not depend on positions."""
 
     name = 'centre'
 
