@@ -1,8 +1,8 @@
 """Cycle rate and waiting times with few users and with many.
 
-Problem: all users answer every beacon, but only one is served. By how much do the other users slow the cycles down? The
-network runs twice, with few users and with many, and is compared with the hops of a cycle in bare
-rclpy, measured in the same run.
+Problem: all users answer every beacon, but only one is served. By how much do the other users slow
+the cycles down? The network runs twice, with few users and with many, and is compared with the
+hops of a cycle in bare rclpy, measured in the same run.
 """
 
 import argparse

@@ -3,8 +3,9 @@
 Problem: a base station has N_B bands, centred at (2 + 0.5 i) GHz, and measures F frames in each,
 with N_B F = 8 frames in total. Which method finds the codebook with the lowest average CRLB over
 N_sam = 10 random positions? The paper's alternating algorithm, gradient descent on all variables
-at once, a genetic algorithm and the package's L-BFGS are compared, from the same start and with the
-same samples; each of the 30 trials draws new ones. The paper makes four claims about its algorithm:
+at once, a genetic algorithm and the package's L-BFGS are compared, from the same start and with
+the same samples; each of the 30 trials draws new ones. The paper makes four claims about its
+algorithm:
 
 (1) It reaches a lower CRLB than both benchmarks at each N_B.
 (2) It takes less time than both.

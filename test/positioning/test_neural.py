@@ -100,7 +100,7 @@ def test_training_stops_when_the_validation_error_does_not_fall(scenario, codebo
     assert network.about['epochs'] + 4 <= len(epochs) < 2000
 
 
-def test_a_single_phase_gives_the_same_as_in_a_batch(scenario, codebook, training):
+def test_a_single_phase_has_the_same_estimate_as_in_a_batch(scenario, codebook, training):
     received = simulate_pairs(scenario, codebook, 20, 9)[1]
     estimator = NeuralEstimator(scenario, codebook, training[0])
     batch, single = estimator.estimate(received), estimator.estimate(received[7])

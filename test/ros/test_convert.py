@@ -222,7 +222,7 @@ def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):
     assert back.id == shipped.id
 
 
-def test_a_codebook_without_a_bound_survives_a_round_trip(small):
+def test_a_round_trip_preserves_a_codebook_without_a_bound(small):
     assert math.isnan(small.codebook.average_crlb_m2)
     back = convert.codebook_from_ros(convert.codebook_to_ros(small.codebook, STAMP))
     assert math.isnan(back.average_crlb_m2)

@@ -1,4 +1,4 @@
-"""The observer of both kinds of trials: cycles, invariants and diagnostics of a running network."""
+"""The observer of both kinds of trials: cycles, invariants and diagnostics of a network."""
 
 import contextlib
 import time

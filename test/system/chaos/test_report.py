@@ -42,7 +42,7 @@ def test_trials_with_recovery_and_reports_pass():
     ({'others_running': False}, 'ENDED'), ({'logged': ()}, 'NOT REPORTED ONCE'),
     ({'diagnosed': ()}, 'NOT REPORTED ONCE'),
     ({'logged': ('bs: missing', 'bs: missing')}, 'NOT REPORTED ONCE')])
-def test_a_trial_fails_if_recovery_is_late_a_process_ends_or_the_report_is_not_single(
+def test_a_trial_fails_if_recovery_is_late_a_process_ends_or_the_report_is_missing_or_repeated(
         fields, mark):
     failed = crash_trial(**fields)
     assert not figures_of(crash_trial(), failed)['passed']

@@ -1,4 +1,4 @@
-"""Messages that are well-formed but absurd do not crash a node.
+"""Well-formed messages with extreme values do not crash a node.
 
 The executor raises the exceptions of callbacks in the test, so a node that would crash fails it.
 """
@@ -28,7 +28,7 @@ PLACE = np.array([10.0, 0.5, 0.2])
 HUGE = (1e100, 1e200, 1e308)
 
 
-class Stage:
+class NodeUnderTest:
     """A node under test and publishers for the messages that it receives."""
 
     def __init__(self, bench, files, kind, inputs, answers, **values):
@@ -77,7 +77,7 @@ class Stage:
 @pytest.fixture
 def stage(bench, small_files):
     def stage(*args, **values):
-        return Stage(bench, small_files, *args, **values)
+        return NodeUnderTest(bench, small_files, *args, **values)
     return stage
 
 
@@ -116,14 +116,14 @@ def send_plausible_pilot(stage):
 
 
 @pytest.mark.parametrize('rows', [1, 3, 5])
-def test_channel_survives_configurations_for_another_number_of_frames(channel, rows):
+def test_channel_continues_after_configurations_for_another_number_of_frames(channel, rows):
     channel.send(truth(1), applied(channel.scenario, 1, rows=rows), pilot(1))
     send_plausible_pilot(channel)
 
 
 @pytest.mark.parametrize('place', [
     (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
-def test_channel_survives_users_in_impossible_places(channel, place):
+def test_channel_continues_after_positions_outside_the_model(channel, place):
     scenario = channel.scenario
     place = element_positions(scenario)[1] if place == 'on an element' else place
     channel.send(truth(1, place), applied(scenario, 1), pilot(1),
@@ -134,7 +134,7 @@ def test_channel_survives_users_in_impossible_places(channel, place):
 
 
 @pytest.mark.parametrize('number', HUGE)
-def test_channel_survives_huge_numbers(channel, number):
+def test_channel_continues_after_huge_numbers(channel, number):
     scenario = channel.scenario
     channel.send(
         truth(1), applied(scenario, 1), pilot(1, number),
@@ -148,7 +148,7 @@ def test_channel_survives_huge_numbers(channel, number):
     send_plausible_pilot(channel)
 
 
-def test_channel_survives_messages_with_unknown_cycles(channel):
+def test_channel_continues_after_messages_with_unknown_cycles(channel):
     last = 2**64 - 1
     for cycle_id in (0, last):
         channel.send(pilot(cycle_id), applied(channel.scenario, cycle_id), truth(cycle_id),
@@ -167,7 +167,7 @@ def estimate(stage, cycle_id, place=PLACE):
 @pytest.mark.parametrize('place', [
     (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
 @pytest.mark.parametrize('what', ['estimate', 'truth'])
-def test_transmission_survives_impossible_places(stage, place, what):
+def test_transmission_continues_after_impossible_places(stage, place, what):
     stage = stage(TransmissionNode, (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth),
                   m.Beam)
     scenario = stage.scenario
@@ -179,7 +179,7 @@ def test_transmission_survives_impossible_places(stage, place, what):
 
 
 @pytest.mark.parametrize('number', HUGE)
-def test_positioner_survives_huge_signals(stage, number):
+def test_positioner_continues_after_huge_signals(stage, number):
     stage = stage(PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
     scenario, codebook = stage.scenario, stage.codebook
     shape = codebook.digital.shape[:3]
