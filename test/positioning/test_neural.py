@@ -133,7 +133,7 @@ def test_invalid_signals_are_errors(scenario, codebook, training, signals):
         NeuralEstimator(scenario, codebook, training[0]).estimate(signals)
 
 
-def test_a_model_of_another_purpose_is_refused(
+def test_a_model_of_another_purpose_is_rejected(
         scenario, codebook, training, random_beams, tmp_path):
     network = training[0]
     other = random_beams(scenario, np.random.default_rng(1))

@@ -196,13 +196,13 @@ def test_repeated_steps_restart_their_timeout_or_the_users_cycle():
 @pytest.mark.parametrize('name', ROLES)
 def test_rows_that_drop_messages_precede_rows_of_single_states(name):
     """A message that is wrong is counted as such in every state."""
-    refusals = {outcome for outcome in Outcome if outcome.value.startswith('wrong')}
-    refusals |= {Outcome.NOT_ALLOWED, Outcome.TOO_OFTEN, Outcome.CROWDED, Outcome.STALE_BEACON,
+    dropped = {outcome for outcome in Outcome if outcome.value.startswith('wrong')}
+    dropped |= {Outcome.NOT_ALLOWED, Outcome.TOO_OFTEN, Outcome.CROWDED, Outcome.STALE_BEACON,
                  Outcome.STALE_COMMAND, Outcome.LATE_GRANT}
     table = ROLES[name].machine.TABLE
-    assert {row.outcome for row in table} & refusals
+    assert {row.outcome for row in table} & dropped
     for number, row in enumerate(table):
-        if row.outcome in refusals:
+        if row.outcome in dropped:
             assert row.source is ANY
             assert row.target is SAME
             earlier = [other for other in table[:number] if other.event is row.event]
