@@ -40,7 +40,7 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.*'))),
     ],
     python_requires='>=3.10',
-    # The library needs no more. The nodes need ROS 2 as well, which pip cannot install from here:
+    # The library requires nothing else. The nodes also require ROS 2, which pip cannot install:
     # rosdep reads package.xml, and scripts/setup reads requirements.txt.
     install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6'],
     # Tests and the documentation read this table as a literal.

@@ -18,7 +18,8 @@ if importlib.util.find_spec('rclpy'):
     pytest_plugins.append('node_processes')
 HERE = Path(__file__).resolve().parent
 
-# The same examples in every run, or many more and others each time.
+# The profile quick uses the same examples in every run; thorough uses many more, which differ from
+# run to run.
 hypothesis.settings.register_profile(
     'quick', max_examples=150, derandomize=True, database=None, deadline=None)
 hypothesis.settings.register_profile(
@@ -28,7 +29,7 @@ hypothesis.settings.register_profile(
 
 def pytest_addoption(parser):
     parser.addoption('--thorough', action='store_true',
-                     help='thousands of examples for each property instead of some')
+                     help='test each property on 5000 random examples instead of 150 fixed ones')
 
 
 def pytest_configure(config):
@@ -69,7 +70,7 @@ def table1() -> Case:
 
 @pytest.fixture(scope='session', autouse=True)
 def own_cache(tmp_path_factory):
-    """Tables that nodes keep go where the tests' other files go, also those of processes."""
+    """Set the cache folder of nodes and child processes to a temporary directory."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('XDG_CACHE_HOME', str(tmp_path_factory.mktemp('cache')))
         yield
@@ -105,9 +106,9 @@ def random_beams():
 
 
 class Plain:
-    """The model as the paper writes it, one index at a time; indices count from 0.
+    """The model in the notation of the paper, one index at a time; indices count from 0.
 
-    Takes what it needs of the scenario from its fields alone. Positions may have leading axes.
+    Uses only the fields of the scenario, none of its methods. Positions may have leading axes.
     """
 
     light = 299_792_458.0
@@ -239,9 +240,9 @@ def table1_estimator(shipped):
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Function that installs a package of one module with entry points, as pip leaves it."""
+    """Function that installs a package of one module with the metadata that pip writes."""
     def install(package: str, code: str, points: dict[str, dict[str, str]]) -> Path:
-        """Take code and objects of the module by group and name; return the folder of it all."""
+        """Take code and objects of the module by group and name; return its folder."""
         folder = tmp_path / 'site'
         info = folder / f'{package}-1.0.dist-info'
         info.mkdir(parents=True)

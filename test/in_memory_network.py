@@ -218,7 +218,7 @@ class Network:
         heapq.heappush(self._queue, (self.now_s + self._make_s, next(self._serial), name,
                                      self._roles[name], event))
 
-    def publish(self, message: m.Message, sender: str = 'stranger') -> None:
+    def publish(self, message: m.Message, sender: str = 'external') -> None:
         m.check(message, self.scenario.sizes)
         self.log.append(Sent(self.now_s, sender, message))
         if isinstance(message, m.Grant) and sender == 'bs':
@@ -292,7 +292,7 @@ class Network:
         """Check that no result mixes cycles, users, codebooks or positions."""
         truths, signals, estimates, beams = {}, set(), set(), set()
         for _, sender, message in self.log:
-            if sender == 'stranger':
+            if sender == 'external':
                 continue
             match message:
                 case m.GroundTruth():

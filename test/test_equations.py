@@ -30,7 +30,7 @@ CLAIMS = claims()
 
 
 @pytest.mark.parametrize('expected', EXPECTED)
-def test_each_is_implemented_once(expected):
+def test_each_equation_is_implemented_once(expected):
     assert len(CLAIMS.get(expected, [])) == 1, CLAIMS.get(expected)
 
 

@@ -51,7 +51,7 @@ def test_rviz_shows_topics_with_their_types_and_quality_of_service(rviz, publish
     assert len({display['Name'] for display in rviz['Displays']}) == len(rviz['Displays'])
 
 
-def test_both_are_fixed_to_the_frame_of_the_positions(rviz):
+def test_both_layouts_are_fixed_to_the_frame_of_the_positions(rviz):
     topics = pytest.importorskip('rhs_isac_ros.ros.topics')
     assert rviz['Global Options']['Fixed Frame'] == topics.MAP_FRAME
     layout = json.loads((ROOT / FOXGLOVE).read_text(encoding='utf-8'))

@@ -44,7 +44,10 @@ class Radio(PlainRole):
         return self._answer()
 
     def _answer(self):
-        """Answer the pilots whose configuration has arrived; topics have no common order."""
+        """Answer the pilots whose configuration has arrived.
+
+        Messages of different topics may arrive in any order.
+        """
         answers = []
         for _ in range(len(self._waiting)):
             pilot = self._waiting.popleft()
@@ -55,13 +58,14 @@ class Radio(PlainRole):
                     cycle_id=pilot.cycle_id, user=pilot.user, band=pilot.band, frame=pilot.frame,
                     signals=feeds)))
             else:
-                # Pilots of unfinished cycles leave the queue at its other end.
+                # The queue is bounded, so the oldest pilots, those of unfinished cycles, are
+                # discarded.
                 self._waiting.append(pilot)
         return answers
 
 
 class RadioNode(RoleNode):
-    """The node; of the parameters of ``channel`` it uses only ``scenario_file``."""
+    """The node. It declares the parameters of ``channel`` but uses only ``scenario_file``."""
 
     def __init__(self, measure, carry, **node_options):
         super().__init__('channel', 'radio', **node_options)

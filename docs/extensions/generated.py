@@ -1,6 +1,6 @@
 """The directive ``generated``: parts of pages that are generated from the code.
 
-``.. generated:: parameters`` calls the function of that name below, which returns
+``.. generated:: parameter_table`` calls the function of that name below, which returns
 reStructuredText or SVG.
 """
 
@@ -42,7 +42,7 @@ def code(text):
 
 
 def parameter_table():
-    """Return all ROS parameters, from their declaration."""
+    """Return a table of all ROS parameters, from their declarations."""
     owners = {}
     for executable, group in parameters.NODES.items():
         for parameter in group:
@@ -52,9 +52,9 @@ def parameter_table():
         default = str(parameter.default).lower() if parameter.kind == 'bool' else (
             parameter.default if parameter.default not in ('', []) else 'empty')
         rows.append((code(name), parameter.kind, default, parameter.range,
-                     ', '.join(nodes_), parameter.text))
-    return table(('parameter', 'type', 'default', 'range', 'nodes', 'what it is'), rows,
-                 '18 8 9 15 20 30')
+                     'yes' if parameter.dynamic else '', ', '.join(nodes_), parameter.text))
+    return table(('parameter', 'type', 'default', 'range', 'dynamic', 'nodes', 'description'),
+                 rows, '18 8 9 14 8 15 28')
 
 
 def topic_table():
@@ -106,7 +106,7 @@ def cycle_sequence():
 
 
 def outcome_table():
-    """Return every outcome that a role counts, with its kind."""
+    """Return the counters of `Outcome`, each with its kind."""
     rows = [(code(f'{kind.value}.{outcome.value}'), KINDS[kind])
             for kind in Kind for outcome in sorted(Outcome, key=lambda outcome: outcome.value)
             if outcome.kind is kind]
@@ -114,19 +114,20 @@ def outcome_table():
 
 
 def dependency_table():
-    """Return the extras of the package that have no rosdep key: pip must install them."""
+    """Return a table of the libraries in extras that have no rosdep key, for pip."""
     tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
     (extras,) = [ast.literal_eval(node.value) for node in ast.walk(tree)
                  if isinstance(node, ast.keyword) and node.arg == 'extras_require']
     keys = (ROOT / 'package.xml').read_text(encoding='utf-8')
     rows = []
-    for purpose, names in extras.items():
-        left = [name for name in names
-                if f'>python3-{name.replace("scikit-learn", "sklearn")}<' not in keys]
-        if left:
-            rows.append((purpose, code(' '.join(left)),
-                         code(f'python3 -m pip install {" ".join(left)}')))
-    return table(('for', 'packages', 'command'), rows, '20 30 50')
+    for extra, names in extras.items():
+        # The extra `all` repeats the others, and scikit-learn depends on threadpoolctl.
+        missing = [name for name in names if extra != 'all' and name != 'threadpoolctl'
+                   and f'>python3-{name.replace("scikit-learn", "sklearn")}<' not in keys]
+        if missing:
+            rows.append((code(extra), code(' '.join(missing)),
+                         code(f'python3 -m pip install {" ".join(missing)}')))
+    return table(('extra', 'packages', 'command'), rows, '20 30 50')
 
 
 def module_list(package):
@@ -156,7 +157,7 @@ FUNCTIONS = {function.__name__: function for function in (
 
 
 class Generated(SphinxDirective):
-    """Replaced by the result of a function."""
+    """Directive that inserts the result of a function."""
 
     required_arguments = 1
     optional_arguments = 1

@@ -38,7 +38,10 @@ _STYLE = ('text{font:11px monospace;fill:#222}.role{font-weight:bold;font-size:1
 
 
 class _Centre:
-    """A fast estimator: the diagram does not show positions."""
+    """Estimator that always returns the centre of the region.
+
+    The diagram does not depend on positions.
+    """
 
     name = 'centre'
 

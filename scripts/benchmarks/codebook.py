@@ -2,8 +2,8 @@
 
 Problem: the average Cramer-Rao bound is a local measure. The phases of two bands repeat
 periodically in range, and a codebook with a low bound may leave such ranges indistinguishable.
-Which codebook locates users best? All are evaluated with the same positions, multipath and noise,
-and with the posterior mean as the estimator.
+With which codebook are users located most accurately? All are evaluated with the same positions,
+multipath and noise, and with the posterior mean as the estimator.
 """
 
 import os
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=1, help='seed of all random numbers')
     parser.add_argument('--codebook', type=Path, action='append', default=[],
                         help='another codebook to compare; may be repeated')
-    parser.add_argument('--json', type=Path, help='JSON file for the figures')
+    parser.add_argument('--json', type=Path, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario()
     codebooks = {

@@ -36,7 +36,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--users', type=positive_int, default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
-    parser.add_argument('--json', type=Path, help='JSON file for the figures')
+    parser.add_argument('--json', type=Path, help='JSON file for the results')
     options = parser.parse_args()
     os.environ.update(private_domain())
     scenario = Scenario()

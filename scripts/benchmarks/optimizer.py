@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument('--limit', type=float, default=120.0,
                         help='time limit per method in (b) [s]')
     parser.add_argument('--parts', default='abc', help='parts to run')
-    parser.add_argument('--json', type=Path, help='JSON file for the figures')
+    parser.add_argument('--json', type=Path, help='JSON file for the results')
     parser.add_argument('--picture', type=Path, help='file for the picture')
     options = parser.parse_args()
     restrict_to(options.threads)
@@ -85,21 +85,21 @@ def gradient() -> dict:
     exact = Problem(scenario, AverageCrlb(scenario, positions))
     variables = fast.pack(start)
     contenders: dict[str, Callable] = {
-        'ours': lambda: fast.value_and_gradient(variables),
-        'ours, exact rows': lambda: exact.value_and_gradient(variables),
+        'this package': lambda: fast.value_and_gradient(variables),
+        'this package, exact rows': lambda: exact.value_and_gradient(variables),
         'matrix products alone': products(fast, scenario)}
     if HAVE_JAX:
         peer = JaxAverageCrlb(scenario, positions)
         contenders['JAX'] = lambda: peer(variables)
     times_s = side_by_side(contenders)
-    value = {name: contenders[name]()[0] for name in ('ours', 'ours, exact rows')}
-    ours = times_s['ours']
+    value = {name: contenders[name]()[0] for name in ('this package', 'this package, exact rows')}
+    ours = times_s['this package']
     print(f'(a) value and gradient, Table I, {POSITIONS} positions, {threads()} thread(s)\n')
-    print('| implementation | ms | speed-up of ours |\n|---|---|---|')
+    print('| implementation | ms | speed-up of this package |\n|---|---|---|')
     for name, time_s in times_s.items():
         print(f'| {name} | {1e3 * time_s:.2f} | {time_s / ours:.2f} |')
-    print(f'\nrelative error of the value: {value["ours"] / value["ours, exact rows"] - 1:.1e}; '
-          f'ranks {fast.objective.rows.ranks}\n')
+    error = value['this package'] / value['this package, exact rows'] - 1
+    print(f'\nrelative error of the value: {error:.1e}; ranks {fast.objective.rows.ranks}\n')
     return {
         'gradient_ms': {name: 1e3 * time_s for name, time_s in times_s.items()},
         'gradient_speedup_vs_jax': times_s['JAX'] / ours if HAVE_JAX else None,
@@ -120,7 +120,7 @@ def products(problem: Problem, scenario: Scenario) -> Callable[[], list]:
 def target(limit_s: float) -> dict:
     """Run part (b)."""
     scenario = Scenario()
-    # Let SciPy finish its imports before the clock starts.
+    # Import the lazily loaded parts of SciPy before the measurement starts.
     sobol(scenario, 1, np.random.default_rng(0))
     held_out = monte_carlo(scenario, HELD_OUT, streams.generator(0, streams.HELD_OUT))
     runs = {f'lbfgs, {DEFAULT_POSITIONS} Sobol': run(scenario, 'lbfgs', sobol, limit_s),
@@ -166,7 +166,7 @@ Trace = list[tuple[float, int, np.ndarray]]
 
 def run(scenario: Scenario, method: str, sample: Callable, limit_s: float,
         n_positions: int = DEFAULT_POSITIONS) -> Trace:
-    """Run a method with its default limit of steps; sampling and set-up count."""
+    """Run a method with its default limit of steps; the times include sampling and set-up."""
     begin = time.perf_counter()
     positions = sample(scenario, n_positions, streams.generator(0, streams.SAMPLES))
     problem = Problem(scenario, AverageCrlb(scenario, positions, ROW_TOLERANCE))

@@ -79,7 +79,7 @@ def main() -> None:
     print(f'time of a fix        {1e3 * np.median(times_s):.1f} ms median, '
           f'{1e3 * np.quantile(times_s, 0.99):.1f} ms 99th percentile, '
           f'{1e3 * np.median(busy_s):.1f} ms CPU time')
-    print(f'time to get ready    {ready_s:.1f} s, including its tables')
+    print(f'time to create       {ready_s:.1f} s, including its tables')
     print_loading(settings)
 
 

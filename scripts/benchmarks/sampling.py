@@ -1,4 +1,4 @@
-"""How many Sobol points are as good as 1200 random ones.
+"""Quality of codebooks by number of samples, with Sobol points and with random points.
 
 Problem: the optimiser sees the region of interest only through samples, and overfits if they are
 too few. How good is the codebook on the whole region, after a fixed number of steps, depending on
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument('--seeds', type=positive_int, default=5, help='number of runs per choice')
     parser.add_argument('--steps', type=positive_int, default=600,
                         help='update steps of each run')
-    parser.add_argument('--json', type=Path, help='JSON file for the figures')
+    parser.add_argument('--json', type=Path, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario()
     held_out = sobol(scenario, HELD_OUT, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))

@@ -1,4 +1,4 @@
-"""Capacity that the beam search leaves unused, and its latency.
+"""Capacity that the beam search does not reach, and latency of the search.
 
 Problem: the capacity has many local maxima. A position error costs well under one per cent of it,
 so the loss can only be measured if the search finds nearly the global maximum everywhere. Three
@@ -90,7 +90,8 @@ def long_optimisation(
     """Return the best capacity of quasi-Newton ascents from random starts [bit/s].
 
     The variable is the configuration, within its bounds; the digital part is always the optimum
-    for it. The best few ascents are refined by flipping single elements until no flip gains.
+    for it. The best few ascents are refined by flipping single elements until no flip increases
+    the capacity.
     """
     link = BandLink.to(scenario, position, band)
     ends = []
@@ -125,7 +126,7 @@ def negative_capacity(link: BandLink) -> Callable[[np.ndarray], tuple[float, np.
 
 
 def refine(link: BandLink, analog: np.ndarray) -> np.ndarray:
-    """Flip single elements to the other end of their range as long as that gains."""
+    """Flip single elements to the other end of their range while this increases the capacity."""
     analog, rate, gained = analog.copy(), link.best_rate(analog), True
     while gained:
         gained = False

@@ -1,8 +1,8 @@
 """Cycle rate and waiting times with few users and with many.
 
-Problem: all users answer every beacon, but only one is served. What do the others cost? The
-network runs twice, with few users and with many, and is compared with the hops of a cycle in bare
-rclpy, measured in the same run.
+Problem: all users answer every beacon, but only one is served. By how much do the other users slow
+the cycles down? The network runs twice, with few users and with many, and is compared with the
+hops of a cycle in bare rclpy, measured in the same run.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main() -> int:
     parser.add_argument('--rounds', type=positive_int, default=5, help='cycles for each user')
     parser.add_argument('--composed', action='store_true',
                         help='run all nodes in one process instead of one process per node')
-    parser.add_argument('--json', type=Path, help='JSON file for the figures')
+    parser.add_argument('--json', type=Path, help='JSON file for the results')
     options = parser.parse_args()
     os.environ.update(private_domain())
     use_discovery_profile()

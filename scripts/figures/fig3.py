@@ -3,13 +3,14 @@
 Problem: a base station has N_B bands, centred at (2 + 0.5 i) GHz, and measures F frames in each,
 with N_B F = 8 frames in total. Which method finds the codebook with the lowest average CRLB over
 N_sam = 10 random positions? The paper's alternating algorithm, gradient descent on all variables
-at once, a genetic algorithm and our L-BFGS are compared, from the same start and with the same
-samples; each of the 30 trials draws new ones. The paper claims that its algorithm
+at once, a genetic algorithm and the package's L-BFGS are compared, from the same start and with
+the same samples; each of the 30 trials draws new ones. The paper makes four claims about its
+algorithm:
 
-(1) reaches a lower CRLB than both rivals at each N_B,
-(2) takes less time than both,
-(3) that its CRLB falls with N_B,
-(4) and that its lead in CRLB grows with N_B.
+(1) It reaches a lower CRLB than both benchmarks at each N_B.
+(2) It takes less time than both.
+(3) Its CRLB falls with N_B.
+(4) Its lead in CRLB grows with N_B.
 
 Beyond the paper, each codebook is also evaluated on 500 held-out positions, the same for all: a
 method may overfit ten samples.
@@ -53,7 +54,7 @@ PROPOSED, RIVALS = 'alternating', ('direct', 'genetic')
 METHODS = (PROPOSED, *RIVALS, 'lbfgs')
 SAMPLES, HELD_OUT, HELD_OUT_SEED = 10, 500, 0
 TRIALS, QUICK_TRIALS = 30, 3
-# The number of update steps of the paper's method and of `direct`.
+# As many update steps as the paper's method and `direct` perform by default.
 LBFGS_STEPS = 400
 
 
@@ -145,7 +146,7 @@ class Summary:
             for rival in RIVALS:
                 other = self.of(name, rival, n)
                 holds &= bool(own.mean() < other.mean())
-                rivals.append(f'{other.mean():.4f} {unit} of {rival} (lower in '
+                rivals.append(f'{other.mean():.4f} {unit} of {rival} ({PROPOSED} is lower in '
                                f'{np.sum(own < other)} of {self.count} trials)')
             details.append(f'With N_B = {n}: {own.mean():.4f} {unit} against '
                              f'{" and ".join(rivals)}.')

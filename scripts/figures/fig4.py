@@ -174,8 +174,9 @@ def add_sizes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--positions', type=positive_int, metavar='N',
                         help=f'test positions (default: {POSITIONS}, quick {QUICK_POSITIONS})')
     parser.add_argument('--ros', action='store_true',
-                        help='instead, measure (b) in a running network with the default codebook '
-                             'and compare; --positions is the number of cycles')
+                        help='measure (b) in a running network with the default codebook instead, '
+                             'and compare it with the library; --positions is the number of '
+                             'cycles')
 
 
 def over_ros(options: argparse.Namespace) -> None:

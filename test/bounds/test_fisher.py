@@ -159,7 +159,7 @@ def test_a_singular_matrix_does_not_affect_the_others():
 
 
 @pytest.mark.parametrize('distance', [10, 100, 1000])
-def test_bound_is_the_inverse_near_and_far(shipped, distance):
+def test_bound_is_the_trace_of_the_inverse_information_at_any_distance(shipped, distance):
     """Far away, nearly all of the information is about the distance."""
     scenario = Scenario()
     positions = distance * np.array([[1.0, 1.0, 0.3], [1.0, 0.0, 0.0], [2.0, -1.0, 0.1]])

@@ -72,7 +72,7 @@ def assert_near(outcome, expected, tolerance):
             actual, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
 
 
-def test_the_pairs_of_these_tests_are_confused_sometimes(
+def test_the_pairs_of_these_tests_are_sometimes_confused(
         scenario, codebook, pairs, plain):
     p = plain(scenario, codebook.analog, codebook.digital)
     q = plain_distances(p, *pairs, multipath_covariance(scenario))

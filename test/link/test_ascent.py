@@ -58,7 +58,7 @@ def test_the_digital_part_is_optimal_for_the_configuration(scenario, link):
         np.testing.assert_array_equal(digital, link.best_digital(analog))
 
 
-def test_no_single_element_gains_at_an_end_of_its_range(scenario, link):
+def test_no_single_element_at_an_end_of_its_range_increases_the_capacity(scenario, link):
     for start in starts(scenario, 3):
         if not start.any():
             continue
@@ -71,7 +71,7 @@ def test_no_single_element_gains_at_an_end_of_its_range(scenario, link):
                 assert rate(scenario, other, digital) <= found * (1 + 1e-8)
 
 
-def test_random_configurations_gain(scenario, link):
+def test_the_ascent_increases_the_capacity_of_random_configurations(scenario, link):
     gained = [rate(scenario, *ascend(link, start)) / rate(
         scenario, start, link.best_digital(start)) for start in starts(scenario)[:10]]
     assert min(gained) > 1.0001

@@ -30,7 +30,7 @@ def test_configurations_are_better_than_the_matched_filter(table1):
         assert rates[0] > max(rates) * (1 - 1e-3)
 
 
-def test_an_ascent_from_the_first_configuration_gains_little(table1):
+def test_an_ascent_from_the_first_configuration_increases_the_capacity_little(table1):
     link = BandLink.to(table1.scenario, POSITION, 1)
     (first,) = candidate_configurations(link, 1)
     better, _ = ascend(link, first)

@@ -95,7 +95,7 @@ def test_beams_are_better_than_a_random_search(table1, reference_link):
         assert rate(scenario, link.best_beam(analog, position), position) < found
 
 
-def test_random_changes_of_the_digital_part_do_not_gain(small, reference_link):
+def test_random_changes_of_the_digital_part_do_not_increase_the_capacity(small, reference_link):
     scenario, rng = small.scenario, np.random.default_rng(3)
     position = np.array([7.0, 3.0, -0.5])
     beam = steer(scenario, position)
@@ -133,7 +133,7 @@ def test_the_configuration_is_a_local_maximum(small):
         assert rate(scenario, Beam(analog, beam.digital), position) <= found
 
 
-def test_steering_to_the_true_position_is_better_than_five_metres_away(table1, positions):
+def test_steering_to_the_true_position_is_better_than_to_one_five_metres_away(table1, positions):
     scenario = table1.scenario
     for position in positions:
         away = position + (np.array([0, 5.0, 0]) if position[1] < 0 else np.array([0, -5.0, 0]))

@@ -20,7 +20,7 @@ def test_kinds_are_complete():
     assert mobility.KINDS == ('static', 'waypoints', 'random_walk')
 
 
-def test_static_stands_still():
+def test_a_static_user_does_not_move():
     positions, velocities = track(mobility.Static((7.0, -1.0, 0.5)), [0.0, 1.0, 1e6])
     assert (positions == [7, -1, 0.5]).all()
     assert (velocities == 0).all()

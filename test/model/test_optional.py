@@ -7,7 +7,7 @@ import pytest
 from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 
 
-def test_an_import_that_succeeds_is_left_alone():
+def test_a_successful_import_has_no_effect():
     with optional_import('a test'):
         import json
     assert json.loads('1') == 1
@@ -23,7 +23,7 @@ def test_the_error_names_purpose_library_and_extra(monkeypatch, extra, hint):
             import json.decoder  # noqa: F401
 
 
-def test_other_errors_pass():
+def test_other_errors_propagate():
     with pytest.raises(ZeroDivisionError):
         with optional_import('a test'):
             raise ZeroDivisionError

@@ -22,7 +22,7 @@ def overview_of(net, until_s=np.inf):
     return overview
 
 
-def test_it_is_empty_before_the_first_message():
+def test_the_overview_is_empty_before_the_first_message():
     overview = Overview()
     assert (overview.phase, overview.users, overview.fixes, overview.nodes) == ('', {}, [], {})
     assert overview.rate_hz(5.0) == 0
@@ -84,7 +84,7 @@ def test_the_rate_is_averaged_over_ten_seconds():
     assert overview.rate_hz(99.0) == 0
 
 
-def test_it_does_not_grow_with_the_cycles(network):
+def test_the_overview_does_not_grow_with_the_cycles(network):
     net = network()
     net.run_cycles(30)
     overview = overview_of(net)

@@ -26,7 +26,7 @@ def beam(user):
         digital=np.ones((2, 2), complex), expected_bps=1e6)
 
 
-def test_it_is_complete_once_every_user_has_an_estimate():
+def test_the_scene_is_complete_once_every_user_has_an_estimate():
     scene = SceneState()
     for message in (m.RhsConfiguration(
         cycle_id=1, mode=m.Mode.POSITIONING, band=0, codebook_id='cb', analog=np.ones((3, 4))),

@@ -25,7 +25,7 @@ COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, 
          m.RhsConfiguration: SIZES['N_B'] + 1,
          m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'] * SIZES['F'],
          m.FeedSignals: SIZES['N_B'] * SIZES['F'], m.Data: 4, m.ProtocolState: 4}
-# Parameters of the nodes, in another order than in test_life.
+# Parameters of the nodes, in another order than in test_start_and_stop.
 BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.02, 'ack_timeout_s': 0.3},
         'positioner': {}, 'optimizer': {}, 'rhs_controller': {}}
 POSITIONS = {1: (9.0, 1.5, 0.3), 2: (12.0, -3.0, -0.5), 3: (6.5, 0.0, 0.0)}
@@ -260,7 +260,7 @@ def not_finite(message):
     return not np.isfinite(message.signals).all()
 
 
-def test_nan_does_not_spread(network, join):
+def test_nan_from_a_faulty_node_is_dropped(network, join):
     """A faulty node sends NaN for the present cycle."""
     watch, running = network.watch, network.running
     codebook = Codebook.load(default_codebook_file())

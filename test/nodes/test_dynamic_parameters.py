@@ -111,7 +111,7 @@ def test_changes_of_policy_and_noise_are_reported(running):
     ('channel', {'loss_probability': 1.5}, 'loss_probability: 1.5, expected a number'),
     ('user_1', {'speed_mps': 2.0}, 'Trying to set a read-only parameter: speed_mps'),
 ])
-def test_an_invalid_value_is_refused_with_the_reason(running, node, values, reason):
+def test_an_invalid_value_is_rejected_with_the_reason(running, node, values, reason):
     result = running.set(node, **values)
     assert not result.successful
     assert result.reason.startswith(reason)

@@ -85,7 +85,7 @@ def test_a_new_codebook_is_used_from_one_cycle_to_the_next(networks):
     assert codebook_ids(networks.b.watch) == {networks.b.codebook.id}
 
 
-def test_both_end_after_one_or_many_signals(networks, crashed):
+def test_networks_end_after_one_or_many_signals(networks, crashed):
     for network in (networks.a, networks.b):
         network.watch.until_served(processes=[network.process])
     for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGINT):

@@ -54,7 +54,7 @@ def test_an_optimised_codebook_is_pushed_and_the_command_ends(
     watch.until(lambda: ids[-1] == Codebook.load(output).id, 'the new codebook')
 
 
-def test_a_codebook_of_another_scenario_is_refused(
+def test_a_codebook_of_another_scenario_is_rejected(
         processes, network, table1, tmp_path):
     process, _, ids = network
     before = ids[-1]

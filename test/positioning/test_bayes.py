@@ -64,7 +64,7 @@ def test_means_are_inside_the_region(table1_estimates):
     assert (table1_estimates[2].mean <= high + 1e-9).all()
 
 
-def test_a_single_phase_gives_the_same_as_in_a_batch(table1_estimates, table1_estimator):
+def test_a_single_phase_has_the_same_estimate_as_in_a_batch(table1_estimates, table1_estimator):
     _, received, estimate = table1_estimates
     for n in (0, 77):
         single = table1_estimator.estimate(received[n])

@@ -100,7 +100,7 @@ def test_training_stops_when_the_validation_error_does_not_fall(scenario, codebo
     assert network.about['epochs'] + 4 <= len(epochs) < 2000
 
 
-def test_a_single_phase_gives_the_same_as_in_a_batch(scenario, codebook, training):
+def test_a_single_phase_has_the_same_estimate_as_in_a_batch(scenario, codebook, training):
     received = simulate_pairs(scenario, codebook, 20, 9)[1]
     estimator = NeuralEstimator(scenario, codebook, training[0])
     batch, single = estimator.estimate(received), estimator.estimate(received[7])
@@ -133,7 +133,7 @@ def test_invalid_signals_are_errors(scenario, codebook, training, signals):
         NeuralEstimator(scenario, codebook, training[0]).estimate(signals)
 
 
-def test_a_model_of_another_purpose_is_refused(
+def test_a_model_of_another_purpose_is_rejected(
         scenario, codebook, training, random_beams, tmp_path):
     network = training[0]
     other = random_beams(scenario, np.random.default_rng(1))

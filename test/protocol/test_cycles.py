@@ -46,7 +46,7 @@ def test_without_faults_nothing_is_counted_or_logged(network):
     net = network()
     net.run_cycles(100)
     assert net.counters() == {}
-    assert not any(said.message.warning for said in net.logs)
+    assert not any(logged.message.warning for logged in net.logs)
 
 
 def test_bands_and_frames_are_sounded_in_order(network, scenario, codebooks):
@@ -114,7 +114,7 @@ def test_the_capacities_are_those_of_the_beam(network, scenario, places):
     assert report.loss_percent == pytest.approx(100 * report.loss_bps / report.perfect_bps)
 
 
-def test_a_perfect_estimate_loses_nothing(network, scenario):
+def test_an_exact_estimate_has_no_capacity_loss(network, scenario):
     net = network({1: scenario.roi_center_m})
     net.run_cycles(1)
     (report,) = net.sent(m.Capacity)

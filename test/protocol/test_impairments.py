@@ -14,7 +14,7 @@ class Repeats(PlainRole):
     """Publishes each message that it receives, with a log message."""
 
     def handle(self, event, now_s):
-        return [Send(event), LogMessage('heard')]
+        return [Send(event), LogMessage('received')]
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def test_an_ideal_channel_changes_nothing(impaired):
     role = impaired()
     (sent, note) = sorted(
         role.handle(m.Beacon(cycle_id=5, attempt=0), 1.0), key=lambda a: isinstance(a, LogMessage))
-    assert (sent.message.cycle_id, note.text) == (5, 'heard')
+    assert (sent.message.cycle_id, note.text) == (5, 'received')
     assert role.next_deadline() is None
     assert role.counters == {}
 

@@ -128,17 +128,17 @@ def make_network(network_class, scenario, codebooks):
 
 
 @pytest.fixture(scope='module')
-def survive(codebooks):
+def run_and_check(codebooks):
     """Function that runs a network through crashes, offers and changes and checks its recovery."""
     def run(net, crashes, offers, changes):
-        happens = [(crash.at_s, lambda crash=crash: stop(net, crash)) for crash in crashes]
-        happens += [(crash.at_s + crash.down_s, lambda crash=crash: start(net, crash.role))
-                    for crash in crashes]
-        happens += [(offer.at_s, lambda offer=offer: net.offer(codebooks[offer.number]))
-                    for offer in offers]
-        happens += [(change.at_s, lambda change=change: alter(net, change))
-                    for change in changes]
-        for at_s, act in sorted(happens, key=lambda pair: pair[0]):
+        events = [(crash.at_s, lambda crash=crash: stop(net, crash)) for crash in crashes]
+        events += [(crash.at_s + crash.down_s, lambda crash=crash: start(net, crash.role))
+                   for crash in crashes]
+        events += [(offer.at_s, lambda offer=offer: net.offer(codebooks[offer.number]))
+                   for offer in offers]
+        events += [(change.at_s, lambda change=change: change_settings(net, change))
+                   for change in changes]
+        for at_s, act in sorted(events, key=lambda pair: pair[0]):
             net.run(limit_s=at_s - net.now_s)
             act()
         net.run(limit_s=max(FAULTS_END_S - net.now_s, 0.0))
@@ -161,7 +161,7 @@ def start(net, role):
         net.add(role)
 
 
-def alter(net, change):
+def change_settings(net, change):
     if change.role in net:
         net.change(change.role, **change.values)
 
@@ -202,8 +202,8 @@ def check_results(net):
        retries=RETRIES)
 @explicit(faults=[], crashes=[], offers=[], changes=[], ordered=True, retries=3)
 def test_guarantees_hold_under_single_faults_and_crashes(
-        make_network, survive, faults, crashes, offers, changes, ordered, retries):
-    survive(make_network(Faulty(faults), ordered, retries), crashes, offers, changes)
+        make_network, run_and_check, faults, crashes, offers, changes, ordered, retries):
+    run_and_check(make_network(Faulty(faults), ordered, retries), crashes, offers, changes)
 
 
 @given(noise=NOISE, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
@@ -213,5 +213,5 @@ def test_guarantees_hold_under_single_faults_and_crashes(
           crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
           offers=[], changes=[], ordered=False, retries=0)
 def test_guarantees_hold_under_random_faults_and_crashes(
-        make_network, survive, noisy, noise, crashes, offers, changes, ordered, retries):
-    survive(make_network(noisy(**noise), ordered, retries), crashes, offers, changes)
+        make_network, run_and_check, noisy, noise, crashes, offers, changes, ordered, retries):
+    run_and_check(make_network(noisy(**noise), ordered, retries), crashes, offers, changes)

@@ -117,14 +117,14 @@ def test_one_lost_message_ends_no_cycle_with_retries(network, kind, fields, reci
 
 @pytest.mark.parametrize(('retries', 'outcome'), [(1, 'user_gone'), (2, 'served')])
 def test_a_step_is_repeated_at_most_as_often_as_configured(network, retries, outcome):
-    heard = []
+    requests = []
 
-    def deaf(message, recipient):
+    def lose_first_two(message, recipient):
         if isinstance(message, m.PilotRequest) and message.band == 1:
-            heard.append(message)
-            return [] if len(heard) < 3 else [(1e-3, message)]
+            requests.append(message)
+            return [] if len(requests) < 3 else [(1e-3, message)]
         return [(1e-3, message)]
-    net = network(transport=deaf, retries=retries)
+    net = network(transport=lose_first_two, retries=retries)
     begin_s = net.now_s
     net.run_cycles(1)
     assert net.outcomes() == [(1, 1, outcome)]

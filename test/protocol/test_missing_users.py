@@ -49,7 +49,7 @@ def test_a_user_lost_between_cycles_is_waited_for_three_times(network):
     assert waits == [True] * 3 + [False] * 3
 
 
-def test_waiting_for_a_lost_user_does_not_cost_another_its_cycle(network):
+def test_waiting_for_a_missing_user_ends_no_cycle_of_another_user(network):
     """The time to wait for acks may exceed the time that a user waits for its grant."""
     net = network(2, ack_timeout_s=3.0)
     net.run_cycles(4)

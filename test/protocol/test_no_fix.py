@@ -28,10 +28,10 @@ class LosesFirst:
         return [(1e-3, message)]
 
 
-class Blind:
+class NoFixInCycles:
     """An estimator without a fix in the given cycles."""
 
-    name = 'blind'
+    name = 'no_fix'
 
     def __init__(self, cycles):
         self._cycles, self._cycle = cycles, 0
@@ -44,13 +44,13 @@ class Blind:
 
 
 def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
-    net = network(make=lambda codebook: Blind({2}))
+    net = network(make=lambda codebook: NoFixInCycles({2}))
     net.run_cycles(3)
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'no_fix'), (3, 1, 'served')]
     assert [e.cycle_id for e in net.sent(m.PositionEstimate)] == [1, 3]
     assert not net.sent(m.Beam, cycle_id=2)
-    (told,) = net.sent(m.NoFix)
-    assert (told.cycle_id, told.user, told.reason) == (2, 1, 'nothing fits')
+    (message,) = net.sent(m.NoFix)
+    assert (message.cycle_id, message.user, message.reason) == (2, 1, 'nothing fits')
     (signals_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ReceivedSignals)
                     and s.message.cycle_id == 2]
     (end_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ProtocolState)
@@ -62,7 +62,7 @@ def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
 
 
 def test_a_lost_no_fix_costs_the_timeout_of_one_step(network):
-    net = network(make=lambda codebook: Blind({2}), transport=LosesFirst(m.NoFix, {}))
+    net = network(make=lambda codebook: NoFixInCycles({2}), transport=LosesFirst(m.NoFix, {}))
     net.run_cycles(3)
     assert net.transport.lost is not None
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'positioner_silent'), (3, 1, 'served')]

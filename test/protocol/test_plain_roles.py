@@ -17,7 +17,7 @@ from rhs_isac_ros.protocol.transmission import Transmission
 PLACE = np.array([8.0, -2.0, 0.5])
 
 
-def test_they_have_no_deadlines(scenario):
+def test_plain_roles_have_no_deadlines(scenario):
     for role in (Channel(scenario, 0), Transmission(scenario),
                  Positioner(scenario, None)):
         assert role.next_deadline() is None

@@ -156,7 +156,7 @@ def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(positioner, co
     assert requested(positioner.handle(CodebookOffered(codebooks[1]), 0.0)) == [codebooks[1].id]
 
 
-class Lost(Fixed):
+class WithoutFix(Fixed):
     """An estimator that returns no fix, or raises an error."""
 
     def __init__(self, codebook, error=False):
@@ -171,7 +171,7 @@ class Lost(Fixed):
 
 @pytest.mark.parametrize('error', [False, True])
 def test_without_a_fix_the_positioner_reports_the_reason(positioner, codebooks, signals, error):
-    lost = Lost(codebooks[0], error)
+    lost = WithoutFix(codebooks[0], error)
     feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0], lost)])
     send, note = positioner.handle(signals(9), 0.0)
     assert isinstance(send.message, m.NoFix)

@@ -23,8 +23,9 @@ def test_changes_are_the_new_values_of_changed_settings():
 
 
 def test_settings_in_use_and_pending_are_described():
-    told = describe_settings(PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
-    assert told == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
+    described = describe_settings(
+        PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
+    assert described == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
                     'pending.estimator': 'neural'}
 
 

@@ -13,10 +13,10 @@ IN_A_CYCLE = [State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERIN
 UNFIT = {'estimator': 'neural', 'model_file': 'unfit'}
 
 
-def told(net, role, beginning):
+def status_of(net, role, prefix):
     """Return the status values of a role whose names have a prefix."""
     return {name: value for name, value in net[role].status().items()
-            if name.startswith(beginning)}
+            if name.startswith(prefix)}
 
 
 def estimators(net):
@@ -35,12 +35,13 @@ def test_noise_does_not_change_within_a_cycle(network, state):
     net.run_to(state)
     net.change('bs', receiver_noise=False)
     waits = state is not State.RESTING
-    assert told(net, 'bs', 'pending') == ({'pending.receiver_noise': 'false'} if waits else {})
-    assert told(net, 'bs', 'parameter.receiver') == {
+    assert status_of(net, 'bs', 'pending') == (
+        {'pending.receiver_noise': 'false'} if waits else {})
+    assert status_of(net, 'bs', 'parameter.receiver') == {
         'parameter.receiver_noise': str(waits).lower()}
     net.run_cycles(3)
     assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
-    assert told(net, 'bs', 'pending') == {}
+    assert status_of(net, 'bs', 'pending') == {}
     assert net.logged('bs') == ["from now on: receiver_noise 'false'"]
     # The reference signals use the noise setting at the time of the grant.
     net.verify()
@@ -109,8 +110,8 @@ def test_retries_change_after_the_cycle(network):
 def test_settings_take_effect_at_once_before_a_cycle(network):
     net = network(codebook=None)
     net.change('bs', policy='random', data_duration_s=2e-3)
-    assert told(net, 'bs', 'pending') == {}
-    assert told(net, 'bs', 'parameter.policy') == {'parameter.policy': 'random'}
+    assert status_of(net, 'bs', 'pending') == {}
+    assert status_of(net, 'bs', 'parameter.policy') == {'parameter.policy': 'random'}
 
 
 @pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING, State.BEACONING],
@@ -122,14 +123,14 @@ def test_an_estimator_changes_between_cycles_and_none_is_lost(network, state, ma
     net.run_to(state)
     net.change('positioner', estimator='ml')
     waiting = {'pending.estimator': 'ml'} if make_s else {}
-    assert told(net, 'positioner', 'pending') == waiting
-    net.run(lambda: not told(net, 'positioner', 'pending'))
+    assert status_of(net, 'positioner', 'pending') == waiting
+    net.run(lambda: not status_of(net, 'positioner', 'pending'))
     net.run_cycles(2)
     assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
     names = list(estimators(net).values())
     assert names[:2] == ['centre'] * 2
     assert names == sorted(names) and names[-1] == 'ml'
-    assert told(net, 'positioner', 'parameter.estimator') == {'parameter.estimator': 'ml'}
+    assert status_of(net, 'positioner', 'parameter.estimator') == {'parameter.estimator': 'ml'}
     assert not net['positioner'].counters
     net.verify()
 
@@ -154,12 +155,12 @@ def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(network, make_
     assert net.kept == [PositionerSettings()]
     assert net.logged('positioner')[1:] == [
         'estimator neural not used, keeping bayes: model_file: unfit']
-    assert told(net, 'positioner', 'pending') == {}
-    assert told(net, 'positioner', 'failed') == {
+    assert status_of(net, 'positioner', 'pending') == {}
+    assert status_of(net, 'positioner', 'failed') == {
         'failed.estimator': 'neural: model_file: unfit'}
     net.change('positioner', estimator='ml')
-    assert told(net, 'positioner', 'failed') == {}
-    net.run(lambda: not told(net, 'positioner', 'pending'))
+    assert status_of(net, 'positioner', 'failed') == {}
+    net.run(lambda: not status_of(net, 'positioner', 'pending'))
     net.run_cycles(2)
     assert list(estimators(net).values())[-1] == 'ml'
 
@@ -176,7 +177,7 @@ def test_the_last_of_several_estimators_is_used(network):
     # Reverted while it is built: nothing changes.
     net.change('positioner', estimator='bayes')
     net.change('positioner', estimator='ml')
-    assert told(net, 'positioner', 'pending') == {}
+    assert status_of(net, 'positioner', 'pending') == {}
     net.run(limit_s=5.0)
     assert list(estimators(net).values())[-1] == 'ml'
     net.verify()
@@ -191,7 +192,7 @@ def test_the_failure_of_a_replaced_estimator_is_not_logged(network):
     assert list(estimators(net).values())[-1] == 'ml'
     assert net.kept == []
     assert not [text for text in net.logged('positioner') if 'not used' in text]
-    assert told(net, 'positioner', 'failed') == {}
+    assert status_of(net, 'positioner', 'failed') == {}
 
 
 @pytest.mark.parametrize('codebook_first', [True, False])
@@ -240,7 +241,7 @@ def test_impairments_change_when_a_cycle_begins(network):
     net.run_to(State.SOUNDING)
     net.change('channel', delay_s=0.2)
     begin_s = net.now_s
-    assert told(net, 'channel', 'pending') == {'pending.delay_s': '0.2'}
+    assert status_of(net, 'channel', 'pending') == {'pending.delay_s': '0.2'}
     net.run_cycles(1)
     assert net.now_s - begin_s < 0.2
     net.run_to(State.CONFIGURING)
@@ -248,7 +249,7 @@ def test_impairments_change_when_a_cycle_begins(network):
     net.run_cycles(1)
     # Two bands and the data.
     assert net.now_s - begin_s > 0.6
-    assert told(net, 'channel', 'p') == {
+    assert status_of(net, 'channel', 'p') == {
         'parameter.loss_probability': '0.0', 'parameter.double_probability': '0.0',
         'parameter.delay_s': '0.2', 'parameter.jitter_s': '0.0'}
     assert net.served() == [1, 1, 1]

@@ -26,18 +26,18 @@ from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.state_machine import ANY, SAME, StateMachine, always, rows_for
 from rhs_isac_ros.protocol.user_scheduler import POLICIES
 
-# The first state, the states without a time-out, and the state in which a role ends that receives
+# The first state, the states without a time-out, and the state that a role reaches if it receives
 # no messages.
 ROLES = {
     'bs': types.SimpleNamespace(
-        machine=bs.BaseStation, initial=State.WAITING, home=State.BEACONING,
+        machine=bs.BaseStation, initial=State.WAITING, final=State.BEACONING,
         endless={State.WAITING}, events={Tick, CodebookOffered, PeersChanged, SettingsOffered}),
     'user': types.SimpleNamespace(
-        machine=user.User, initial=user.State.DISCONNECTED, home=user.State.NO_BEACON,
+        machine=user.User, initial=user.State.DISCONNECTED, final=user.State.NO_BEACON,
         endless={user.State.DISCONNECTED, user.State.NO_BEACON}, events={Tick, PeersChanged}),
     'rhs_controller': types.SimpleNamespace(
         machine=rhs_controller.RhsController, initial=rhs_controller.State.IDLE,
-        home=rhs_controller.State.POSITIONING, endless=set(rhs_controller.State),
+        final=rhs_controller.State.POSITIONING, endless=set(rhs_controller.State),
         events={CodebookOffered}),
 }
 TIMED = [(name, state) for name, role in ROLES.items()
@@ -133,9 +133,9 @@ def test_every_state_is_reachable(role):
     assert reachable(role, role.initial) == set(role.machine.STATES)
 
 
-def test_home_is_reachable_from_every_state(role):
+def test_the_final_state_is_reachable_from_every_state(role):
     for state in role.machine.STATES:
-        assert role.home in reachable(role, state)
+        assert role.final in reachable(role, state)
 
 
 def test_every_state_can_be_left(role):
@@ -150,20 +150,20 @@ def test_exactly_the_states_with_a_timeout_have_rows_for_a_tick():
 
 
 @pytest.mark.parametrize(('name', 'state'), TIMED)
-def test_timeouts_alone_lead_home(name, state):
+def test_timeouts_alone_lead_to_the_final_state(name, state):
     """The last row for a tick has no guard: it ends the state whatever the memory holds."""
     role, path = ROLES[name], [state]
-    while path[-1] is not role.home:
+    while path[-1] is not role.final:
         row = rows_for(role.machine.TABLE, path[-1], Tick)[-1]
         assert row.guard is always
         assert row.target is not SAME and row.target not in path
         path.append(row.target)
-    at_home = rows_for(role.machine.TABLE, role.home, Tick)
-    if role.home in role.endless:
-        assert at_home == []
+    final_rows = rows_for(role.machine.TABLE, role.final, Tick)
+    if role.final in role.endless:
+        assert final_rows == []
     else:
-        assert at_home[-1].target is SAME
-        assert at_home[-1].restart_timeout
+        assert final_rows[-1].target is SAME
+        assert final_rows[-1].restart_timeout
 
 
 @pytest.mark.parametrize(('name', 'state'), TIMED)
@@ -194,15 +194,15 @@ def test_repeated_steps_restart_their_timeout_or_the_users_cycle():
 
 
 @pytest.mark.parametrize('name', ROLES)
-def test_rows_that_refuse_come_before_rows_of_single_states(name):
+def test_rows_that_drop_messages_precede_rows_of_single_states(name):
     """A message that is wrong is counted as such in every state."""
-    refusals = {outcome for outcome in Outcome if outcome.value.startswith('wrong')}
-    refusals |= {Outcome.NOT_ALLOWED, Outcome.TOO_OFTEN, Outcome.CROWDED, Outcome.STALE_BEACON,
+    dropped = {outcome for outcome in Outcome if outcome.value.startswith('wrong')}
+    dropped |= {Outcome.NOT_ALLOWED, Outcome.TOO_OFTEN, Outcome.CROWDED, Outcome.STALE_BEACON,
                  Outcome.STALE_COMMAND, Outcome.LATE_GRANT}
     table = ROLES[name].machine.TABLE
-    assert {row.outcome for row in table} & refusals
+    assert {row.outcome for row in table} & dropped
     for number, row in enumerate(table):
-        if row.outcome in refusals:
+        if row.outcome in dropped:
             assert row.source is ANY
             assert row.target is SAME
             earlier = [other for other in table[:number] if other.event is row.event]

@@ -150,7 +150,7 @@ def test_optimizers_of_other_namespaces_are_ignored(
     assert ids(got) == ids(far) == [stored['first'].id, stored['second'].id]
 
 
-def test_a_codebook_that_does_not_fit_is_refused_with_one_error(
+def test_a_codebook_that_does_not_fit_is_rejected_with_one_error(
         bench, follow, optimizer_of, stored, small, random_beams, capfd):
     unsuitable = bench.add(OptimizerNode)
     got = follow(small.scenario)

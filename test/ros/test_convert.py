@@ -174,7 +174,7 @@ COMPLEX = 'FeedSignals.signals'
     (REAL, ros.RealArray(shape=[2**32 - 1] * 8, data=[1.0])),
     (REAL, ros.RealArray(shape=[1] * 200, data=[1.0])),
 ])
-def test_an_array_that_does_not_fill_its_shape_is_refused(where, array):
+def test_an_array_that_does_not_fill_its_shape_is_rejected(where, array):
     name, _, field = where.partition('.')
     kind = getattr(m, name)
     message = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
@@ -193,7 +193,7 @@ def test_a_value_without_a_shape_is_not_a_vector():
 @pytest.mark.parametrize(('kind', 'field', 'number'), [
     (m.RhsConfiguration, 'mode', 2), (m.Data, 'direction', 2), (m.Data, 'stage', 255),
     (m.ProtocolState, 'phase', 5)])
-def test_an_unknown_constant_is_refused(kind, field, number):
+def test_an_unknown_constant_is_rejected(kind, field, number):
     message = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
     setattr(message, field, number)
     with pytest.raises(MessageError, match=rf'^{kind.__name__}.{field}: {number} '):
@@ -222,14 +222,14 @@ def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):
     assert back.id == shipped.id
 
 
-def test_a_codebook_without_a_bound_survives_a_round_trip(small):
+def test_a_round_trip_preserves_a_codebook_without_a_bound(small):
     assert math.isnan(small.codebook.average_crlb_m2)
     back = convert.codebook_from_ros(convert.codebook_to_ros(small.codebook, STAMP))
     assert math.isnan(back.average_crlb_m2)
     assert back.id == small.codebook.id
 
 
-def test_a_malformed_codebook_is_refused(shipped):
+def test_a_malformed_codebook_is_rejected(shipped):
     sent = convert.codebook_to_ros(shipped, STAMP)
     sent.analog.data = sent.analog.data[:-1]
     with pytest.raises(MessageError, match='^Codebook: 799 values'):

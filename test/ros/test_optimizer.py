@@ -138,7 +138,7 @@ def wrong_sets():
 
 
 @pytest.mark.parametrize('name', wrong_sets())
-def test_a_change_to_an_invalid_codebook_is_refused_as_a_whole(
+def test_a_change_to_an_invalid_codebook_is_rejected_as_a_whole(
         bench, optimizer, client, probe, shipped, other, name):
     received = latched(bench, probe)
     changes, text = wrong_sets()[name]
@@ -160,7 +160,7 @@ def test_a_change_to_an_invalid_codebook_is_refused_as_a_whole(
 
 
 @pytest.mark.parametrize('name', [*TYPES, 'codebook.provenance'])
-def test_a_value_of_another_type_is_refused(bench, optimizer, client, shipped, name):
+def test_a_value_of_another_type_is_rejected(bench, optimizer, client, shipped, name):
     for wrong in (Parameter(name, value=True), Parameter(name, Parameter.Type.NOT_SET)):
         result, = bench.result(client.set_parameters([wrong])).results
         assert not result.successful
@@ -214,7 +214,7 @@ def test_scenario_and_codebook_come_from_the_given_files(bench, small, small_fil
     ('scenario_file', 'n_feed: 3', ScenarioError, 'n_feed: unknown field'),
     ('scenario_file', 'n_feeds: 2', CodebookError, r'digital: shape \(2, 8, 4, 3\), expected'),
 ])
-def test_a_bad_file_is_refused_at_the_start(bench, tmp_path, name, content, error, text):
+def test_a_bad_file_is_rejected_at_the_start(bench, tmp_path, name, content, error, text):
     path = tmp_path / 'bad.yaml'
     if content is not None:
         path.write_text(content, encoding='utf-8')
@@ -222,12 +222,12 @@ def test_a_bad_file_is_refused_at_the_start(bench, tmp_path, name, content, erro
         bench.add(OptimizerNode, parameter_overrides=[Parameter(name, value=str(path))])
 
 
-def test_a_bad_codebook_is_refused_at_the_start(bench):
+def test_a_bad_codebook_is_rejected_at_the_start(bench):
     with pytest.raises(CodebookError, match='codebook.id'):
         bench.add(OptimizerNode, parameter_overrides=[
             Parameter('codebook.id', value='deadbeefdeadbeef')])
 
 
-def test_a_parameter_of_the_wrong_type_is_refused_at_the_start(bench):
+def test_a_parameter_of_the_wrong_type_is_rejected_at_the_start(bench):
     with pytest.raises(ParameterError, match='codebook_file: .*expected a string'):
         bench.add(OptimizerNode, parameter_overrides=[Parameter('codebook_file', value=1)])

@@ -55,7 +55,7 @@ def wrong_values(p):
 
 @pytest.mark.parametrize(('executable', 'parameter'), DYNAMIC,
                          ids=[f'{executable}-{p.name}' for executable, p in DYNAMIC])
-def test_an_invalid_value_is_refused_with_a_reason(make, executable, parameter):
+def test_an_invalid_value_is_rejected_with_a_reason(make, executable, parameter):
     node = make(executable)
     before = node.get_parameter(parameter.name).value
     for wrong in wrong_values(parameter):
@@ -78,7 +78,7 @@ def test_an_invalid_value_is_refused_with_a_reason(make, executable, parameter):
     ('positioner', {'estimator': 'neural', 'model_file': '/no/model.npz'},
      'model_file: /no/model.npz: '),
 ])
-def test_a_value_that_contradicts_other_parameters_scenario_or_files_is_refused(
+def test_a_value_that_contradicts_other_parameters_scenario_or_files_is_rejected(
         make, executable, values, reason):
     node = make(executable)
     result = set_together(node, **values)
@@ -95,7 +95,7 @@ def test_parameters_that_are_set_together_are_offered_together(make):
         (0.5, 0.25, 0.0), (0.5, 0.25, 0.125)]
 
 
-def test_parameters_that_are_set_together_are_accepted_or_refused_together(make):
+def test_parameters_that_are_set_together_are_accepted_or_rejected_together(make):
     node = make('bs')
     result = set_together(node, policy='first', rest_s=-1.0)
     assert not result.successful

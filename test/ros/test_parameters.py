@@ -102,7 +102,7 @@ def test_numbers_have_ranges_and_texts_are_sentences(executable, parameter):
 
 
 @each_parameter
-def test_a_value_of_another_type_is_refused(make, executable, parameter):
+def test_a_value_of_another_type_is_rejected(make, executable, parameter):
     others = {bool: 'yes', int: 2.5, float: 3, str: 17, list: ['1', '2']}
     wrong = others[type(parameter.default)]
     text = refusal(make, executable, parameter.name, wrong)
@@ -112,7 +112,7 @@ def test_a_value_of_another_type_is_refused(make, executable, parameter):
 
 
 @only(lambda p: isinstance(p.default, int | float) and not isinstance(p.default, bool))
-def test_a_number_given_as_a_string_is_refused(make, executable, parameter):
+def test_a_number_given_as_a_string_is_rejected(make, executable, parameter):
     # `ros2 param set` sends 28e9 as a string.
     text = refusal(make, executable, parameter.name, '28e9')
     assert text.startswith(f'{parameter.name}: ')
@@ -138,7 +138,7 @@ def test_a_range_includes_its_ends_and_nothing_beyond(make, executable, paramete
 
 @has_fractions
 @pytest.mark.parametrize('number', [math.nan, math.inf, -math.inf])
-def test_a_number_that_is_not_finite_is_refused(make, executable, parameter, number):
+def test_a_number_that_is_not_finite_is_rejected(make, executable, parameter, number):
     text = refusal(make, executable, parameter.name, value_of(parameter, number))
     assert text.startswith(f'{parameter.name}: ')
     assert str(number) in text
@@ -146,7 +146,7 @@ def test_a_number_that_is_not_finite_is_refused(make, executable, parameter, num
 
 
 @has_choices
-def test_choices_are_accepted_and_other_strings_refused(make, executable, parameter):
+def test_choices_are_accepted_and_other_strings_rejected(make, executable, parameter):
     for choice in parameter.choices:
         node = make(**{parameter.name: choice})
         assert getattr(declare(node, executable), parameter.name) == choice
@@ -227,7 +227,7 @@ def test_nodes_share_declarations_of_equal_names():
     ({'mobility': 'random_walk', 'speed_mps': 5.6},
      r'speed_mps: 5.6, expected at most max_user_speed_mps = 5.55'),
 ])
-def test_values_of_a_user_that_contradict_the_scenario_are_refused(bench, values, text):
+def test_values_of_a_user_that_contradict_the_scenario_are_rejected(bench, values, text):
     overrides = [Parameter(name, value=value) for name, value in values.items()]
     with pytest.raises(ParameterError, match=text):
         bench.add(UserNode, parameter_overrides=overrides)
@@ -260,7 +260,7 @@ def test_a_user_without_a_position_starts_in_the_region(bench):
     assert first != second
 
 
-def test_a_band_beyond_those_of_the_scenario_is_refused(bench):
+def test_a_band_beyond_those_of_the_scenario_is_rejected(bench):
     with pytest.raises(ParameterError, match='band: 2, expected 0 to 1 of the scenario'):
         bench.add(TransmissionNode, parameter_overrides=[Parameter('band', value=2)])
 
@@ -303,7 +303,7 @@ def test_a_plug_in_moves_the_user(bench, install, position, place):
             'rhs_isac_ros.mobilities; installed: climb, nothing'),
     ('nothing', 'mobility: entry point .*: nothing = moves:nothing of moves: returned None'),
 ])
-def test_an_invalid_mobility_is_refused(bench, install, name, words):
+def test_an_invalid_mobility_is_rejected(bench, install, name, words):
     install('moves', MOBILITIES, {plugins.MOBILITIES: {'climb': 'Climb', 'nothing': 'nothing'}})
     with pytest.raises(ParameterError, match=words):
         bench.add(UserNode, parameter_overrides=[Parameter('mobility', value=name)])

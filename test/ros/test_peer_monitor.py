@@ -82,8 +82,8 @@ def test_a_role_without_one_of_its_endpoints_is_missing(bench, monitor, owner, r
     node = bench.add(Node, role)
     create_endpoints(node, partial)
     # The presence of a role without requirements shows that the graph was polled.
-    reports = monitor({role: endpoints, 'decoy': Endpoints((), ())})
-    bench.until(lambda: reports and 'decoy' not in reports[-1], 'a poll of the graph')
+    reports = monitor({role: endpoints, 'always_present': Endpoints((), ())})
+    bench.until(lambda: reports and 'always_present' not in reports[-1], 'a poll of the graph')
     assert reports[-1] == (role,)
     create_endpoints(node, ([kind], []) if side == 0 else ([], [kind]))
     bench.until(lambda: reports[-1] == (), f'presence of {role}')
@@ -111,8 +111,8 @@ def test_a_role_is_present_from_the_second_poll_in_a_row_that_finds_it():
 def test_a_monitor_observes_its_own_namespace_only(bench, monitor):
     required = {'channel': REQUIRED_BY_USER['channel']}
     create_endpoints(bench.add(Node, 'channel', namespace='/b'), required['channel'])
-    reports = monitor({**required, 'decoy': Endpoints((), ())}, '-r', '__ns:=/a')
-    bench.until(lambda: reports and 'decoy' not in reports[-1], 'a poll of the graph')
+    reports = monitor({**required, 'always_present': Endpoints((), ())}, '-r', '__ns:=/a')
+    bench.until(lambda: reports and 'always_present' not in reports[-1], 'a poll of the graph')
     assert reports[-1] == ('channel',)
     create_endpoints(bench.add(Node, 'channel', namespace='/a'), required['channel'])
     bench.until(lambda: reports[-1] == (), 'presence')
@@ -126,7 +126,7 @@ def test_a_monitor_follows_remapped_topics(bench, monitor):
     bench.until(lambda: () in reports, 'presence')
 
 
-def test_a_node_counts_once_it_is_ready(bench, monitor):
+def test_a_node_is_reported_as_present_when_it_is_ready(bench, monitor):
     """The channel is ready at once; the positioner subscribes when it has an estimator."""
     reports = monitor({role: REQUIRED_BY_BASE_STATION[role] for role in ('channel', 'positioner')})
     bench.add(ChannelNode)

@@ -143,7 +143,7 @@ class TestNeural:
         model.save(tmp_path / 'model.npz')
         return {'estimator': 'neural', 'model_file': str(tmp_path / 'model.npz')}
 
-    def test_its_model_is_used_for_one_codebook_and_refused_for_another(
+    def test_its_model_is_used_for_one_codebook_and_rejected_for_another(
             self, bench, node, send, codebooks, monkeypatch):
         logged = []
         monkeypatch.setattr(node, 'get_logger', lambda: types.SimpleNamespace(
@@ -205,7 +205,7 @@ def fails(scenario, codebook):
              r"rhs_isac_ros.estimators; installed: absent, fails"),
     ('absent', 'estimator: entry point .*: absent = guesses:Absent of guesses: cannot be loaded'),
 ])
-def test_a_missing_plug_in_is_refused_at_the_start(bench, install, name, words):
+def test_a_missing_plug_in_is_rejected_at_the_start(bench, install, name, words):
     install('guesses', TestPlugin.CODE, {
         plugins.ESTIMATORS: {'fails': 'fails', 'absent': 'Absent'}})
     with pytest.raises(ParameterError, match=words):

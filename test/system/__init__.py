@@ -1,1 +1,1 @@
-"""Rigs that test a whole network: crashes, impairments, fuzzing and several hosts."""
+"""Trials of a whole network: crashes, impairments, fuzzing and several hosts."""

@@ -1,4 +1,4 @@
-"""The observer of both rigs: cycles, invariants and diagnostics of a running network."""
+"""The observer of both kinds of trials: cycles, invariants and diagnostics of a network."""
 
 import contextlib
 import time
@@ -24,7 +24,7 @@ from rhs_isac_ros.ros.subscriptions import subscribe
 class NetworkObserver(CycleObserver):
     """Collects the cycles of a network, checks its results and keeps its diagnostics.
 
-    Malformed messages are ignored: counting them is up to the nodes.
+    Malformed messages are ignored here; the nodes count them.
 
     Attributes
     ----------

@@ -24,7 +24,7 @@ def snapshot(tmp_path):
     return call
 
 
-def test_it_draws_a_running_network(shared_session, snapshot, tmp_path):
+def test_snapshot_draws_a_running_network(shared_session, snapshot, tmp_path):
     done = snapshot('--config', ROOT / 'config' / 'quick.yaml', '--output', 'now.png')
     assert (done.returncode, done.stdout, done.stderr) == (0, 'now.png\n', '')
     assert [path.name for path in tmp_path.iterdir()] == ['now.png']

@@ -91,5 +91,5 @@ def test_hz_reports_until_it_is_interrupted(shared_session):
     assert float(found[1]) > 1
 
 
-def test_it_exits_when_the_reader_closes_the_pipe(run_script):
+def test_topic_exits_when_the_reader_closes_the_pipe(run_script):
     assert run_script('scripts/topic echo ground_truth | head -n 2') == 'header:\n  stamp:\n'

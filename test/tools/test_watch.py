@@ -76,7 +76,7 @@ def test_once_prints_a_cycle_and_every_node(network, run_script):
         assert re.search(f'^ {node} .*(no fault|just now) ', text, re.MULTILINE), text
 
 
-def test_it_refreshes_the_terminal_until_it_is_interrupted(network):
+def test_watch_refreshes_the_terminal_until_it_is_interrupted(network):
     parent, child = pty.openpty()
     with subprocess.Popen([SCRIPT], stdin=child, stdout=child, stderr=child) as process:
         os.close(child)
@@ -96,7 +96,7 @@ def test_it_refreshes_the_terminal_until_it_is_interrupted(network):
     assert text.rstrip().endswith(b'\x1b[?1049l')
 
 
-def test_it_exits_when_the_reader_closes_the_pipe(network, run_script):
+def test_watch_exits_when_the_reader_closes_the_pipe(network, run_script):
     assert run_script(f'{{ {SCRIPT}; echo $? >&3; }} 3>&1 >&1 | head -n 1; true')
 
 

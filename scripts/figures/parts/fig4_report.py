@@ -81,7 +81,7 @@ class Summary:
 
 
 def picture(summary: Summary) -> bytes:
-    """Draw (a), trainings as dots in their distribution, and (b), box plots of the losses."""
+    """Draw (a) errors, one dot per training over their distribution, (b) box plots of losses."""
     with optional_import('drawing the figure', extra='plot'):
         from matplotlib.figure import Figure
     figure = Figure(figsize=(11, 4), layout='constrained')

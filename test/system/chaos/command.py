@@ -152,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
                         help="scenario file; by default the paper's Table I")
     parser.add_argument('--codebook', type=Path,
                         help='codebook file; by default that of the package')
-    parser.add_argument('--json', type=Path, metavar='PATH', help='file for the figures')
+    parser.add_argument('--json', type=Path, metavar='PATH', help='JSON file for the results')
     return parser
 
 

@@ -47,11 +47,11 @@ class CrashTrial:
     node, phase
         The node that was killed, and the phase.
     kill_delay_s
-        Time from the observed begin of the phase to the death of the process [s].
+        Time from the observed start of the phase to the end of the process [s].
     recovery_s
         Time from the restart of the process to the end of the first cycle that was served after
         it, for a user of one of its own cycles [s]; infinite if there was none.
-    survivors
+    others_running
         Whether all other processes kept running.
     logged
         Warnings that other nodes logged about the missing node, each as ``<node>: <text>``.
@@ -65,7 +65,7 @@ class CrashTrial:
     phase: str
     kill_delay_s: float
     recovery_s: float
-    survivors: bool
+    others_running: bool
     logged: tuple[str, ...]
     diagnosed: tuple[str, ...]
     violations: tuple[str, ...]
@@ -73,7 +73,7 @@ class CrashTrial:
     @property
     def recovered(self) -> bool:
         """Whether cycles were served in time and all other processes kept running."""
-        return self.recovery_s <= RECOVERY_LIMIT_S and self.survivors
+        return self.recovery_s <= RECOVERY_LIMIT_S and self.others_running
 
     @property
     def reported(self) -> bool:
@@ -154,7 +154,7 @@ def _wait_for_service(observer: NetworkObserver) -> None:
     first = len(observer.log.ended)
     if not observer.spin_until(lambda: both_served(observer, first), _TIMEOUT_S):
         outcomes = [record.outcome for record in observer.log.ended[first:]]
-        raise ChaosError(f'the users are not served within {_TIMEOUT_S:g} s; outcomes of the '
+        raise ChaosError(f'the users were not served within {_TIMEOUT_S:g} s; outcomes of the '
                          f'cycles: {outcomes or "none"}')
 
 
@@ -171,7 +171,7 @@ def _kill_in(
     observer.on_phase = kill
     try:
         if not observer.spin_until(lambda: bool(delays_s), _TIMEOUT_S):
-            raise ChaosError(f'no cycle enters the phase {phase.name} within {_TIMEOUT_S:g} s')
+            raise ChaosError(f'no cycle entered the phase {phase.name} within {_TIMEOUT_S:g} s')
     finally:
         observer.on_phase = lambda entered: None
     return delays_s[0]

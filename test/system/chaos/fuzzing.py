@@ -88,8 +88,8 @@ class _Mutator:
 
     def publish(self, rng: np.random.Generator) -> bytes:
         """Publish a mutation, and return it."""
-        # The counters are read from the diagnostics, so these are random but never mutated: no
-        # mutation may carry the name of a node.
+        # Diagnostics are random messages, not mutations: a mutation could carry the name of a node
+        # and falsify the counters, which are read from the diagnostics.
         originals = () if self.name == topics.DIAGNOSTICS else self.originals
         content = mutate(self._kind, originals, rng)
         self._published.append(content)
@@ -180,7 +180,7 @@ def fuzz(
         # Queues overflow unless every node has received all mutations before the next ones.
         if not observer.spin_until(
                 lambda: bool(processes.ended()) or counters.all_received(sent), _TIMEOUT_S):
-            raise ChaosError(f'not all mutations are received within {_TIMEOUT_S:g} s')
+            raise ChaosError(f'not all mutations were received within {_TIMEOUT_S:g} s')
         on_progress(sent.total())
     return _result(observer, processes, counters, sent, malformed)
 

@@ -33,7 +33,8 @@ def mutate(kind: type, originals: Sequence[bytes], rng: np.random.Generator) -> 
     Returns
     -------
     bytes
-        A random message, or an original with a changed field, changed bytes, or a missing end.
+        A random message, or an original with a changed field, with changed bytes, or without its
+        last bytes.
         The first four bytes, the CDR header, are always intact: Fast DDS does not deliver a
         message without them.
     """

@@ -18,10 +18,10 @@ def crash_line(trial: CrashTrial) -> str:
     """Return a trial as a row of the table, followed by its violations."""
     loggers = sorted({line.partition(':')[0] for line in trial.logged})
     reporters = f'{", ".join(loggers) or "-"}; {", ".join(trial.diagnosed) or "-"}'
-    others = 'alive' if trial.survivors else 'DEAD'
+    others = 'running' if trial.others_running else 'ENDED'
     marks = ('' if trial.recovered else '  NOT IN TIME') + (
         '' if trial.reported else '  NOT REPORTED ONCE')
-    row = (f'{trial.node:15s} {trial.phase:14s} {trial.recovery_s:7.2f} s   {others:6s}   '
+    row = (f'{trial.node:15s} {trial.phase:14s} {trial.recovery_s:7.2f} s   {others:7s}  '
            f'{reporters}{marks}')
     return '\n'.join([row, *(f'  VIOLATION: {text}' for text in trial.violations)])
 

@@ -14,7 +14,7 @@ from system.chaos.soaking import SoakResult
 
 def crash_trial(**fields):
     given = {'node': 'rhs_controller', 'phase': 'positioning', 'kill_delay_s': 1e-3,
-             'recovery_s': 1.0, 'survivors': True,
+             'recovery_s': 1.0, 'others_running': True,
              'logged': ('bs: user 1 given up: rhs_silent',), 'diagnosed': ('bs',),
              'violations': ()}
     return CrashTrial(**given | fields)
@@ -34,15 +34,16 @@ def test_trials_with_recovery_and_reports_pass():
     assert (figures['worst_recovery_s'], figures['wrong_publications']) == (2.5, 0)
     assert '2 of 2 recovered' in report.crash_summary(figures)
     assert report.crash_line(crash_trial()).split() == [
-        'rhs_controller', 'positioning', '1.00', 's', 'alive', 'bs;', 'bs']
+        'rhs_controller', 'positioning', '1.00', 's', 'running', 'bs;', 'bs']
 
 
 @pytest.mark.parametrize('fields, mark', [
     ({'recovery_s': 3.01}, 'NOT IN TIME'), ({'recovery_s': math.inf}, 'NOT IN TIME'),
-    ({'survivors': False}, 'DEAD'), ({'logged': ()}, 'NOT REPORTED ONCE'),
+    ({'others_running': False}, 'ENDED'), ({'logged': ()}, 'NOT REPORTED ONCE'),
     ({'diagnosed': ()}, 'NOT REPORTED ONCE'),
     ({'logged': ('bs: missing', 'bs: missing')}, 'NOT REPORTED ONCE')])
-def test_a_trial_fails_if_late_dead_unreported_or_reported_twice(fields, mark):
+def test_a_trial_fails_if_recovery_is_late_a_process_ends_or_the_report_is_missing_or_repeated(
+        fields, mark):
     failed = crash_trial(**fields)
     assert not figures_of(crash_trial(), failed)['passed']
     assert mark in report.crash_line(failed)

@@ -151,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
                         help="use Fast DDS's default settings instead of the package's profile")
     parser.add_argument('--static-peers', action='store_true',
                         help='discover nodes by their addresses, without multicast')
-    parser.add_argument('--json', type=Path, metavar='PATH', help='file for the figures')
+    parser.add_argument('--json', type=Path, metavar='PATH', help='JSON file for the results')
     return parser
 
 

@@ -99,7 +99,7 @@ def test_an_outage_passes_and_namespaces_of_a_killed_run_are_removed(hold, files
     assert not namespaces_of(done.pid)
 
 
-def test_it_is_skipped_without_the_command_ip(files, monkeypatch, capsys):
+def test_the_trial_is_skipped_without_the_command_ip(files, monkeypatch, capsys):
     monkeypatch.setenv('PATH', '/nonexistent')
     for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'RMW_IMPLEMENTATION',
                  'FASTDDS_BUILTIN_TRANSPORTS', 'FASTRTPS_DEFAULT_PROFILES_FILE'):

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from rhs_isac_ros.monitoring.cycle_log import CycleTimes
-from system.hosts.verdict import figures, judge, recovery_s, table
+from system.hosts.verdict import evaluate, figures, recovery_s, table
 
 MARKS_S = (0.0, 5.0, 11.0, 14.0)
 LOGS = {'bs': '[WARN] [bs]: waiting for channel\n', 'user_1': 'listening for beacons\n'}
@@ -20,7 +20,7 @@ def cycles(*spans_s):
 
 def outage(spans_s=((1.0, 1.1), (2.0, 2.1), (4.95, 5.05), (11.5, 11.6)), logs=LOGS,
            warnings=WARNINGS, waiting=('bs',)):
-    return judge('channel', MARKS_S, cycles(*spans_s), logs, warnings, waiting)
+    return evaluate('channel', MARKS_S, cycles(*spans_s), logs, warnings, waiting)
 
 
 def test_recovery_ends_with_the_first_cycle_that_began_after_the_outage():

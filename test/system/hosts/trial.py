@@ -6,7 +6,7 @@ from rhs_isac_ros.monitoring import invariants
 from rhs_isac_ros.ros.processes import Processes
 from system.hosts import plan
 from system.hosts.namespaces import Hosts
-from system.hosts.verdict import Outage, judge
+from system.hosts.verdict import Outage, evaluate
 from system.observer import NetworkObserver
 
 # Maximum time from the start of the network to its first cycle [s].
@@ -80,7 +80,7 @@ class Trial:
         self._spin(_AFTER_S, 3)
         marks_s.append(time.monotonic())
         waiting = plan.WAITING[host] if seconds >= self._lease_s + _REPORT_DELAY_S else ()
-        return judge(
+        return evaluate(
             host, marks_s, self._observer.log.complete, logs, warnings,
             [node for node in log_lengths if node.partition('_')[0] in waiting])
 

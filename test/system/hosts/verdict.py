@@ -36,7 +36,7 @@ class Outage:
     diagnosed
         Nodes whose diagnostics reported during the outage that they wait for another node.
     unreported
-        Nodes that had to report that they wait, and did not in their log or diagnostics.
+        Nodes whose log or diagnostics lack the required report of a missing node.
     repeated
         Nodes that logged more than once that they wait for the same node.
     """
@@ -78,7 +78,7 @@ def recovery_s(cycles: Sequence[CycleTimes], restored_s: float) -> float:
                default=math.inf)
 
 
-def judge(
+def evaluate(
         host: str, marks_s: Sequence[float], cycles: Sequence[CycleTimes],
         logs: Mapping[str, str], warnings: Mapping[str, Sequence[str]],
         waiting: Sequence[str]) -> Outage:
@@ -89,7 +89,7 @@ def judge(
     host
         Name of the host.
     marks_s
-        Begin of the observation, begin and end of the outage, end of the observation [s].
+        Start of the observation, start and end of the outage, end of the observation [s].
     cycles
         Complete cycles.
     logs

@@ -1,4 +1,4 @@
-"""An estimator that weights a fixed set of positions: slow and coarse, but short."""
+"""An estimator that weights a fixed set of positions: a short example, slow and coarse."""
 
 import numpy as np
 from scipy.stats import qmc

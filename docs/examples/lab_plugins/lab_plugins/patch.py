@@ -11,7 +11,7 @@ def amplitude(angles):
 
 
 def slope(angles):
-    """Return the derivative. This function is optional: differences replace it."""
+    """Return the derivative. Without this function, it is computed by finite differences."""
     return np.where(np.cos(angles) > 0, -2 * np.sin(angles), 0.0)
 
 

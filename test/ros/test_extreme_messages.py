@@ -1,4 +1,4 @@
-"""Messages that are well-formed but absurd do not crash a node.
+"""Well-formed messages with extreme values do not crash a node.
 
 The executor raises the exceptions of callbacks in the test, so a node that would crash fails it.
 """
@@ -28,7 +28,7 @@ PLACE = np.array([10.0, 0.5, 0.2])
 HUGE = (1e100, 1e200, 1e308)
 
 
-class Stage:
+class NodeUnderTest:
     """A node under test and publishers for the messages that it receives."""
 
     def __init__(self, bench, files, kind, inputs, answers, **values):
@@ -75,16 +75,16 @@ class Stage:
 
 
 @pytest.fixture
-def stage(bench, small_files):
-    def stage(*args, **values):
-        return Stage(bench, small_files, *args, **values)
-    return stage
+def make_node(bench, small_files):
+    def make(*args, **values):
+        return NodeUnderTest(bench, small_files, *args, **values)
+    return make
 
 
 @pytest.fixture
-def channel(stage):
-    return stage(ChannelNode, (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data),
-                 m.FeedSignals)
+def channel(make_node):
+    return make_node(
+        ChannelNode, (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data), m.FeedSignals)
 
 
 def truth(cycle_id, place=PLACE):
@@ -110,20 +110,20 @@ def beam(scenario, cycle_id, amplitude=1e-3, expected_bps=1e6):
         analog=np.full(scenario.n_elements, 0.5), digital=digital, expected_bps=expected_bps)
 
 
-def send_plausible_pilot(stage):
-    stage.send(truth(9), applied(stage.scenario, 9), pilot(9))
-    stage.until_answer(9)
+def send_plausible_pilot(node):
+    node.send(truth(9), applied(node.scenario, 9), pilot(9))
+    node.until_answer(9)
 
 
 @pytest.mark.parametrize('rows', [1, 3, 5])
-def test_channel_survives_configurations_for_another_number_of_frames(channel, rows):
+def test_channel_continues_after_configurations_for_another_number_of_frames(channel, rows):
     channel.send(truth(1), applied(channel.scenario, 1, rows=rows), pilot(1))
     send_plausible_pilot(channel)
 
 
 @pytest.mark.parametrize('place', [
     (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
-def test_channel_survives_users_in_impossible_places(channel, place):
+def test_channel_continues_after_positions_outside_the_model(channel, place):
     scenario = channel.scenario
     place = element_positions(scenario)[1] if place == 'on an element' else place
     channel.send(truth(1, place), applied(scenario, 1), pilot(1),
@@ -134,7 +134,7 @@ def test_channel_survives_users_in_impossible_places(channel, place):
 
 
 @pytest.mark.parametrize('number', HUGE)
-def test_channel_survives_huge_numbers(channel, number):
+def test_channel_continues_after_huge_numbers(channel, number):
     scenario = channel.scenario
     channel.send(
         truth(1), applied(scenario, 1), pilot(1, number),
@@ -148,7 +148,7 @@ def test_channel_survives_huge_numbers(channel, number):
     send_plausible_pilot(channel)
 
 
-def test_channel_survives_messages_with_unknown_cycles(channel):
+def test_channel_continues_after_messages_with_unknown_cycles(channel):
     last = 2**64 - 1
     for cycle_id in (0, last):
         channel.send(pilot(cycle_id), applied(channel.scenario, cycle_id), truth(cycle_id),
@@ -157,9 +157,9 @@ def test_channel_survives_messages_with_unknown_cycles(channel):
     send_plausible_pilot(channel)
 
 
-def estimate(stage, cycle_id, place=PLACE):
+def estimate(node, cycle_id, place=PLACE):
     return m.PositionEstimate(
-        cycle_id=cycle_id, user=1, codebook_id=stage.codebook.id,
+        cycle_id=cycle_id, user=1, codebook_id=node.codebook.id,
         position=np.asarray(place, float), covariance_m2=np.eye(3), crlb_m2=0.1, estimator='rogue',
         latency_s=0.1)
 
@@ -167,25 +167,26 @@ def estimate(stage, cycle_id, place=PLACE):
 @pytest.mark.parametrize('place', [
     (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
 @pytest.mark.parametrize('what', ['estimate', 'truth'])
-def test_transmission_survives_impossible_places(stage, place, what):
-    stage = stage(TransmissionNode, (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth),
-                  m.Beam)
-    scenario = stage.scenario
+def test_transmission_continues_after_positions_outside_the_model(
+        make_node, place, what):
+    node = make_node(
+        TransmissionNode, (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth), m.Beam)
+    scenario = node.scenario
     place = element_positions(scenario)[1] if place == 'on an element' else place
     places = {'estimate': PLACE, 'truth': PLACE, what: place}
-    stage.send(truth(1, places['truth']), estimate(stage, 1, places['estimate']),
-               applied(scenario, 1, m.Mode.TRANSMISSION), estimate(stage, 2))
-    stage.until_answer(2)
+    node.send(truth(1, places['truth']), estimate(node, 1, places['estimate']),
+              applied(scenario, 1, m.Mode.TRANSMISSION), estimate(node, 2))
+    node.until_answer(2)
 
 
 @pytest.mark.parametrize('number', HUGE)
-def test_positioner_survives_huge_signals(stage, number):
-    stage = stage(PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
-    scenario, codebook = stage.scenario, stage.codebook
+def test_positioner_continues_after_huge_signals(make_node, number):
+    node = make_node(PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
+    scenario, codebook = node.scenario, node.codebook
     shape = codebook.digital.shape[:3]
     plausible = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(0))[0]
     received = m.ReceivedSignals(cycle_id=1, user=1, codebook_id=codebook.id,
         signals=np.full(shape, number * (1 + 1j)))
-    stage.send(received)
-    stage.send(dataclasses.replace(received, cycle_id=9, signals=plausible.reshape(shape)))
-    stage.until_answer(9)
+    node.send(received)
+    node.send(dataclasses.replace(received, cycle_id=9, signals=plausible.reshape(shape)))
+    node.until_answer(9)

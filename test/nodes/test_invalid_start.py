@@ -94,7 +94,8 @@ def never_spins(monkeypatch):
 
 
 @pytest.mark.parametrize('name', CASES)
-def test_a_bad_start_ends_with_one_clear_line(name, files, never_spins, crashed, capfd):
+def test_an_invalid_start_prints_one_line_and_exits_with_code_2(
+        name, files, never_spins, crashed, capfd):
     executable = importlib.import_module(f'rhs_isac_ros.nodes.{CASES[name][0]}')
     code = executable.main(['--ros-args', *arguments(name, files)])
     assert_clear(code, capfd.readouterr().err, name, crashed)

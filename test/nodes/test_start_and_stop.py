@@ -15,7 +15,7 @@ EXECUTABLES = ('bs', 'user', 'rhs_controller', 'channel', 'positioner', 'transmi
 
 @pytest.fixture(scope='module', params=[signal.SIGINT, signal.SIGTERM],
                 ids=lambda number: number.name)
-def life(request, module_processes, make_watch, small_files):
+def ended_network(request, module_processes, make_watch, small_files):
     """The observer of a network, and exit code and log of each process after a signal."""
     number = request.param
     namespace = f'/{number.name.lower()}'
@@ -40,26 +40,26 @@ def life(request, module_processes, make_watch, small_files):
     return types.SimpleNamespace(watch=watch, ends=ends)
 
 
-def test_cycles_begin_whatever_the_order_of_the_starts(life, small_files):
-    received = life.watch.received
+def test_cycles_begin_whatever_the_order_of_the_starts(ended_network, small_files):
+    received = ended_network.watch.received
     used = Codebook.load(small_files / 'first.yaml').id
     assert {message.codebook_id for message in received[m.ReceivedSignals]} == {used}
-    assert {message.user for message in life.watch.served} == {1}
+    assert {message.user for message in ended_network.watch.served} == {1}
     numbers = [message.cycle_id for message in received[m.Grant]]
     assert numbers == sorted(set(numbers))
 
 
 @pytest.mark.parametrize('executable', EXECUTABLES)
-def test_a_signal_ends_each_process_with_exit_code_0(life, crashed, executable):
-    code, log = life.ends[executable]
+def test_a_signal_ends_each_process_with_exit_code_0(ended_network, crashed, executable):
+    code, log = ended_network.ends[executable]
     assert code == 0, log
     assert not crashed(log), log
     assert '[ERROR]' not in log, log
 
 
-def test_repeated_signals_do_no_harm(processes, make_watch):
-    process = processes.start('rhs_controller', namespace='/impatient')
-    make_watch('/impatient').wait_for_nodes('rhs_controller')
+def test_repeated_signals_end_the_process_with_exit_code_0(processes, make_watch):
+    process = processes.start('rhs_controller', namespace='/repeated')
+    make_watch('/repeated').wait_for_nodes('rhs_controller')
     while process.running:
         process.signal(signal.SIGINT)
     assert process.wait() == 0, process.log
