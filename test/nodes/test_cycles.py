@@ -261,7 +261,7 @@ def not_finite(message):
 
 
 def test_nan_does_not_spread(network, join):
-    """A faulty node sends NaN for the present cycle."""
+    """A faulty node sends NaN for the current cycle."""
     watch, running = network.watch, network.running
     codebook = Codebook.load(default_codebook_file())
     feeds, received = watch.publisher(m.FeedSignals), watch.publisher(m.ReceivedSignals)

@@ -49,8 +49,8 @@ def test_without_a_fix_the_cycle_ends_at_once_without_a_position(network):
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'no_fix'), (3, 1, 'served')]
     assert [e.cycle_id for e in net.sent(m.PositionEstimate)] == [1, 3]
     assert not net.sent(m.Beam, cycle_id=2)
-    (told,) = net.sent(m.NoFix)
-    assert (told.cycle_id, told.user, told.reason) == (2, 1, 'nothing fits')
+    (no_fix,) = net.sent(m.NoFix)
+    assert (no_fix.cycle_id, no_fix.user, no_fix.reason) == (2, 1, 'nothing fits')
     (signals_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ReceivedSignals)
                     and s.message.cycle_id == 2]
     (end_s,) = [s.time_s for s in net.log if isinstance(s.message, m.ProtocolState)

@@ -13,7 +13,7 @@ IN_A_CYCLE = [State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERIN
 UNFIT = {'estimator': 'neural', 'model_file': 'unfit'}
 
 
-def told(net, role, beginning):
+def described(net, role, beginning):
     """Return the status values of a role whose names have a prefix."""
     return {name: value for name, value in net[role].status().items()
             if name.startswith(beginning)}
@@ -35,13 +35,14 @@ def test_noise_does_not_change_within_a_cycle(network, state):
     net.run_to(state)
     net.change('bs', receiver_noise=False)
     waits = state is not State.RESTING
-    assert told(net, 'bs', 'pending') == ({'pending.receiver_noise': 'false'} if waits else {})
-    assert told(net, 'bs', 'parameter.receiver') == {
+    pending = {'pending.receiver_noise': 'false'} if waits else {}
+    assert described(net, 'bs', 'pending') == pending
+    assert described(net, 'bs', 'parameter.receiver') == {
         'parameter.receiver_noise': str(waits).lower()}
     net.run_cycles(3)
     assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
-    assert told(net, 'bs', 'pending') == {}
-    assert net.logged('bs') == ["from now on: receiver_noise 'false'"]
+    assert described(net, 'bs', 'pending') == {}
+    assert net.logged('bs') == ["settings applied: receiver_noise 'false'"]
     # The reference signals use the noise setting at the time of the grant.
     net.verify()
     first = 4 if waits else 3
@@ -55,7 +56,7 @@ def test_a_policy_takes_effect_with_the_next_cycle_and_keeps_the_turns(network):
     net.run_to(State.SOUNDING)
     net.change('bs', policy='first')
     net.run_cycles(3)
-    # The rest of the present cycle, then the first user to answer; all answer at once.
+    # The rest of the current cycle, then the first user to answer; all answer at once.
     first = net.sent(m.Ack, cycle_id=4)[0].user
     assert net.served() == [1, 2, 3, first, first]
     net.change('bs', policy='round_robin')
@@ -109,8 +110,8 @@ def test_retries_change_after_the_cycle(network):
 def test_settings_take_effect_at_once_before_a_cycle(network):
     net = network(codebook=None)
     net.change('bs', policy='random', data_duration_s=2e-3)
-    assert told(net, 'bs', 'pending') == {}
-    assert told(net, 'bs', 'parameter.policy') == {'parameter.policy': 'random'}
+    assert described(net, 'bs', 'pending') == {}
+    assert described(net, 'bs', 'parameter.policy') == {'parameter.policy': 'random'}
 
 
 @pytest.mark.parametrize('state', [*IN_A_CYCLE, State.RESTING, State.BEACONING],
@@ -122,14 +123,14 @@ def test_an_estimator_changes_between_cycles_and_none_is_lost(network, state, ma
     net.run_to(state)
     net.change('positioner', estimator='ml')
     waiting = {'pending.estimator': 'ml'} if make_s else {}
-    assert told(net, 'positioner', 'pending') == waiting
-    net.run(lambda: not told(net, 'positioner', 'pending'))
+    assert described(net, 'positioner', 'pending') == waiting
+    net.run(lambda: not described(net, 'positioner', 'pending'))
     net.run_cycles(2)
     assert {outcome for _, _, outcome in net.outcomes()} == {'served'}
     names = list(estimators(net).values())
     assert names[:2] == ['centre'] * 2
     assert names == sorted(names) and names[-1] == 'ml'
-    assert told(net, 'positioner', 'parameter.estimator') == {'parameter.estimator': 'ml'}
+    assert described(net, 'positioner', 'parameter.estimator') == {'parameter.estimator': 'ml'}
     assert not net['positioner'].counters
     net.verify()
 
@@ -153,13 +154,13 @@ def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(network, make_
     assert set(estimators(net).values()) == {'centre'}
     assert net.kept == [PositionerSettings()]
     assert net.logged('positioner')[1:] == [
-        'estimator neural not used, keeping bayes: model_file: unfit']
-    assert told(net, 'positioner', 'pending') == {}
-    assert told(net, 'positioner', 'failed') == {
+        'cannot build estimator neural, keeping bayes: model_file: unfit']
+    assert described(net, 'positioner', 'pending') == {}
+    assert described(net, 'positioner', 'failed') == {
         'failed.estimator': 'neural: model_file: unfit'}
     net.change('positioner', estimator='ml')
-    assert told(net, 'positioner', 'failed') == {}
-    net.run(lambda: not told(net, 'positioner', 'pending'))
+    assert described(net, 'positioner', 'failed') == {}
+    net.run(lambda: not described(net, 'positioner', 'pending'))
     net.run_cycles(2)
     assert list(estimators(net).values())[-1] == 'ml'
 
@@ -176,7 +177,7 @@ def test_the_last_of_several_estimators_is_used(network):
     # Reverted while it is built: nothing changes.
     net.change('positioner', estimator='bayes')
     net.change('positioner', estimator='ml')
-    assert told(net, 'positioner', 'pending') == {}
+    assert described(net, 'positioner', 'pending') == {}
     net.run(limit_s=5.0)
     assert list(estimators(net).values())[-1] == 'ml'
     net.verify()
@@ -191,7 +192,7 @@ def test_the_failure_of_a_replaced_estimator_is_not_logged(network):
     assert list(estimators(net).values())[-1] == 'ml'
     assert net.kept == []
     assert not [text for text in net.logged('positioner') if 'not used' in text]
-    assert told(net, 'positioner', 'failed') == {}
+    assert described(net, 'positioner', 'failed') == {}
 
 
 @pytest.mark.parametrize('codebook_first', [True, False])
@@ -212,7 +213,7 @@ def test_estimator_and_codebook_change_together(network, codebooks, codebook_fir
     net.verify()
 
 
-def test_a_codebook_offered_again_uses_the_newest_estimator(network, codebooks):
+def test_a_codebook_offered_again_uses_the_latest_estimator(network, codebooks):
     net = network()
     net.run_cycles(1)
     net.offer(codebooks[1])
@@ -240,7 +241,7 @@ def test_impairments_change_when_a_cycle_begins(network):
     net.run_to(State.SOUNDING)
     net.change('channel', delay_s=0.2)
     begin_s = net.now_s
-    assert told(net, 'channel', 'pending') == {'pending.delay_s': '0.2'}
+    assert described(net, 'channel', 'pending') == {'pending.delay_s': '0.2'}
     net.run_cycles(1)
     assert net.now_s - begin_s < 0.2
     net.run_to(State.CONFIGURING)
@@ -248,7 +249,7 @@ def test_impairments_change_when_a_cycle_begins(network):
     net.run_cycles(1)
     # Two bands and the data.
     assert net.now_s - begin_s > 0.6
-    assert told(net, 'channel', 'p') == {
+    assert described(net, 'channel', 'p') == {
         'parameter.loss_probability': '0.0', 'parameter.double_probability': '0.0',
         'parameter.delay_s': '0.2', 'parameter.jitter_s': '0.0'}
     assert net.served() == [1, 1, 1]
