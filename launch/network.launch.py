@@ -71,7 +71,7 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
 
 
 def _recorder(context: LaunchContext) -> list[Node]:
-    """Return the recorder, which starts first: it misses earlier messages that are not latched."""
+    """Return the recorder, which starts first because it misses earlier unlatched messages."""
     file = LaunchConfiguration('record').perform(context)
     if not file:
         return []

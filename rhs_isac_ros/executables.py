@@ -1,7 +1,7 @@
 """The entry points of the executables, which handle signals before anything slow is imported.
 
-Importing ROS, NumPy and the nodes takes a moment. A signal during that time would end in a
-traceback; here it ends the process with exit code 0, as a signal does later on.
+Importing ROS, NumPy and the nodes takes a moment. A signal during that time would cause a
+traceback; the handlers set here end the process with exit code 0 instead, as a later signal does.
 """
 
 import importlib

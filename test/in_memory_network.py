@@ -27,10 +27,10 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
     PeersChanged,
+    RevertSettings,
     Send,
     SettingsOffered,
-    SettingsReverted,
-    Tick,
+    Timeout,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
@@ -189,7 +189,7 @@ class Network:
     def change(self, name: str, **values) -> None:
         """Offer new settings to a role: those offered last, with these values replaced."""
         role = self._roles[name]
-        self.dispatch(name, SettingsOffered(dataclasses.replace(role._settings.newest, **values)))
+        self.dispatch(name, SettingsOffered(dataclasses.replace(role._settings.latest, **values)))
 
     def dispatch(self, name: str, event) -> None:
         for action in self._roles[name].handle(event, self.now_s):
@@ -197,7 +197,7 @@ class Network:
                 self.publish(action.message, name)
             elif isinstance(action, BuildEstimator):
                 self._make_estimator(name, action)
-            elif isinstance(action, SettingsReverted):
+            elif isinstance(action, RevertSettings):
                 self.kept.append(action.settings)
             else:
                 self.logs.append(Logged(self.now_s, name, action))
@@ -255,7 +255,7 @@ class Network:
                 return
             if due_s < arrival_s:
                 self.now_s = max(self.now_s, due_s)
-                self.dispatch(name, Tick())
+                self.dispatch(name, Timeout())
             else:
                 self.now_s, _, name, role, message = heapq.heappop(self._queue)
                 if self._roles.get(name) is role:
@@ -426,16 +426,17 @@ def example(scenario):
             meta = field.metadata
             if 'equals' in meta:
                 values[field.name] = sizes[meta['equals']]
-            elif 'below' in meta:
-                values[field.name] = 0 if rng is None else int(rng.integers(sizes[meta['below']]))
+            elif 'index_of' in meta:
+                size = sizes[meta['index_of']]
+                values[field.name] = 0 if rng is None else int(rng.integers(size))
             elif issubclass(field.type, enum.Enum):
                 members = list(field.type)
                 values[field.name] = members[0 if rng is None else rng.integers(len(members))]
             elif field.type is str:
                 values[field.name] = ''
             elif field.type in (int, float):
-                least = meta.get('least', 0)
-                values[field.name] = field.type(least if rng is None else rng.integers(1, 4))
+                low = meta.get('low', 0)
+                values[field.name] = field.type(low if rng is None else rng.integers(1, 4))
         values |= given
         sizes |= kind.own_sizes(types.SimpleNamespace(**values), sizes)
         for field in fields:

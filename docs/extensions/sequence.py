@@ -19,7 +19,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     PeersChanged,
     Send,
-    Tick,
+    Timeout,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
@@ -87,7 +87,7 @@ def cycle():
             dispatch(*queue.popleft())
         else:
             now_s = roles['bs'].next_deadline()
-            dispatch('bs', Tick())
+            dispatch('bs', Timeout())
     assert sent[-1][1].outcome == 'served', sent[-1]
     return sent
 

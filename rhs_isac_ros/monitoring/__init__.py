@@ -1,1 +1,1 @@
-"""Monitoring of a running network from its messages, without ROS and without taking part."""
+"""Passive monitoring of a running network from its messages, without ROS."""

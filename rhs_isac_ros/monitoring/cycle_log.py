@@ -7,7 +7,7 @@ import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
 
-# Older cycles that still lack a message are discarded: the message will not arrive any more.
+# Older cycles that still lack a message are discarded, because it will no longer arrive.
 _MAX_OPEN_CYCLES = 16
 # Messages that the log needs.
 RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Capacity,
@@ -16,12 +16,12 @@ RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Ca
 
 @dataclasses.dataclass
 class CycleTimes:
-    """The times of one cycle, as observed from outside.
+    """The times of one cycle, as observed by a subscriber.
 
     Attributes
     ----------
     user
-        Number of the user that was granted the cycle; 0 before the grant.
+        Id of the user that was granted the cycle; 0 before the grant.
     began_s
         Arrival of the last beacon before the grant [s].
     phase_s
@@ -88,14 +88,14 @@ class CycleRecord(CycleTimes):
 
 
 class CycleLog:
-    """Collects the cycles of one network, also across restarts of its base station.
+    """Collects the cycles of one network, including across restarts of its base station.
 
     Attributes
     ----------
     complete
-        Cycles that were served and received as a whole, in their order.
+        Cycles that were served and received completely, in order.
     ended
-        All cycles that have ended, in their order.
+        All cycles that have ended, in order.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Invariants of the published results, checked from outside by the messages on the topics.
+"""Invariants of the published results, checked passively against the messages on the topics.
 
 No position and no capacity may be published for a cycle whose signals were incomplete, stale,
 mixed between users, or received with two codebooks.
@@ -18,8 +18,8 @@ from rhs_isac_ros.protocol import messages as m
 # Messages that the checker needs.
 RECEIVES = (m.Grant, m.RhsConfiguration, m.FeedSignals, m.ReceivedSignals, m.PositionEstimate,
             m.Beam, m.Capacity)
-# Messages of different topics arrive in any order: a result is checked after this delay [s].
-SETTLE_S = 1.0
+# Messages of different topics arrive in any order, so a result is checked after this delay [s].
+CHECK_DELAY_S = 1.0
 # Number of cycles whose messages are kept.
 _MAX_CYCLES = 64
 # Noise is complex Gaussian: |n|^2 exceeds this multiple of its power with probability e^-40.
@@ -94,10 +94,10 @@ class InvariantChecker:
         self._codebooks[codebook.id] = codebook
 
     def expect_rediscovery(self, kinds: Iterable[type[m.Message]]) -> None:
-        """Tolerate that messages are missing until the first of their type arrives.
+        """Tolerate missing messages of some types until the first of each type arrives.
 
-        To be called when a publisher has terminated or is unreachable: other nodes may discover
-        its successor earlier than this one.
+        Call this when a publisher has terminated or is unreachable, because other nodes may
+        discover its successor earlier than this one.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ class InvariantChecker:
         self._undiscovered.discard(type(message))
         cycle.add(message)
         if isinstance(message, m.PositionEstimate | m.Capacity):
-            self._results.append((now_s + SETTLE_S, message))
+            self._results.append((now_s + CHECK_DELAY_S, message))
         while self._results and self._results[0][0] <= now_s:
             self._check(self._results.popleft()[1])
 
@@ -157,13 +157,13 @@ class InvariantChecker:
                 yield None, (f'received signals of user {signals.user}, '
                              f'codebook {signals.codebook_id}')
             if not np.array_equal(signals.signals, cycle.signals[0].signals):
-                yield None, 'received signals that differ'
+                yield None, 'received signals that differ from each other'
         sizes = self._scenario.sizes
         for band in range(sizes['N_B']):
             ids = {applied.codebook_id for applied in cycle.applied.get(band, ())}
             if ids != {estimate.codebook_id}:
                 missing = None if ids else m.RhsConfiguration
-                yield missing, f'band {band} taken with {sorted(ids) or "no configuration"}'
+                yield missing, f'band {band} measured with {sorted(ids) or "no configuration"}'
         frames = [(band, frame) for band in range(sizes['N_B']) for frame in range(sizes['F'])]
         absent = [key for key in frames if not cycle.feeds.get(key)]
         if absent:
@@ -173,7 +173,7 @@ class InvariantChecker:
             yield None, f'signals of users {sorted(users)}'
         codebook = self._codebooks.get(estimate.codebook_id)
         if codebook is None:
-            yield None, 'a codebook that was never offered'
+            yield None, 'codebook that was never offered'
         elif not absent:
             yield from self._content_faults(cycle, codebook, frames)
 
@@ -183,7 +183,7 @@ class InvariantChecker:
         """Compare the received signals with those at the feeds, combined by the codebook."""
         for band, reports in cycle.applied.items():
             if any(not np.array_equal(report.analog, codebook.analog[band]) for report in reports):
-                yield None, f'band {band} taken with a configuration that is not in the codebook'
+                yield None, f'band {band} measured with a configuration not in the codebook'
         sizes = self._scenario.sizes
         feeds = np.stack([cycle.feeds[key][0].signals for key in frames])
         shape = sizes['N_B'], sizes['F'], *feeds.shape[1:]
@@ -192,7 +192,7 @@ class InvariantChecker:
         allowed = (_MAX_NOISE_FACTOR * self._scenario.noise_power_w
                    + 1e-12 * np.abs(expected).max()**2)
         if noise.max() > allowed:
-            yield None, 'received signals that are not those at the feeds'
+            yield None, 'received signals do not match the feed signals'
 
     def _beam_faults(self, report: m.Capacity, cycle: _CycleMessages) -> Iterator[_Fault]:
         """Yield the faults of the beam for which a capacity was reported."""
@@ -206,4 +206,4 @@ class InvariantChecker:
         elif not any(np.array_equal(applied.analog[0], beam.analog) and
                      applied.codebook_id == report.codebook_id
                      for applied in cycle.beam_applied for beam in beams):
-            yield m.RhsConfiguration, 'a beam that the surface does not apply'
+            yield m.RhsConfiguration, 'beam not applied by the surface'

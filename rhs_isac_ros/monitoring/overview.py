@@ -24,7 +24,7 @@ _MAX_DIGITS = 18
 
 @dataclasses.dataclass(frozen=True)
 class Fix:
-    """The newest complete cycle of a user.
+    """The latest complete cycle of a user.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Fix:
 
 @dataclasses.dataclass(frozen=True)
 class NodeStatus:
-    """The newest report of a node.
+    """The latest report of a node.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Overview:
     cycle_id, user
         Current cycle and its user; 0 where unknown.
     codebook_id
-        Codebook of the newest signals; empty before the first.
+        Codebook of the latest signals; empty before the first.
     served, given_up
         Numbers of cycles that ended.
     last_failure
@@ -86,7 +86,7 @@ class Overview:
     began_s
         Arrival of the first message [s]; infinite before.
     users
-        Newest fix of each user by number; None before the first.
+        Latest fix of each user by id; None before the first.
     nodes
         Status of each node by name.
     """
@@ -138,7 +138,7 @@ class Overview:
 
     @property
     def fixes(self) -> list[Fix]:
-        """The fixes of all users that have one, the newest first."""
+        """The fixes of all users that have one, the latest first."""
         return sorted(filter(None, self.users.values()), key=lambda fix: -fix.received_s)
 
     def _set_phase(self, phase: str, cycle_id: int, user: int, now_s: float) -> None:

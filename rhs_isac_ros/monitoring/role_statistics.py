@@ -11,7 +11,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, PeersChanged, Send
 from rhs_isac_ros.protocol.outcomes import Outcome, kind_of
 
-# Percentiles are computed over this number of newest durations.
+# Percentiles are computed over this number of latest durations.
 _MAX_DURATIONS = 512
 _PERCENTS = (50, 95, 99)
 
@@ -53,11 +53,11 @@ class RoleStatistics:
         self._faults = 0
 
     def set_available(self, node: str, available: bool) -> None:
-        """Record whether a node without which the role can work for a while is available."""
+        """Record whether a node is available that the role can do without for a while."""
         (self._unavailable.discard if available else self._unavailable.add)(node)
 
     def count_received(self, kind: type[m.Message]) -> None:
-        """Count a received message, also if it is dropped later."""
+        """Count a received message, even if it is dropped later."""
         self._received[kind.__name__] += 1
 
     def record(
@@ -68,7 +68,7 @@ class RoleStatistics:
         Parameters
         ----------
         event, actions
-            The event and the response.
+            The event, and the actions that the role returned for it.
         now_s
             Time of the event, on the clock of the role [s].
         handling_s
@@ -115,11 +115,6 @@ class RoleStatistics:
             Whether the role lacks something that it needs in this state.
         status
             Settings in use and pending, by name.
-
-        Returns
-        -------
-        Report
-            The report.
         """
         values = {'phase': phase} if phase else {}
         values |= self._codebook_ids(status.get('codebook_id', ''))
@@ -137,15 +132,15 @@ class RoleStatistics:
         if self._missing_roles:
             return Report(True, f'waiting for {", ".join(self._missing_roles)}', values)
         if self._unavailable:
-            return Report(True, f'without {", ".join(sorted(self._unavailable))}', values)
+            return Report(True, f'{", ".join(sorted(self._unavailable))} not available', values)
         if blocked:
-            return Report(True, f'cannot work: {phase}', values)
+            return Report(True, f'blocked: {phase}', values)
         if new_faults:
-            return Report(True, f'{new_faults} faults just now', values)
+            return Report(True, f'{new_faults} new faults', values)
         return Report(False, 'no fault', values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
-        """Return the ids of the codebook in use, or the first one, and of a pending one."""
+        """Return the ids of the codebook in use (at first, the offered one) and a pending one."""
         if not self._codebook_id:
             return {}
         if in_use in ('', self._codebook_id):

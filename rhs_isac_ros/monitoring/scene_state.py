@@ -1,4 +1,4 @@
-"""State of the scene of a network: users, beam and surface, as its messages report them."""
+"""State of the scene of a network: users, beam and surface, as reported by its messages."""
 
 import collections
 import dataclasses
@@ -10,7 +10,7 @@ from rhs_isac_ros.protocol import messages as m
 
 # Messages that the scene state needs.
 RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.PositionEstimate, m.Beam)
-# A path holds the newest positions, and a position only if the user has moved this far.
+# Maximum number of positions in a path, and minimum distance between consecutive true positions.
 _MAX_PATH_LENGTH = 200
 _MIN_STEP_M = 0.05
 
@@ -26,15 +26,15 @@ class UserState:
     Attributes
     ----------
     user
-        Number of the user.
+        Id of the user.
     updated_s
-        Arrival of the newest message about the user [s].
+        Arrival of the latest message about the user [s].
     truth
         The true position; None before the first.
     estimate
-        The newest estimate; None before the first.
+        The latest estimate; None before the first.
     true_path, estimated_path
-        True positions and estimates, float64 [3] [m] each, the newest last.
+        True positions and estimates, float64 [3] [m] each, the latest last.
     """
 
     user: int
@@ -44,7 +44,7 @@ class UserState:
     true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=_empty_path)
     estimated_path: collections.deque[np.ndarray] = dataclasses.field(
         default_factory=_empty_path)
-    # The true position at which the pilots of the newest cycle were sent.
+    # The true position at which the pilots of the latest cycle were sent.
     _cycle_truth: m.GroundTruth | None = None
 
     @property
@@ -77,9 +77,9 @@ class SceneState:
     configuration
         Configuration that the surface applies; None before the first message.
     beam
-        Newest beam of a transmission; None before the first.
+        Latest beam of a transmission; None before the first.
     users
-        Users by number.
+        Users by id.
     """
 
     def __init__(self) -> None:
@@ -124,8 +124,8 @@ class SceneState:
                 and all(state.estimate for state in self.users.values()))
 
     @property
-    def newest(self) -> UserState | None:
-        """The user of the newest cycle that led to an estimate; None if there is none."""
+    def latest_user(self) -> UserState | None:
+        """The user of the latest cycle that yielded an estimate; None if there is none."""
         cycles = [(state.estimate.cycle_id, user) for user, state in self.users.items()
                   if state.estimate]
         return self.users[max(cycles)[1]] if cycles else None

@@ -2,7 +2,8 @@
 
 import os
 
-# The matrix products are small and the processes many: further threads would only compete for the
-# cores. The libraries read the variables when NumPy is first imported, which is after this module.
+# The matrix products are small and there are many processes, so additional threads would only
+# compete for the cores. The libraries read these variables when NumPy is first imported, which
+# happens after this module is imported.
 for _name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS'):
     os.environ.setdefault(_name, '1')

@@ -20,7 +20,7 @@ from rhs_isac_ros.ros.run import entry
 
 
 class BsNode(RoleNode[BaseStation]):
-    """The base station."""
+    """The ROS node of the base station."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('bs', **node_options)
@@ -54,7 +54,7 @@ class BsNode(RoleNode[BaseStation]):
 
 
 def _cycle_from_clock() -> int:
-    """Return the milliseconds since 1970: a cycle takes longer, so no restart repeats a number."""
+    """Return the time since 1970 [ms]. Cycles take longer than 1 ms, so no id is reused."""
     return time.time_ns() // 1_000_000
 
 

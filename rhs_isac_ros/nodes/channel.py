@@ -13,7 +13,7 @@ from rhs_isac_ros.ros.run import entry
 
 
 class ChannelNode(RoleNode[ImpairedChannel]):
-    """Line of sight, multipath, surface and propagation behind it."""
+    """The ROS node of the emulated channel, impairments included."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('channel', **node_options)

@@ -15,7 +15,7 @@ from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.run import entry
 
-# Nodes besides the users, and besides ``network``, which only holds the parameter ``users``.
+# All node classes except the users and ``network``, which only declares the parameter ``users``.
 KINDS = (OptimizerNode, RhsControllerNode, ChannelNode, PositionerNode, TransmissionNode, BsNode)
 
 
@@ -25,7 +25,7 @@ def make_network() -> list[Node]:
     Raises
     ------
     ParameterError
-        If a parameter is wrong.
+        If a parameter is invalid.
     """
     head = Node('network')
     users = parameters.declare(head, 'network').users

@@ -37,7 +37,8 @@ class OptimizerNode(Node):
         super().__init__(topics.OPTIMIZER_NODE, **node_options)
         values = parameters.declare(self, 'optimizer')
         self._scenario = parameters.scenario_of(values)
-        self._publisher = self.create_publisher(ros.Codebook, topics.CODEBOOK, qos.HELD)
+        self._publisher = self.create_publisher(
+            ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
         defaults = Codebook.load(values.codebook_file or default_codebook_file()).to_parameters()
         for name, text in CODEBOOK.items():
             self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
@@ -80,8 +81,9 @@ class OptimizerNode(Node):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable.
 
-    Without options it holds a codebook. With options it first optimises one and writes it to a
-    file; with ``--push``, it then sets it on the optimizer of a running network instead.
+    Without options, this holds a codebook. With options, it first optimises a codebook, writes it
+    to a file and holds it; with ``--push``, it instead sends the codebook to the optimizer of a
+    running network.
 
     Parameters
     ----------
@@ -91,8 +93,8 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 after a signal; 1 if a network did not accept the codebook; 2 if an argument
-        or a file is wrong.
+        Exit code: 0 on success or after a signal; 1 if a network did not accept the codebook; 2 if
+        an argument or a file is invalid.
     """
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
     arguments = remove_ros_args(args)[1:]
@@ -122,9 +124,11 @@ def _parser() -> argparse.ArgumentParser:
                     'offline, write it to a file and hold it.')
     add_options(parser)
     parser.add_argument('--push', action='store_true',
-                        help='set it on the optimizer of a running network and exit')
+                        help='send the codebook to the optimizer of a running network '
+                              'and exit')
     parser.add_argument('--push-file', type=Path, metavar='FILE',
-                        help='do not optimise: set this codebook on a running network and exit')
+                        help='send this codebook to a running network without '
+                              'optimising, and exit')
     return parser
 
 

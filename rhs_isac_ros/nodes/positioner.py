@@ -67,7 +67,8 @@ class PositionerNode(RoleNode[Positioner]):
             self._check_plugin(settings.estimator)
             return settings
         if settings.estimator != NeuralEstimator.name:
-            # Other estimators do not use the file; without it, a change has no effect on them.
+            # Other estimators do not use the file. Clear it, so that a change of the file does not
+            # rebuild them.
             return dataclasses.replace(settings, model_file='')
         if not settings.model_file:
             raise ParameterError(
@@ -99,7 +100,7 @@ class PositionerNode(RoleNode[Positioner]):
         Raises
         ------
         TypeError
-            If the action is another one.
+            If the action is not a `BuildEstimator`.
         """
         if not isinstance(action, BuildEstimator):
             super().execute(action)
@@ -116,7 +117,7 @@ class PositionerNode(RoleNode[Positioner]):
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message, and an estimate also as a pose; return False if it is invalid."""
+        """Publish a message, and a pose for an estimate; return False if it is invalid."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
             self._pose.publish(convert.pose(message, self.get_clock().now().to_msg()))

@@ -16,10 +16,11 @@ from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import markers, parameters, qos, topics
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.subscriptions import listen
+from rhs_isac_ros.ros.subscriptions import subscribe_messages
 from rhs_isac_ros.ros.timers import steady_timer
 
-# Each path has its own topic, so many users would flood the graph.
+# Maximum number of users with published paths. Each path has its own topic, and too many would
+# flood the graph.
 _MAX_PATHS = 64
 
 
@@ -32,17 +33,17 @@ class VisualizerNode(Node):
         self._scenario = parameters.scenario_of(values)
         self._forget_s = values.forget_s
         self._scene = SceneState()
-        # The latest beam and its marker: a beam pattern takes long to compute.
+        # The latest beam and its marker, cached because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
         self._publisher = self.create_publisher(MarkerArray, topics.MARKERS, qos.EXCHANGE)
         self._paths: dict[int, tuple[Publisher, Publisher]] = {}
-        listen(self, RECEIVES, self._scenario.sizes,
-               lambda message: self._scene.add(message, time.monotonic()))
+        subscribe_messages(self, RECEIVES, self._scenario.sizes,
+                           lambda message: self._scene.add(message, time.monotonic()))
         steady_timer(self, values.period_s, self._show)
 
     def _show(self) -> None:
-        """Publish the whole scene, which late joiners need."""
+        """Publish the whole scene, so that late joiners receive it."""
         for user in self._scene.discard_stale(time.monotonic() - self._forget_s):
             for publisher in self._paths.pop(user, ()):
                 self.destroy_publisher(publisher)

@@ -9,19 +9,20 @@ _LAST_USER = 2**32 - 1
 
 
 class AckFilter:
-    """Restricts acks to a list of users, and the number of acks of each user in a second.
+    """Restricts the users whose acks are accepted, and the acks of each user per second.
 
     Parameters
     ----------
     allowed
-        Numbers of the users, as returned by `parse_users`; empty: all.
+        Ids of the users, as returned by `parse_users`; empty: all.
     rate_hz
         Maximum number of acks of each user in a second.
     """
 
     def __init__(self, allowed: tuple[range, ...] = (), rate_hz: float = math.inf) -> None:
         self._allowed, self._rate_hz = allowed, rate_hz
-        # Acks by user in one second; all are discarded with the next, which bounds the memory.
+        # Acks by user in the current second; they are discarded every second, which bounds the
+        # memory.
         self._acks: collections.Counter[int] = collections.Counter()
         self._second: int | None = None
 
@@ -55,7 +56,7 @@ def parse_users(text: str) -> tuple[range, ...]:
     Parameters
     ----------
     text
-        Numbers from 1 and ranges, separated by commas; may be empty.
+        User numbers from 1 and ranges, separated by commas; may be empty.
 
     Raises
     ------

@@ -1,10 +1,10 @@
-"""The base station: sends beacons, selects, positions and serves one user in each cycle."""
+"""The base station, which sends beacons, then selects, positions and serves a user per cycle."""
 
 from rhs_isac_ros.protocol import base_station_table
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.base_station_steps import BaseStationSteps
-from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, SettingsOffered, Tick
+from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, SettingsOffered, Timeout
 
 
 class BaseStation(BaseStationSteps):
@@ -18,8 +18,8 @@ class BaseStation(BaseStationSteps):
         Callable that takes (codebook, feeds [N_B, F, N_SB, K], user, cycle_id, whether to add
         noise) and returns the received signals, complex128 [N_B, N_SB, F].
     first_cycle_id
-        Number of the first cycle. After a restart it must exceed all numbers used before, so that
-        messages still in transit are recognized.
+        Id of the first cycle. After a restart, it must exceed all ids used before, so that
+        messages still in transit are recognised as stale.
     """
 
     SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
@@ -31,6 +31,6 @@ class BaseStation(BaseStationSteps):
     TABLE = base_station_table.TABLE
     EVENT_NAMES = {
         CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
-        Tick: 'timeout', m.Ack: 'ack', m.RhsConfiguration: 'configured', m.FeedSignals: 'frame',
+        Timeout: 'timeout', m.Ack: 'ack', m.RhsConfiguration: 'configured', m.FeedSignals: 'frame',
         m.PositionEstimate: 'estimate', m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
-    LACKING = frozenset({State.WAITING})
+    BLOCKED_STATES = frozenset({State.WAITING})

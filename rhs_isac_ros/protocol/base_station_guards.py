@@ -9,7 +9,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.ack_filter import AckFilter, parse_users
 from rhs_isac_ros.protocol.base_station_states import Cycle, State, timeouts
-from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, Tick
+from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, Timeout
 from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
 from rhs_isac_ros.protocol.outage_log import OutageLog
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
@@ -31,7 +31,7 @@ class BaseStationGuards(StateMachine[State]):
         self._users = UserScheduler(settings.policy, rng)
         self._settings = PendingSettings(settings)
         self._use(settings)
-        # The codebook of the present cycle, and the one for the next.
+        # The codebook of the current cycle, and the one for the next.
         self._codebook: Codebook | None = None
         self._offered: Codebook | None = None
         # Roles that are missing; None before the first report.
@@ -52,9 +52,9 @@ class BaseStationGuards(StateMachine[State]):
     def _codebook_id(self) -> str:
         return self._codebook.id if self._codebook else ''
 
-    # Guards: readiness and time-outs
+    # Guards: readiness and timeouts
 
-    def not_ready(self, event: Tick, now_s: float) -> bool:
+    def not_ready(self, event: Timeout, now_s: float) -> bool:
         """Whether a role or the codebook is missing."""
         return bool(self._missing) or not self._offered
 
@@ -66,15 +66,15 @@ class BaseStationGuards(StateMachine[State]):
         """Whether all roles are present now and a codebook was offered."""
         return not event.missing and self._offered is not None
 
-    def some_acks(self, event: Tick, now_s: float) -> bool:
+    def some_acks(self, event: Timeout, now_s: float) -> bool:
         """Whether at least one user answered the beacon."""
         return bool(self._users.answered)
 
-    def may_retry(self, event: Tick, now_s: float) -> bool:
-        """Whether the present step may be requested again."""
+    def may_retry(self, event: Timeout, now_s: float) -> bool:
+        """Whether the current step may be requested again."""
         return self.repeats < self._settings.in_use.retries
 
-    # Guards: messages to refuse
+    # Guards: messages to reject
 
     def wrong_cycle(self, event: m.Message, now_s: float) -> bool:
         """Whether a message belongs to another cycle."""
@@ -83,7 +83,7 @@ class BaseStationGuards(StateMachine[State]):
     def wrong_user(
             self, event: m.FeedSignals | m.PositionEstimate | m.NoFix | m.Beam | m.Data,
             now_s: float) -> bool:
-        """Whether a message concerns another user than the granted one."""
+        """Whether a message concerns a user other than the granted one."""
         return event.user != self._cycle.user
 
     def wrong_codebook(
@@ -105,7 +105,7 @@ class BaseStationGuards(StateMachine[State]):
         return event in self._cycle.frames
 
     def not_delivered_uplink(self, event: m.Data, now_s: float) -> bool:
-        """Whether data are not those that the channel delivers to the base station."""
+        """Whether data are anything other than uplink data delivered by the channel."""
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.DOWNLINK
 
     def not_allowed(self, event: m.Ack, now_s: float) -> bool:

@@ -1,4 +1,4 @@
-"""States of the base station, their time-outs, and the memory of a cycle."""
+"""States of the base station, their timeouts, and the memory of a cycle."""
 
 import dataclasses
 import enum
@@ -11,14 +11,14 @@ from rhs_isac_ros.protocol.settings import BaseStationSettings
 class State(enum.Enum):
     """States of the base station."""
 
-    WAITING = 'waiting'            # for a codebook and for the other roles
-    RESTING = 'resting'            # between cycles
-    BEACONING = 'beaconing'        # for acks
-    CONFIGURING = 'configuring'    # for the RHS to apply a band's configurations
-    SOUNDING = 'sounding'          # for the feed signals of a band
-    ESTIMATING = 'estimating'      # for the position
-    STEERING = 'steering'          # for the beam, and for the RHS to apply it
-    TRANSMITTING = 'transmitting'  # for the uplink data
+    WAITING = 'waiting'            # waits for a codebook and the other roles
+    RESTING = 'resting'            # pauses between cycles
+    BEACONING = 'beaconing'        # waits for acks
+    CONFIGURING = 'configuring'    # waits for the RHS to apply a band's configurations
+    SOUNDING = 'sounding'          # waits for the feed signals of a band
+    ESTIMATING = 'estimating'      # waits for the position estimate
+    STEERING = 'steering'          # waits for the beam and for the RHS to apply it
+    TRANSMITTING = 'transmitting'  # waits for the uplink data
 
 
 # Steps of a granted cycle: each waits for a reply and may request it again.
@@ -27,7 +27,7 @@ NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
 
 
 def timeouts(settings: BaseStationSettings) -> dict[State, float]:
-    """Return the time-outs by state [s]; a step's time is shared evenly by its retries."""
+    """Return the timeouts by state [s]; that of a step is divided equally among its attempts."""
     attempt_s = settings.step_timeout_s / (settings.retries + 1)
     return {State.RESTING: settings.rest_s, State.BEACONING: settings.ack_timeout_s,
             **dict.fromkeys(STEPS, attempt_s)}
@@ -40,7 +40,7 @@ class Cycle:
     Attributes
     ----------
     attempt
-        Number of beacons sent before the present one.
+        Number of beacons sent before the current one.
     user
         User that was granted the cycle; 0 before the grant.
     band

@@ -10,7 +10,7 @@ from rhs_isac_ros.protocol.events import (
     PeersChanged,
     Send,
     SettingsOffered,
-    Tick,
+    Timeout,
 )
 from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
 from rhs_isac_ros.protocol.outcomes import Outcome
@@ -22,7 +22,7 @@ class BaseStationSteps(BaseStationGuards):
     # Between cycles
 
     def store_codebook(self, event: CodebookOffered, now_s: float) -> None:
-        """Use a codebook from the next cycle on."""
+        """Store a codebook for the next cycle."""
         self._offered = event.codebook
 
     def store_peers(self, event: PeersChanged, now_s: float) -> None:
@@ -31,10 +31,10 @@ class BaseStationSteps(BaseStationGuards):
 
     def store_settings(self, event: SettingsOffered, now_s: float) -> None:
         """Store settings until they may be applied."""
-        self._settings.newest = event.settings
+        self._settings.latest = event.settings
 
     def apply_settings(self, event: Event, now_s: float) -> list[Action]:
-        """Apply the newest settings."""
+        """Apply the latest settings."""
         return self._apply_settings()
 
     def _apply_settings(self) -> list[Action]:
@@ -59,7 +59,7 @@ class BaseStationSteps(BaseStationGuards):
         self._users.begin_cycle()
         return self._beacon(now_s)
 
-    def beacon_again(self, event: Tick, now_s: float) -> list[Action]:
+    def beacon_again(self, event: Timeout, now_s: float) -> list[Action]:
         """Send another beacon of the cycle."""
         self._cycle.attempt += 1
         return self._beacon(now_s)
@@ -79,10 +79,10 @@ class BaseStationSteps(BaseStationGuards):
         self._users.add_answer(event.user)
 
     def register_user(self, event: m.Ack, now_s: float) -> None:
-        """Wait for a user from the next cycle on."""
+        """Register a user, for which the next cycle waits as well."""
         self._users.register(event.user)
 
-    def grant(self, event: m.Ack | Tick, now_s: float) -> list[Action]:
+    def grant(self, event: m.Ack | Timeout, now_s: float) -> list[Action]:
         """Grant the cycle to one of the users that answered."""
         lost = self._users.remove_absent()
         self.count(Outcome.USER_LOST, len(lost))
@@ -127,7 +127,7 @@ class BaseStationSteps(BaseStationGuards):
             cycle_id=cycle.id, user=cycle.user, codebook_id=self._codebook_id, signals=signals)
         return [Send(cycle.received), *self._announce(m.Phase.ESTIMATING, now_s)]
 
-    def resend_signals(self, event: Tick, now_s: float) -> list[Action]:
+    def resend_signals(self, event: Timeout, now_s: float) -> list[Action]:
         """Send the received signals again."""
         assert self._cycle.received
         return [Send(self._cycle.received)]
@@ -156,7 +156,7 @@ class BaseStationSteps(BaseStationGuards):
             stage=m.Stage.OFFERED, duration_s=duration_s,
             bits=self._cycle.beam.expected_bps * duration_s // 1))]
 
-    def remove_user(self, event: Tick, now_s: float) -> None:
+    def remove_user(self, event: Timeout, now_s: float) -> None:
         """Stop waiting for the user until it answers again."""
         self._users.remove(self._cycle.user)
 

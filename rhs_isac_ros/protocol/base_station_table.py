@@ -11,7 +11,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     PeersChanged,
     SettingsOffered,
-    Tick,
+    Timeout,
 )
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, Transition
@@ -35,7 +35,7 @@ def give_up(
 
 
 TABLE = (
-    # Offers and presence. A codebook and settings apply from the next cycle on.
+    # Offers and presence. A new codebook and new settings take effect with the next cycle.
     Row(source=(State.WAITING,), event=CodebookOffered, guard=Steps.peers_present,
         actions=(Steps.store_codebook, Steps.begin_cycle), target=State.BEACONING),
     Row(source=(State.WAITING,), event=CodebookOffered,
@@ -54,47 +54,49 @@ TABLE = (
         actions=(Steps.store_settings, Steps.apply_settings), restart_timeout=True),
     Row(event=SettingsOffered, actions=(Steps.store_settings,)),
 
-    # Time-outs.
-    Row(source=(State.RESTING,), event=Tick, guard=Steps.not_ready,
+    # Timeouts.
+    Row(source=(State.RESTING,), event=Timeout, guard=Steps.not_ready,
         actions=(Steps.log_not_ready,), target=State.WAITING),
-    Row(source=(State.RESTING,), event=Tick, actions=(Steps.begin_cycle,),
+    Row(source=(State.RESTING,), event=Timeout, actions=(Steps.begin_cycle,),
         target=State.BEACONING),
 
-    Row(source=(State.BEACONING,), event=Tick, guard=Steps.some_acks,
+    Row(source=(State.BEACONING,), event=Timeout, guard=Steps.some_acks,
         actions=(Steps.grant, Steps.command_next_band, Steps.announce_positioning),
         target=State.CONFIGURING),
-    Row(source=(State.BEACONING,), event=Tick, guard=Steps.not_ready,
+    Row(source=(State.BEACONING,), event=Timeout, guard=Steps.not_ready,
         actions=(Steps.log_not_ready,), target=State.WAITING),
-    Row(source=(State.BEACONING,), event=Tick,
+    Row(source=(State.BEACONING,), event=Timeout,
         actions=(Steps.apply_settings, Steps.beacon_again), outcome=Outcome.UNANSWERED,
         restart_timeout=True),
 
-    Row(source=(State.CONFIGURING,), event=Tick, guard=Steps.may_retry,
+    Row(source=(State.CONFIGURING,), event=Timeout, guard=Steps.may_retry,
         actions=(Steps.command_band,), outcome=Outcome.RETRY_RHS, restart_timeout=True),
-    give_up(State.CONFIGURING, Tick, Outcome.RHS_SILENT),
+    give_up(State.CONFIGURING, Timeout, Outcome.RHS_SILENT),
 
-    # The command too: the channel may have missed the report of the RHS.
-    Row(source=(State.SOUNDING,), event=Tick, guard=Steps.may_retry,
+    # Repeat the command as well, because the channel may have missed the report of the RHS.
+    Row(source=(State.SOUNDING,), event=Timeout, guard=Steps.may_retry,
         actions=(Steps.command_band, Steps.request_pilots), outcome=Outcome.RETRY_BAND,
         restart_timeout=True),
-    give_up(State.SOUNDING, Tick, Outcome.USER_GONE, before=(Steps.remove_user,)),
+    give_up(State.SOUNDING, Timeout, Outcome.USER_GONE, before=(Steps.remove_user,)),
 
-    Row(source=(State.ESTIMATING,), event=Tick, guard=Steps.may_retry,
+    Row(source=(State.ESTIMATING,), event=Timeout, guard=Steps.may_retry,
         actions=(Steps.resend_signals,), outcome=Outcome.RETRY_POSITION, restart_timeout=True),
-    give_up(State.ESTIMATING, Tick, Outcome.POSITIONER_SILENT),
+    give_up(State.ESTIMATING, Timeout, Outcome.POSITIONER_SILENT),
 
-    # From the start of the chain: roles repeat their replies to repeated messages.
-    Row(source=(State.STEERING,), event=Tick, guard=Steps.may_retry,
+    # Resend the received signals: each role repeats its reply to a repeated message, which also
+    # repeats the beam.
+    Row(source=(State.STEERING,), event=Timeout, guard=Steps.may_retry,
         actions=(Steps.resend_signals,), outcome=Outcome.RETRY_BEAM, restart_timeout=True),
-    give_up(State.STEERING, Tick, Outcome.TRANSMISSION_SILENT),
+    give_up(State.STEERING, Timeout, Outcome.TRANSMISSION_SILENT),
 
     # The channel may have missed the beam or its configuration.
-    Row(source=(State.TRANSMITTING,), event=Tick, guard=Steps.may_retry,
+    Row(source=(State.TRANSMITTING,), event=Timeout, guard=Steps.may_retry,
         actions=(Steps.resend_signals, Steps.send_downlink), outcome=Outcome.RETRY_DATA,
         restart_timeout=True),
-    give_up(State.TRANSMITTING, Tick, Outcome.DATA_LOST),
+    give_up(State.TRANSMITTING, Timeout, Outcome.DATA_LOST),
 
-    # Acks. All but the refused ones count towards the user's rate.
+    # Acks. All count towards the rate of their user, except those from users that are not allowed
+    # or have reached their rate.
     Row(event=m.Ack, guard=Steps.not_allowed, outcome=Outcome.NOT_ALLOWED),
     Row(event=m.Ack, guard=Steps.too_often, outcome=Outcome.TOO_OFTEN),
     Row(event=m.Ack, guard=Steps.wrong_cycle, actions=(Steps.count_ack,),
@@ -102,7 +104,7 @@ TABLE = (
     Row(event=m.Ack, guard=Steps.duplicate_ack, actions=(Steps.count_ack,),
         outcome=Outcome.DUPLICATE),
     Row(event=m.Ack, guard=Steps.crowded, actions=(Steps.count_ack,), outcome=Outcome.CROWDED),
-    # A late ack: the cycle is granted, and the next one waits for the user too.
+    # A late ack: the cycle is already granted, so the user is registered for the next cycle.
     Row(source=NOT_BEACONING, event=m.Ack, actions=(Steps.count_ack, Steps.register_user),
         outcome=Outcome.LATE_ACK),
     Row(source=(State.BEACONING,), event=m.Ack, guard=Steps.last_ack,

@@ -1,4 +1,4 @@
-"""The emulated channel: line of sight, multipath, surface and on-board propagation."""
+"""The emulated channel: line of sight, multipath, surface and propagation on the surface."""
 
 import dataclasses
 import itertools
@@ -16,9 +16,10 @@ from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import PlainRole
 
-# Messages of each kind that wait for others; the cycle of an older one can no longer be complete.
+# Maximum number of messages of each kind kept until related messages arrive. The cycle of an older
+# message can no longer be completed.
 _MAX_PENDING = 256
-# Cycles that are remembered, to recognize late and duplicate positions.
+# Number of cycles kept to recognise late and duplicate positions.
 _MAX_REMEMBERED = 8
 
 
@@ -54,7 +55,8 @@ class Channel(PlainRole):
     Parameters
     ----------
     seed
-        Seed of the multipath, which depends on the seed, the user and the cycle only.
+        Seed of the multipath. The multipath depends only on the seed, the user, the cycle and the
+        band.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -64,11 +66,12 @@ class Channel(PlainRole):
         super().__init__()
         self._scenario, self._seed = scenario, seed
         self._cycle: _Cycle | None = None
-        # The first draw factorizes covariances, which would delay the first cycle.
+        # The first draw factorises covariances. Draw once now, so that it does not delay the first
+        # cycle.
         draw_multipath(scenario, 0, 1, np.random.default_rng(0))
         # Cycle, user and position of the cycles begun.
         self._begun: NewestDict[tuple[float, ...], None] = NewestDict(_MAX_REMEMBERED)
-        # Configurations and beams of the present and of future cycles.
+        # Configurations and beams of the current and of future cycles.
         self._configurations: NewestDict[tuple[int, m.Mode, int], np.ndarray] = NewestDict(
             _MAX_PENDING)
         self._beams: NewestDict[tuple[int, int], m.Beam] = NewestDict(_MAX_PENDING)

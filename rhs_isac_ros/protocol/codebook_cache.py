@@ -1,11 +1,11 @@
-"""A cache of what roles derive from codebooks: for the newest few and the one in use."""
+"""A cache of objects derived from codebooks, for the latest few and the one in use."""
 
 from typing import Generic, TypeVar
 
 from rhs_isac_ros.protocol.newest import NewestDict
 
 Item = TypeVar('Item')
-# Codebooks that may be offered during a cycle before the oldest one is discarded.
+# Maximum number of codebooks offered during a cycle before the oldest one is discarded.
 _MAX_OFFERED = 3
 
 
@@ -23,7 +23,7 @@ class CodebookCache(Generic[Item]):
         self.in_use = ''
 
     def put(self, codebook_id: str, item: Item) -> None:
-        """Store an item as the newest; the oldest one not in use may be discarded."""
+        """Store an item as the latest; the oldest one not in use may be discarded."""
         self._items.put(codebook_id, item, pinned=self.in_use)
 
     def take(self, codebook_id: str) -> Item:

@@ -29,7 +29,7 @@ HEAD = ('state', 'event', 'guard', 'next state', 'actions', 'counts')
 
 
 def edges(role: str) -> list[Edge]:
-    """Return the changes of state of a role, a key of `ROLES`, as one edge for each pair."""
+    """Return the state changes of a role (a key of `ROLES`), one edge per pair of states."""
     machine = ROLES[role]
     found: dict[tuple[enum.Enum, enum.Enum], list[str]] = {}
     for state in machine.STATES:

@@ -34,8 +34,8 @@ class Edge(NamedTuple):
 def draw(name: str, states: Sequence[enum.Enum], edges: Sequence[Edge]) -> str:
     """Return the diagram of a role as an SVG document.
 
-    States are stacked in their order. Arrows to the next state are drawn between the boxes, other
-    arrows forward on the right, arrows back on the left.
+    States are stacked in order. Arrows to the next state are drawn between the boxes, other
+    forward arrows on the right, and backward arrows on the left.
     """
     place = {state: index for index, state in enumerate(states)}
     steps = [edge for edge in edges if place[edge.target] - place[edge.source] == 1]
@@ -96,7 +96,7 @@ def _ports(states: Sequence[enum.Enum], group: Sequence[Edge], tops: Mapping[enu
 
 def _around(group: Sequence[Edge], side: int, edge_x: float, label: float,
             ports: Mapping[tuple[Edge, bool], int], place: Mapping[enum.Enum, int]) -> list[str]:
-    """Return arrows that leave and enter on one side, each in its own lane, short ones inside."""
+    """Return arrows on one side, each in its own lane, the shortest innermost."""
     parts = []
     order = sorted(group, key=lambda edge: abs(place[edge.target] - place[edge.source]))
     for lane, edge in enumerate(order):

@@ -10,7 +10,7 @@ from rhs_isac_ros.protocol.settings import PositionerSettings
 
 
 @dataclasses.dataclass(frozen=True)
-class Tick:
+class Timeout:
     """The deadline of the role has passed."""
 
 
@@ -23,7 +23,7 @@ class CodebookOffered:
 
 @dataclasses.dataclass(frozen=True)
 class SettingsOffered:
-    """New settings, of the same class as those in use, take effect with the next cycle."""
+    """New settings, of the same class as those in use, are available to the role."""
 
     settings: Any
 
@@ -52,7 +52,7 @@ class EstimatorFailed:
     reason: str
 
 
-Event = (Message | Tick | CodebookOffered | SettingsOffered | PeersChanged | EstimatorReady
+Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | EstimatorReady
          | EstimatorFailed)
 
 
@@ -80,10 +80,10 @@ class BuildEstimator:
 
 
 @dataclasses.dataclass(frozen=True)
-class SettingsReverted:
-    """Set the parameters back to these settings: the ones offered last cannot be used."""
+class RevertSettings:
+    """Reset the parameters to these settings, because the settings offered last are unusable."""
 
     settings: Any
 
 
-Action = Send | LogMessage | BuildEstimator | SettingsReverted
+Action = Send | LogMessage | BuildEstimator | RevertSettings

@@ -35,23 +35,23 @@ def array(
 
 
 def index(symbol: str) -> Any:
-    """Declare an index, from 0 to one less than a size, a symbol of `Scenario.sizes`."""
-    return dataclasses.field(metadata={'below': symbol})
+    """Declare an index that is less than the size `symbol` of `Scenario.sizes`."""
+    return dataclasses.field(metadata={'index_of': symbol})
 
 
 def number(low: float, high: float) -> Any:
     """Declare a number with an inclusive range."""
-    return dataclasses.field(metadata={'least': low, 'most': high})
+    return dataclasses.field(metadata={'low': low, 'high': high})
 
 
 def size(symbol: str) -> Any:
-    """Declare a field that equals a size, a symbol of `Scenario.sizes`."""
+    """Declare a field that equals the size `symbol` of `Scenario.sizes`."""
     return dataclasses.field(metadata={'equals': symbol})
 
 
 def optional_float() -> Any:
     """Declare a number that may be NaN, for an unknown value."""
-    return dataclasses.field(metadata={'open': True})
+    return dataclasses.field(metadata={'nan_allowed': True})
 
 
 class Checkable(Protocol):
@@ -85,15 +85,15 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
         problem = ''
         if 'dims' in meta:
             problem = _array_problem(value, meta, sizes)
-        elif 'below' in meta and not 0 <= value < sizes[meta['below']]:
-            end = sizes[meta['below']]
-            problem = f'{value}, expected 0 to {end - 1} ({meta["below"]} = {end})'
-        elif isinstance(value, float) and not math.isfinite(value) and 'open' not in meta:
+        elif 'index_of' in meta and not 0 <= value < sizes[meta['index_of']]:
+            end = sizes[meta['index_of']]
+            problem = f'{value}, expected 0 to {end - 1} ({meta["index_of"]} = {end})'
+        elif isinstance(value, float) and not math.isfinite(value) and 'nan_allowed' not in meta:
             problem = f'{value}, expected a finite number'
         elif 'equals' in meta and value != sizes[meta['equals']]:
             problem = f'{value}, expected {meta["equals"]} = {sizes[meta["equals"]]}'
-        elif 'least' in meta and not meta['least'] <= value <= meta['most']:
-            problem = f'{value}, expected {meta["least"]:g} to {meta["most"]:g}'
+        elif 'low' in meta and not meta['low'] <= value <= meta['high']:
+            problem = f'{value}, expected {meta["low"]:g} to {meta["high"]:g}'
         if problem:
             raise MessageError(f'{type(message).__name__}.{name}: {problem}')
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Tick
+from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Timeout
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.protocol.settings import setting
@@ -33,7 +33,7 @@ class Impairments:
 class ImpairedChannel:
     """A channel role whose outgoing messages are subject to impairments.
 
-    New impairments take effect with the true position that begins the next cycle.
+    New impairments take effect at the start of the next cycle, when its true position arrives.
 
     Parameters
     ----------
@@ -63,10 +63,10 @@ class ImpairedChannel:
         arriving: list[Action] = []
         actions: list[Action] = []
         match event:
-            case Tick():
+            case Timeout():
                 pass
             case SettingsOffered(impairments):
-                self._settings.newest = impairments
+                self._settings.latest = impairments
             case _:
                 arriving += self._begin_cycle(event)
                 actions = self._role.handle(event, now_s)
@@ -99,9 +99,9 @@ class ImpairedChannel:
         return self._role.state
 
     @property
-    def LACKING(self) -> frozenset[enum.Enum]:
+    def BLOCKED_STATES(self) -> frozenset[enum.Enum]:
         """States in which something that the role needs is missing."""
-        return self._role.LACKING
+        return self._role.BLOCKED_STATES
 
     def next_deadline(self) -> float | None:
         """Return when the next message arrives [s], or None if no message is in flight."""
@@ -115,7 +115,8 @@ class ImpairedChannel:
 
     def _send(self, action: Send, now_s: float) -> None:
         impairments = self._settings.in_use
-        # The number of draws is fixed, so that the fate of one message does not affect another.
+        # The number of draws is fixed, so that the impairments of one message do not affect
+        # those of others.
         loss, duplication, *delays = self._rng.random(4)
         if loss < impairments.loss_probability:
             self.counters['emulated_loss'] += 1

@@ -62,7 +62,7 @@ class Message:
 
 
 def same(one: Message, other: Message) -> bool:
-    """Return whether two messages have the same class and equal fields; NaN equals nothing."""
+    """Return whether two messages have the same class and equal fields; NaN != NaN."""
     return type(one) is type(other) and all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name))
         for field in dataclasses.fields(one))
@@ -70,7 +70,7 @@ def same(one: Message, other: Message) -> bool:
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Beacon(Message):
-    """Invitation of the base station to a cycle."""
+    """Invitation from the base station to take part in a cycle."""
 
     attempt: int
 
@@ -212,7 +212,7 @@ class Capacity(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CapacityStatistics(Message):
-    """Lower quartile, median and upper quartile of the capacities of the newest beams."""
+    """Lower quartile, median and upper quartile of the capacities of the latest beams."""
 
     n_reports: int = number(1, 2**32 - 1)
     expected_bps: np.ndarray = array('3', low=0, high=_MAX_BITS)

@@ -1,4 +1,4 @@
-"""Log messages about outages: one at the beginning of each, one at its end."""
+"""Log messages about outages, one at the beginning of each and one at its end."""
 
 from collections.abc import Iterable
 
@@ -12,8 +12,9 @@ _USER_REASON = Outcome.USER_GONE.value
 class OutageLog:
     """Suppresses repeated log messages about the same outage.
 
-    Missing roles are logged again after a cycle has begun, the reason of a lost cycle after
-    service has resumed: to the same user for ``user_gone``, to any user for other reasons.
+    Missing roles are logged again once a cycle has begun. The reason for a lost cycle is logged
+    again once service has resumed: to the same user for ``user_gone``, to any user for other
+    reasons.
     """
 
     def __init__(self) -> None:
@@ -29,7 +30,7 @@ class OutageLog:
         return [LogMessage(f'waiting for {", ".join(self._waiting_for)}', warning=True)]
 
     def clear_waiting(self) -> None:
-        """Note that nothing is missing, since a cycle has begun."""
+        """Record that nothing is missing, because a cycle has begun."""
         self._waiting_for = ()
 
     @staticmethod
@@ -43,7 +44,7 @@ class OutageLog:
         if key in self._open:
             return []
         self._open.add(key)
-        return [LogMessage(f'cycle {cycle_id}: user {user} given up: {reason}', warning=True)]
+        return [LogMessage(f'cycle {cycle_id} of user {user} given up: {reason}', warning=True)]
 
     def log_served_cycle(self, cycle_id: int, user: int) -> list[LogMessage]:
         """Return a message about the outages that a served cycle ends, if any."""

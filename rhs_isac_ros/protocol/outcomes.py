@@ -1,10 +1,10 @@
-"""The results that roles count, each with its kind."""
+"""The outcomes that roles count, each with its kind."""
 
 import enum
 
 
 class Kind(enum.Enum):
-    """What a counted result means; the value is its section in the diagnostics."""
+    """Kind of an outcome; the value is the name of its section in the diagnostics."""
 
     DROPPED = 'dropped'    # a message was ignored
     REPEATED = 'retries'   # a step of a cycle was requested again
@@ -14,7 +14,7 @@ class Kind(enum.Enum):
 
 @enum.unique
 class Outcome(enum.Enum):
-    """A countable result; the value is the name of its counter."""
+    """A countable outcome; the value is the name of its counter."""
 
     kind: Kind
 
@@ -25,7 +25,7 @@ class Outcome(enum.Enum):
         member.kind = kind
         return member
 
-    # A message that belongs to no step of the present cycle, or that is refused.
+    # A message that belongs to no step of the current cycle, or that is rejected.
     WRONG_CYCLE = 'wrong_cycle', Kind.DROPPED
     WRONG_USER = 'wrong_user', Kind.DROPPED
     WRONG_BAND = 'wrong_band', Kind.DROPPED
@@ -48,14 +48,14 @@ class Outcome(enum.Enum):
     RETRY_DATA = 'retry_data', Kind.REPEATED
     ASKED_AGAIN = 'asked_again', Kind.REPEATED
 
-    # A cycle that ended without service, as the base station counts it.
+    # A cycle that ended without service, as counted by the base station.
     RHS_SILENT = 'rhs_silent', Kind.LOST
     USER_GONE = 'user_gone', Kind.LOST
     NO_FIX = 'no_fix', Kind.LOST
     POSITIONER_SILENT = 'positioner_silent', Kind.LOST
     TRANSMISSION_SILENT = 'transmission_silent', Kind.LOST
     DATA_LOST = 'data_lost', Kind.LOST
-    # The same, as its user counts it.
+    # A cycle that ended without service, as counted by its user.
     NOT_GRANTED = 'not_granted', Kind.LOST
     ABANDONED = 'abandoned', Kind.LOST
     BS_SILENT = 'bs_silent', Kind.LOST

@@ -1,4 +1,4 @@
-"""Settings in use, and settings that take effect at the end of a cycle."""
+"""Settings in use, and new settings that are not in use yet."""
 
 from typing import Generic, TypeVar
 
@@ -15,21 +15,21 @@ class PendingSettings(Generic[SettingsT]):
     ----------
     in_use
         The settings in use.
-    newest
+    latest
         The settings received last.
     """
 
     def __init__(self, settings: SettingsT) -> None:
         self.in_use = settings
-        self.newest = settings
+        self.latest = settings
 
     def apply(self) -> list[LogMessage]:
-        """Put the newest settings into use; return a message that lists changes, if any."""
-        changed = changes(self.in_use, self.newest)
-        self.in_use = self.newest
+        """Put the latest settings into use; return a message that lists changes, if any."""
+        changed = changes(self.in_use, self.latest)
+        self.in_use = self.latest
         described = ', '.join(f'{name} {shown(value)!r}' for name, value in changed.items())
-        return [LogMessage(f'from now on: {described}')] if described else []
+        return [LogMessage(f'settings applied: {described}')] if described else []
 
     def describe(self) -> dict[str, str]:
         """Return the values in use and the pending ones, as `settings.describe_settings` does."""
-        return describe_settings(self.in_use, self.newest)
+        return describe_settings(self.in_use, self.latest)

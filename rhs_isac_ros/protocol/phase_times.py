@@ -34,7 +34,7 @@ class PhaseTimes:
         Parameters
         ----------
         outcome
-            ``served``, or the name of the `Outcome` that ended the cycle.
+            ``served``, or the value of the `Outcome` that ended the cycle.
         """
         return self._state(m.Phase.BEACONING, cycle_id, user, now_s, outcome)
 

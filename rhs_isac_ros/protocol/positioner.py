@@ -1,4 +1,4 @@
-"""The positioner: estimates positions from received signals."""
+"""The positioner, which estimates positions from received signals."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -19,9 +19,9 @@ from rhs_isac_ros.protocol.events import (
     EstimatorReady,
     Event,
     LogMessage,
+    RevertSettings,
     Send,
     SettingsOffered,
-    SettingsReverted,
 )
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
@@ -30,7 +30,7 @@ from rhs_isac_ros.protocol.settings import PositionerSettings
 
 
 class _Job(NamedTuple):
-    """What an estimator is built from."""
+    """The codebook and the settings from which an estimator is built."""
 
     codebook: Codebook
     settings: PositionerSettings
@@ -41,7 +41,7 @@ class _Job(NamedTuple):
 
 
 class _Built(NamedTuple):
-    """An estimator, what it was built from, and what its bound is computed from."""
+    """An estimator, the job that built it, and the measurement model for its bound."""
 
     job: _Job
     model: MeasurementModel
@@ -52,10 +52,10 @@ class Positioner(PlainRole):
     """The role of the positioner.
 
     The codebook id of the received signals selects the estimator. Estimators are built one at a
-    time in the background. Meanwhile, estimators for other codebooks remain in use, and the newest
+    time in the background. Meanwhile, estimators for other codebooks remain in use, and the latest
     signals of the codebook wait for its estimator. If there is an estimator for the same codebook
-    with other settings, it remains in use until the new one is ready, and for good if the new one
-    cannot be built.
+    with other settings, it remains in use until the new one is ready, or permanently if the new
+    one cannot be built.
 
     Parameters
     ----------
@@ -74,15 +74,16 @@ class Positioner(PlainRole):
         super().__init__()
         self._scenario, self._stopwatch = scenario, stopwatch
         self._settings = PendingSettings(settings or PositionerSettings())
-        # Why the last change of settings was reverted; empty if it was not.
+        # Reason why the last change of settings was reverted; empty if it was not reverted.
         self._failure = ''
         self._estimators: CodebookCache[_Built] = CodebookCache()
         self._codebook: Codebook | None = None
-        # The estimator that is being built, and the newest one requested since.
+        # The estimator that is being built, and the latest one requested since.
         self._building: _Job | None = None
         self._next: _Job | None = None
         self._waiting: m.ReceivedSignals | None = None
-        # Whether the last signals gave no position: the first of a series is logged.
+        # Whether the last signals yielded no position; only the first of consecutive failures is
+        # logged.
         self._no_fix_logged = False
         # The last signals that were answered, and the answer.
         self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
@@ -92,7 +93,7 @@ class Positioner(PlainRole):
         match event:
             case CodebookOffered(codebook):
                 self._codebook = codebook
-                return self._request(_Job(codebook, self._settings.newest))
+                return self._request(_Job(codebook, self._settings.latest))
             case SettingsOffered(settings):
                 return self._offer_settings(settings)
             case EstimatorReady(codebook, estimator, elapsed_s):
@@ -110,7 +111,7 @@ class Positioner(PlainRole):
         return self._settings.describe() | failed | {'codebook_id': self._estimators.in_use}
 
     def _offer_settings(self, settings: PositionerSettings) -> list[Action]:
-        self._settings.newest, self._failure = settings, ''
+        self._settings.latest, self._failure = settings, ''
         if self._codebook is None:
             return [*self._settings.apply()]
         return self._request(_Job(self._codebook, settings))
@@ -127,12 +128,12 @@ class Positioner(PlainRole):
         return [BuildEstimator(job.codebook, job.settings)]
 
     def _job_of(self, codebook: Codebook) -> _Job:
-        return self._building or _Job(codebook, self._settings.newest)
+        return self._building or _Job(codebook, self._settings.latest)
 
     def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> list[Action]:
         """Store an estimator, unless other settings were offered meanwhile."""
         codebook = job.codebook
-        is_current = job.settings == self._settings.newest
+        is_current = job.settings == self._settings.latest
         if not is_current and codebook.id in self._estimators:
             return []
         model = MeasurementModel(self._scenario, codebook).prepare()
@@ -142,19 +143,20 @@ class Positioner(PlainRole):
             f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')]
 
     def _revert(self, job: _Job, reason: str) -> list[Action]:
-        """Revert to the settings in use if new settings were the reason of a failure."""
+        """Revert to the settings in use if new settings caused the failure."""
         kept = self._settings.in_use
         if job.settings == kept:
             return [LogMessage(
                 f'no estimator for codebook {job.codebook.id}: {reason}', warning=True)]
-        if job.settings != self._settings.newest:
+        if job.settings != self._settings.latest:
             return []
-        self._settings.newest = kept
+        self._settings.latest = kept
         self._failure = f'{job.settings.estimator}: {reason}'
         # A codebook offered meanwhile needs an estimator with the settings in use.
         self._next = _Job((self._next or job).codebook, kept)
-        text = f'estimator {job.settings.estimator} not used, keeping {kept.estimator}: {reason}'
-        return [LogMessage(text, warning=True), SettingsReverted(kept)]
+        text = (f'cannot build estimator {job.settings.estimator}, keeping {kept.estimator}: '
+                f'{reason}')
+        return [LogMessage(text, warning=True), RevertSettings(kept)]
 
     def _continue(self) -> list[Action]:
         """Request the next estimator and process the signals that waited for the last one."""

@@ -1,4 +1,4 @@
-"""The RHS controller: applies configurations to the surface and reports them."""
+"""The RHS controller, which applies configurations to the surface and reports them."""
 
 import dataclasses
 import enum
@@ -12,16 +12,16 @@ from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
 
-# Cycles and commands that are remembered, to recognize late and repeated messages.
+# Number of cycles and commands kept to recognise late and repeated messages.
 _MAX_REMEMBERED = 8
 
 
 class State(enum.Enum):
     """States of the RHS controller."""
 
-    IDLE = 'idle'                  # no configuration applied
-    POSITIONING = 'positioning'    # a band's configurations, one for each frame
-    TRANSMITTING = 'transmitting'  # the configuration of a beam
+    IDLE = 'idle'                  # applies no configuration
+    POSITIONING = 'positioning'    # applies a band's configurations, one for each frame
+    TRANSMITTING = 'transmitting'  # applies the configuration of a beam
 
 
 class RhsControllerSteps(StateMachine[State]):
@@ -33,9 +33,10 @@ class RhsControllerSteps(StateMachine[State]):
         self._cycle_id = 0
         # The user of each granted cycle.
         self._granted: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
-        # Cycle, band and codebook of the commands obeyed; the present one is the last.
+        # Cycle, band and codebook of the latest executed commands; the last one is the current
+        # command.
         self._applied: NewestDict[tuple[int, int, str], None] = NewestDict(_MAX_REMEMBERED)
-        # Reset by the next command obeyed, so that each outage is logged once.
+        # Reset by the next executed command, so that each outage is logged once.
         self._unknown_logged = False
 
     def status(self) -> Mapping[str, str]:
@@ -50,15 +51,15 @@ class RhsControllerSteps(StateMachine[State]):
 
     def repeats_command(self, event: m.RhsCommand, now_s: float) -> bool:
         """Whether the configurations of a command are those applied now."""
-        newest = next(reversed(self._applied), None)
-        return self.state is State.POSITIONING and _key(event) == newest
+        current = next(reversed(self._applied), None)
+        return self.state is State.POSITIONING and _key(event) == current
 
     def stale_command(self, event: m.RhsCommand, now_s: float) -> bool:
-        """Whether a command was obeyed before."""
+        """Whether a command was executed before."""
         return _key(event) in self._applied
 
     def wrong_cycle(self, event: m.Beam, now_s: float) -> bool:
-        """Whether a beam belongs to another cycle than the last command."""
+        """Whether a beam belongs to a cycle other than that of the last command."""
         return event.cycle_id != self._cycle_id
 
     def wrong_user(self, event: m.Beam, now_s: float) -> bool:
@@ -66,17 +67,17 @@ class RhsControllerSteps(StateMachine[State]):
         return self._granted.get(event.cycle_id, event.user) != event.user
 
     def wrong_codebook(self, event: m.Beam, now_s: float) -> bool:
-        """Whether a beam belongs to another codebook than the one applied."""
+        """Whether a beam belongs to a codebook other than the one applied."""
         return event.codebook_id != self._codebooks.in_use
 
     # Actions
 
     def store_codebook(self, event: CodebookOffered, now_s: float) -> None:
-        """Add a codebook to those held."""
+        """Store a codebook."""
         self._codebooks.put(event.codebook.id, event.codebook)
 
     def store_grant(self, event: m.Grant, now_s: float) -> None:
-        """Remember the user of a cycle."""
+        """Store the user of a cycle."""
         self._granted.put(event.cycle_id, event.user)
 
     def apply_band(self, event: m.RhsCommand, now_s: float) -> list[Action]:
@@ -95,13 +96,13 @@ class RhsControllerSteps(StateMachine[State]):
             codebook_id=event.codebook_id, analog=event.analog[None]))]
 
     def log_unknown_codebook(self, event: m.RhsCommand | m.Beam, now_s: float) -> list[Action]:
-        """Log the first request for a codebook that is not available."""
+        """Log the first message of an outage whose codebook cannot be applied."""
         if self._unknown_logged:
             return []
         self._unknown_logged = True
         return [LogMessage(
-            f'codebook {event.codebook_id!r} requested, available: {self._codebooks.ids()}',
-            warning=True)]
+            f'codebook {event.codebook_id!r} rejected; in use: {self._codebooks.in_use!r}, '
+            f'available: {self._codebooks.ids()}', warning=True)]
 
 
 def _key(command: m.RhsCommand) -> tuple[int, int, str]:
@@ -141,7 +142,7 @@ TABLE = (
 class RhsController(RhsControllerSteps):
     """The role of the RHS controller.
 
-    It holds the newest codebooks; the commands of the base station select the one to apply.
+    It holds the latest codebooks; the commands of the base station select the one to apply.
     """
 
     SENDS = (m.RhsConfiguration,)

@@ -1,4 +1,4 @@
-"""The interface of the roles, and what all of them have in common."""
+"""The interface of the roles, and their common base classes."""
 
 import collections
 import enum
@@ -11,7 +11,7 @@ from rhs_isac_ros.protocol.outcomes import Outcome
 
 
 class Role(Protocol):
-    """A role of the protocol: it turns events into actions and reads no clock.
+    """A role of the protocol. It maps events to actions and does not read a clock.
 
     Attributes
     ----------
@@ -32,13 +32,13 @@ class Role(Protocol):
         ...
 
     @property
-    def LACKING(self) -> frozenset[enum.Enum]:
+    def BLOCKED_STATES(self) -> frozenset[enum.Enum]:
         """States in which something that the role needs is missing."""
         ...
 
     @property
     def state(self) -> enum.Enum | None:
-        """Present state; None if the role has no state machine."""
+        """Current state; None if the role has no state machine."""
         ...
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
@@ -46,7 +46,7 @@ class Role(Protocol):
         ...
 
     def next_deadline(self) -> float | None:
-        """Return when the role expects a `Tick` [s], on the clock of `handle`, or None."""
+        """Return when the role expects a `Timeout` [s], on the clock of `handle`, or None."""
         ...
 
     def status(self) -> Mapping[str, str]:
@@ -76,16 +76,16 @@ class CountingRole:
             self.counters[outcome.value] += n
 
     def status(self) -> Mapping[str, str]:
-        """Return an empty mapping: nothing in the role can change."""
+        """Return an empty mapping, because the role has no settings."""
         return {}
 
 
 class PlainRole(CountingRole):
     """Base of the roles that only answer messages, without states or deadlines."""
 
-    LACKING: frozenset[enum.Enum] = frozenset()
+    BLOCKED_STATES: frozenset[enum.Enum] = frozenset()
     state: enum.Enum | None = None
 
     def next_deadline(self) -> float | None:
-        """Return None: the role needs no `Tick`."""
+        """Return None, because the role needs no `Timeout`."""
         return None

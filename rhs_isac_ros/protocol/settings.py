@@ -44,7 +44,7 @@ class BaseStationSettings:
     Raises
     ------
     ValueError
-        If ``allowed_users`` is not a list of users, as `parse_users` reads it.
+        If `parse_users` cannot parse ``allowed_users``.
     """
 
     policy: str = setting(
@@ -70,7 +70,7 @@ class BaseStationSettings:
         200.0, 'Maximum rate of acks accepted from each user.', unit='Hz', low=1.0, high=1e6)
 
     def __post_init__(self) -> None:
-        """Check what types and ranges cannot express."""
+        """Check the constraints that types and ranges cannot express."""
         try:
             parse_users(self.allowed_users)
         except ValueError as error:
@@ -102,7 +102,7 @@ def changes(old: Any, new: Any) -> dict[str, Any]:
             if getattr(new, name) != getattr(old, name)}
 
 
-def describe_settings(in_use: Any, newest: Any) -> dict[str, str]:
+def describe_settings(in_use: Any, latest: Any) -> dict[str, str]:
     """Return settings as text for the diagnostics.
 
     Returns
@@ -114,7 +114,7 @@ def describe_settings(in_use: Any, newest: Any) -> dict[str, str]:
     described = {f'parameter.{name}': shown(value)
                  for name, value in dataclasses.asdict(in_use).items()}
     return described | {f'pending.{name}': shown(value)
-                        for name, value in changes(in_use, newest).items()}
+                        for name, value in changes(in_use, latest).items()}
 
 
 def shown(value: Any) -> str:

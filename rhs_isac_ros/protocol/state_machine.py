@@ -13,13 +13,13 @@ StateT = TypeVar('StateT', bound=enum.Enum)
 RoleT = TypeVar('RoleT')
 EventT = TypeVar('EventT')
 
-# As a source: any state. As a target: the present state.
+# As a source: any state. As a target: the current state.
 ANY = None
 SAME = None
 
 
 def always(role: object, event: object, now_s: float) -> bool:
-    """Accept every event: the guard of a row without a condition."""
+    """Accept every event; this is the guard of a row without a condition."""
     return True
 
 
@@ -34,15 +34,15 @@ class Transition(Generic[StateT, RoleT, EventT]):
     event
         Class of the event.
     guard
-        Condition on role, event and time; it changes nothing.
+        Condition on role, event and time; it must not have side effects.
     actions
         Steps to carry out, in order; each may return protocol actions.
     target
         Next state, or SAME.
     outcome
-        What is counted, if anything.
+        Outcome to count, or None.
     restart_timeout
-        Whether the time-out starts anew although the state stays.
+        Whether to restart the timeout although the state does not change.
     """
 
     source: tuple[StateT, ...] | None = ANY
@@ -55,25 +55,25 @@ class Transition(Generic[StateT, RoleT, EventT]):
 
 
 class StateMachine(CountingRole, Generic[StateT]):
-    """A role with states: it takes events and returns actions.
+    """A role with states, which takes events and returns actions.
 
     `handle` takes the first row of `TABLE` whose source, event class and guard match. An event
-    without a matching row changes nothing and counts as ``unexpected_<name>``. The machine reads
-    no clock: every call passes the time.
+    without a matching row changes nothing and counts as ``unexpected_<name>``. The machine does
+    not read a clock: every call passes the time.
 
     Parameters
     ----------
     initial
         First state.
     timeouts_s
-        Time after which a state expects a `Tick` [s]; other states have no time-out.
+        Time after which a state expects a `Timeout` [s]; other states have no timeout.
 
     Attributes
     ----------
     state
-        Present state.
+        Current state.
     repeats
-        Number of times that the time-out of the present state was restarted.
+        Number of times that the timeout of the current state was restarted.
     """
 
     STATES: ClassVar[type[enum.Enum]]
@@ -81,7 +81,7 @@ class StateMachine(CountingRole, Generic[StateT]):
     # Names of the events in the counters of unexpected events.
     EVENT_NAMES: ClassVar[Mapping[type, str]]
     # States in which something that the role needs is missing.
-    LACKING: ClassVar[frozenset[enum.Enum]] = frozenset()
+    BLOCKED_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
 
     _rows: ClassVar[Mapping[tuple[enum.Enum, type], tuple[Transition[Any, Any, Any], ...]]]
 
@@ -130,12 +130,12 @@ class StateMachine(CountingRole, Generic[StateT]):
         return []
 
     def next_deadline(self) -> float | None:
-        """Return when the machine expects a `Tick`.
+        """Return when the machine expects a `Timeout`.
 
         Returns
         -------
         float or None
-            Time on the clock of `handle` [s]; None if the state has no time-out.
+            Time on the clock of `handle` [s]; None if the state has no timeout.
         """
         return self._deadline_s
 
@@ -150,7 +150,7 @@ class StateMachine(CountingRole, Generic[StateT]):
         if changes or row.restart_timeout:
             self.state = target
             self.repeats = 0 if changes else self.repeats + 1
-            # Looked up after the actions, which may have changed the time-outs.
+            # Looked up after the actions, which may have changed the timeouts.
             timeout_s = self._timeouts_s.get(self.state)
             self._deadline_s = None if timeout_s is None else now_s + timeout_s
         return actions

@@ -1,4 +1,4 @@
-"""The transmission: steers a beam to the estimated position and reports its capacity."""
+"""The transmission role, which steers a beam to the estimate and reports its capacity."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,14 +24,14 @@ from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 
-# Figures of a report with statistics, named as in `CapacityStatistics`.
+# Fields of a report for which statistics are computed, named as in `CapacityStatistics`.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
-# Cycles whose reports may still arrive.
+# Number of cycles whose reports may still arrive.
 _MAX_REMEMBERED = 8
 
 
 class _Steered(NamedTuple):
-    """The beam of a cycle, from an estimate, one of a choice of bands."""
+    """The beam of a cycle, its estimate, and the bands from which it was chosen."""
 
     estimate: m.PositionEstimate
     beam: m.Beam
@@ -42,7 +42,7 @@ class _Steered(NamedTuple):
 class Transmission(PlainRole):
     """The role that steers the beam.
 
-    The true position only enters the reported capacities, never the beam.
+    The true position affects only the reported capacities, never the beam.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Transmission(PlainRole):
         self._scenario = scenario
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
-        # By cycle; the last one holds the cycles that the statistics include.
+        # By cycle. `_counted` holds the cycles that the statistics already include.
         self._steered: NewestDict[int, _Steered] = NewestDict(_MAX_REMEMBERED)
         self._truths: NewestDict[int, m.GroundTruth] = NewestDict(_MAX_REMEMBERED)
         self._counted: NewestDict[int, None] = NewestDict(_MAX_REMEMBERED)
@@ -71,7 +71,7 @@ class Transmission(PlainRole):
                 self._codebooks.put(codebook.id, None)
             case SettingsOffered(settings):
                 # A cycle that has a beam keeps its bands.
-                self._settings.newest = settings
+                self._settings.latest = settings
                 return [*self._settings.apply()]
             case m.GroundTruth() if event.cycle_id:
                 self._truths.put(event.cycle_id, event)

@@ -1,4 +1,4 @@
-"""The user: answers beacons, sends pilots, exchanges data."""
+"""The user, which answers beacons, sends pilots and exchanges data."""
 
 import dataclasses
 import enum
@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 from rhs_isac_ros.model.mobility import Mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, LogMessage, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.events import Action, LogMessage, PeersChanged, Send, Timeout
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
 
-# Cycles that are remembered; no message of an older one can still be in transit.
+# Number of cycles kept; no message of an older cycle can still be in transit.
 _MAX_REMEMBERED = 8
 # Steps of a cycle during which the user may receive nothing: the signals of the last band, the
 # position, the beam and the data.
@@ -21,27 +21,27 @@ _SILENT_STEPS = 4
 class State(enum.Enum):
     """States of a user."""
 
-    DISCONNECTED = 'disconnected'  # base station or channel missing
-    LISTENING = 'listening'        # waiting for a beacon
-    NO_BEACON = 'no_beacon'        # waiting for a beacon for longer than the time-out
-    ACKNOWLEDGED = 'acknowledged'  # waiting for the grant
-    GRANTED = 'granted'            # being positioned and served
+    DISCONNECTED = 'disconnected'  # waits for the base station and the channel
+    LISTENING = 'listening'        # waits for a beacon
+    NO_BEACON = 'no_beacon'        # waits for a beacon for longer than the timeout
+    ACKNOWLEDGED = 'acknowledged'  # waits for the grant
+    GRANTED = 'granted'            # is being positioned and served
 
 
 def timeouts(step_s: float, beacon_s: float) -> dict[State, float]:
-    """Return the time-outs of a user.
+    """Return the timeouts of a user.
 
     Parameters
     ----------
     step_s
         Time that the base station waits for each step [s].
     beacon_s
-        Time without a beacon after which the user warns [s].
+        Time without a beacon after which the user logs a warning [s].
 
     Returns
     -------
     dict
-        Time-outs by state [s].
+        Timeouts by state [s].
     """
     return {State.LISTENING: beacon_s, State.ACKNOWLEDGED: step_s,
             State.GRANTED: _SILENT_STEPS * step_s}
@@ -96,7 +96,7 @@ class UserSteps(StateMachine[State]):
         return event.user != self.user and event.cycle_id == self._cycle_id
 
     def wrong_cycle(self, event: m.Grant | m.PilotRequest | m.Data, now_s: float) -> bool:
-        """Whether a message belongs to another cycle than the one acknowledged last."""
+        """Whether a message belongs to a cycle other than the one acknowledged last."""
         return event.cycle_id != self._cycle_id
 
     def late_grant(self, event: m.Grant, now_s: float) -> bool:
@@ -108,7 +108,7 @@ class UserSteps(StateMachine[State]):
         return self._sounded != (event.cycle_id, event.band)
 
     def not_delivered_downlink(self, event: m.Data, now_s: float) -> bool:
-        """Whether data are not those that the channel delivers to a user."""
+        """Whether data are anything other than downlink data delivered by the channel."""
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.UPLINK
 
     # Actions
@@ -121,7 +121,7 @@ class UserSteps(StateMachine[State]):
         """Log the missing roles."""
         return [LogMessage(f'waiting for {", ".join(event.missing)}', warning=True)]
 
-    def log_no_beacon(self, event: Tick, now_s: float) -> list[Action]:
+    def log_no_beacon(self, event: Timeout, now_s: float) -> list[Action]:
         """Log that beacons have ceased."""
         wait_s = self._timeouts_s[State.LISTENING]
         return [LogMessage(f'no beacon for {wait_s:g} s', warning=True)]
@@ -136,7 +136,7 @@ class UserSteps(StateMachine[State]):
         self._attempts.put(event.cycle_id, event.attempt)
         return [Send(m.Ack(cycle_id=event.cycle_id, user=self.user))]
 
-    def fix_position(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
+    def publish_position(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
         """Publish the position that applies to the cycle."""
         truth = self._truths.get(event.cycle_id) or self.ground_truth(now_s, event.cycle_id)
         self._truths.put(event.cycle_id, truth)
@@ -151,7 +151,7 @@ class UserSteps(StateMachine[State]):
                 for frame in range(event.n_frames)]
 
     def send_uplink(self, event: m.Data, now_s: float) -> list[Action]:
-        """Answer the downlink with as much uplink."""
+        """Answer downlink data with the same amount of uplink data."""
         return [Send(m.Data(
             cycle_id=event.cycle_id, user=self.user, direction=m.Direction.UPLINK,
             stage=m.Stage.OFFERED, duration_s=event.duration_s, bits=event.bits))]
@@ -171,11 +171,11 @@ TABLE = (
         target=State.LISTENING),
     Row(event=PeersChanged),
 
-    Row(source=(State.LISTENING,), event=Tick, actions=(Steps.log_no_beacon,),
+    Row(source=(State.LISTENING,), event=Timeout, actions=(Steps.log_no_beacon,),
         target=State.NO_BEACON, outcome=Outcome.NO_BEACON),
-    Row(source=(State.ACKNOWLEDGED,), event=Tick, target=State.LISTENING,
+    Row(source=(State.ACKNOWLEDGED,), event=Timeout, target=State.LISTENING,
         outcome=Outcome.NOT_GRANTED),
-    Row(source=(State.GRANTED,), event=Tick, target=State.LISTENING,
+    Row(source=(State.GRANTED,), event=Timeout, target=State.LISTENING,
         outcome=Outcome.BS_SILENT),
 
     Row(event=m.Beacon, guard=Steps.stale_beacon, outcome=Outcome.STALE_BEACON),
@@ -196,21 +196,21 @@ TABLE = (
     Row(event=m.Grant, guard=Steps.late_grant, outcome=Outcome.LATE_GRANT),
     # The base station may wait for longer than the user did.
     Row(source=(State.LISTENING, State.ACKNOWLEDGED), event=m.Grant,
-        actions=(Steps.fix_position,), target=State.GRANTED),
+        actions=(Steps.publish_position,), target=State.GRANTED),
     Row(source=(State.NO_BEACON,), event=m.Grant,
-        actions=(Steps.log_resumed, Steps.fix_position), target=State.GRANTED),
+        actions=(Steps.log_resumed, Steps.publish_position), target=State.GRANTED),
     Row(source=(State.GRANTED,), event=m.Grant),
 
     Row(event=m.PilotRequest, guard=Steps.other_user),
     Row(event=m.PilotRequest, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
     # A request that overtakes the grant implies it.
     Row(source=(State.ACKNOWLEDGED,), event=m.PilotRequest, guard=Steps.new_request,
-        actions=(Steps.fix_position, Steps.send_pilots), target=State.GRANTED),
+        actions=(Steps.publish_position, Steps.send_pilots), target=State.GRANTED),
     Row(source=(State.GRANTED,), event=m.PilotRequest, guard=Steps.new_request,
         actions=(Steps.send_pilots,), restart_timeout=True),
     # The channel may have missed the pilots or the position.
     Row(source=(State.GRANTED,), event=m.PilotRequest,
-        actions=(Steps.fix_position, Steps.send_pilots), outcome=Outcome.ASKED_AGAIN,
+        actions=(Steps.publish_position, Steps.send_pilots), outcome=Outcome.ASKED_AGAIN,
         restart_timeout=True),
 
     Row(event=m.Data, guard=Steps.not_delivered_downlink),
@@ -229,11 +229,11 @@ class User(UserSteps):
     Parameters
     ----------
     user
-        Number of the user, from 1.
+        Id of the user, from 1.
     mobility
         The user's position as a function of time.
     timeouts_s
-        Time-outs by state [s].
+        Timeouts by state [s].
     """
 
     SENDS = (m.Ack, m.GroundTruth, m.Pilot, m.Data)
@@ -241,6 +241,6 @@ class User(UserSteps):
 
     STATES = State
     TABLE = TABLE
-    EVENT_NAMES = {PeersChanged: 'peers', Tick: 'timeout', m.Beacon: 'beacon', m.Grant: 'grant',
+    EVENT_NAMES = {PeersChanged: 'peers', Timeout: 'timeout', m.Beacon: 'beacon', m.Grant: 'grant',
                    m.PilotRequest: 'pilot_request', m.Data: 'downlink'}
-    LACKING = frozenset({State.DISCONNECTED, State.NO_BEACON})
+    BLOCKED_STATES = frozenset({State.DISCONNECTED, State.NO_BEACON})

@@ -3,9 +3,9 @@
 import numpy as np
 
 POLICIES = ('round_robin', 'first', 'random')
-# Consecutive beacons without an answer after which a user is removed.
+# Number of consecutive beacons without an answer after which a user is removed.
 _MAX_MISSED = 3
-# Bounds the memory, whatever user numbers the acks contain.
+# Maximum number of registered users, which bounds the memory whatever ids the acks contain.
 _MAX_USERS = 1024
 
 
@@ -79,7 +79,7 @@ class UserScheduler:
         self._served.pop(user, None)
 
     def is_complete_with(self, user: int) -> bool:
-        """Return whether the selection need not wait for others if `user` answers now."""
+        """Return whether no further answers are needed once `user` has answered."""
         if self._policy == 'first':
             return True
         return self._missed.keys() <= {*self.answered, user}

@@ -1,1 +1,1 @@
-"""Where the protocol meets ROS 2: topics, quality of service, conversions, parameters, nodes."""
+"""ROS 2 adapters of the protocol: topics, quality of service, conversions, parameters, nodes."""

@@ -1,4 +1,4 @@
-"""Work that takes longer than a callback may."""
+"""Background execution of jobs that would block a callback for too long."""
 
 import collections
 from collections.abc import Callable
@@ -34,8 +34,8 @@ class BackgroundWorker:
         Parameters
         ----------
         on_result
-            Called with the result in the thread that spins the node. An exception of the job is
-            raised there instead.
+            Called with the result in the thread that spins the node. An exception
+            raised by the job is re-raised there instead.
         """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))

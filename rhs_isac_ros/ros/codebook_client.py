@@ -1,4 +1,4 @@
-"""A client of the codebook that the optimizer holds as its parameters."""
+"""A client that fetches the codebook from the parameters of the optimizer."""
 
 import functools
 import math
@@ -27,8 +27,8 @@ _RESPONSE_TIMEOUT_S = 2.0
 class CodebookClient:
     """Fetches the codebook from the parameters of the optimizer whenever it changes.
 
-    A message on the latched topic only triggers a request, also after a restart of the optimizer;
-    the codebook itself comes from the parameter service.
+    A message on the latched topic only triggers a request, including after a restart of the
+    optimizer; the codebook itself comes from the parameter service.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ class CodebookClient:
     on_codebook
         Called with each new codebook.
     on_presence
-        Called with whether the optimizer is present, whenever that changes; it counts as present
-        at first.
+        Called with True or False whenever the optimizer appears or disappears; it is assumed to be
+        present at first.
     """
 
     def __init__(
@@ -57,14 +57,14 @@ class CodebookClient:
         self._log_once = LogOnce(node)
         self._codebook_id = ''
         node.create_subscription(
-            ros.Codebook, topics.CODEBOOK, self._on_announcement, qos.HELD, raw=True,
+            ros.Codebook, topics.CODEBOOK, self._on_announcement, qos.LATCHED_WITH_LEASE, raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 liveliness=self._on_liveliness, use_default_callbacks=False))
         self._timer = steady_timer(node, _RETRY_S, self._request)
 
     def _on_announcement(self, content: bytes) -> None:
-        # The content is ignored, malformed or not. A known id is no reason to skip the request:
-        # a response with a codebook that was withdrawn meanwhile may be under way.
+        # Ignore the content, which may be malformed. Send the request even if the id is unchanged,
+        # because a response with a withdrawn codebook may be in transit.
         self._announced += 1
         self._timer.reset()
 
@@ -79,10 +79,10 @@ class CodebookClient:
         else:
             self._node.get_logger().warning(
                 f'{self._optimizer} is no longer present; '
-                f'{self._codebook_id or "no codebook"} stays in use')
+                f'the codebook in use is {self._codebook_id or "none"}')
 
     def _is_in_this_process(self) -> bool:
-        """Return whether the optimizer runs in this process, where Fast DDS reports it dead.
+        """Return whether the optimizer is in this process; Fast DDS then reports it as lost.
 
         The first twelve bytes of the GID of an endpoint identify its participant, and each process
         has one participant.
@@ -122,7 +122,7 @@ class CodebookClient:
             codebook.check(self._scenario)
         except CodebookError as error:
             self._log_once.error(
-                'codebook', f'codebook of {self._optimizer} not used: {error}',
+                'codebook', f'codebook of {self._optimizer} rejected: {error}',
                 repeat_if_changed=True)
             return
         self._log_once.clear('codebook')

@@ -4,7 +4,7 @@ from rclpy.node import Node
 
 
 class LogOnce:
-    """Logs the first error of each subject: a faulty sender must not fill the disk."""
+    """Logs the first error of each subject, so that a faulty sender cannot fill the disk."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -16,7 +16,8 @@ class LogOnce:
         Parameters
         ----------
         repeat_if_changed
-            Log it again if the text is not that of the last error of the subject.
+            Whether to log an error again if its text differs from the last one logged for the
+            subject.
         """
         last = self._logged.get(subject)
         if last is None or repeat_if_changed and text != last:
@@ -24,5 +25,5 @@ class LogOnce:
             self._node.get_logger().error(text)
 
     def clear(self, subject: str) -> None:
-        """Log the next error of a subject again."""
+        """Allow the next error of a subject to be logged again."""
         self._logged.pop(subject, None)

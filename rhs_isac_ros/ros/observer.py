@@ -1,4 +1,4 @@
-"""A node that observes the cycles of a network from outside."""
+"""A node that passively observes the cycles of a network."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -10,7 +10,7 @@ from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.recording import Recorder
-from rhs_isac_ros.ros.subscriptions import listen
+from rhs_isac_ros.ros.subscriptions import subscribe_messages
 
 
 class CycleObserver(Node):
@@ -25,14 +25,14 @@ class CycleObserver(Node):
     receives
         Types of the messages to receive.
     sizes
-        Sizes by symbol that the messages must have, as of `Scenario.sizes`; None: any.
+        Required sizes by symbol, as in `Scenario.sizes`; None: any.
     on_malformed
         Called with the error of each malformed message; by default it is logged.
 
     Attributes
     ----------
     log
-        The cycles, on the clock `time.monotonic`.
+        The cycles, with times of `time.monotonic`.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class CycleObserver(Node):
         if recorder is not None:
             # One subscription for both, so that a replay yields the same cycles in the same order.
             kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
-            recorder.listen(self, lambda name, message: self._on_recorded(
+            recorder.record_topics(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))
             return
-        listen(self, receives, sizes, self._on_message, on_malformed)
+        subscribe_messages(self, receives, sizes, self._on_message, on_malformed)
 
     def observe(self, message: m.Message, now_s: float) -> None:
         """Process a message that arrived at `now_s` [s]; subclasses may extend this."""

@@ -31,7 +31,7 @@ class ParameterizedNode(Node):
     Raises
     ------
     ParameterError
-        If a parameter is wrong.
+        If a parameter is invalid.
     """
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
@@ -77,7 +77,7 @@ class ParameterizedNode(Node):
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters together, as the parameter services do.
 
-        The reason of a rejection names value and range, which the reasons of rclpy do not.
+        Unlike that of rclpy, the reason for a rejection states the value and the valid range.
         """
         try:
             self._check_each(parameter_list)

@@ -50,12 +50,12 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         _SCENARIO, _SEED,
         *_BASE_STATION.values(),
         Parameter('first_cycle', 0,
-                  'Number of the first cycle; 0: from the clock, so that no number is repeated '
+                  'Id of the first cycle; 0: derived from the clock, so that no id is reused '
                   'after a restart.', low=0, high=2**53),
     ),
     'user': (
         _SCENARIO, _SEED,
-        Parameter('user_id', 1, 'Number of the user.', low=1, high=2**31 - 1),
+        Parameter('user_id', 1, 'Id of the user.', low=1, high=2**31 - 1),
         Parameter('mobility', 'static', 'Mobility model.', choices=mobility.KINDS,
                   plugins=plugins.MOBILITIES),
         Parameter('position_m', [],
@@ -76,7 +76,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         _SCENARIO,
         _POSITIONER['estimator'],
         Parameter('table_folder', '',
-                  "Folder in which tables are cached; empty: the user's cache folder."),
+                  'Directory in which tables are cached; empty: the cache directory of the user.'),
         _POSITIONER['model_file'],
     ),
     'transmission': (_SCENARIO, *_declared_by(TransmissionSettings).values()),
@@ -171,7 +171,7 @@ def scenario_of(values: types.SimpleNamespace) -> Scenario:
     Raises
     ------
     ScenarioError
-        If the file is wrong.
+        If the file is invalid.
     """
     file = values.scenario_file
     return Scenario.from_yaml(file) if file else Scenario()

@@ -15,12 +15,12 @@ from ament_index_python.packages import get_package_prefix
 _PR_SET_PDEATHSIG = 1
 # Loaded here, because no library may be loaded between fork and exec.
 _PRCTL = ctypes.CDLL(None).prctl
-# Signals that end a process, each with the time to wait for the end [s].
+# Signals sent in order to end a process, each with the time to wait for its exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 
 
 def private_domain() -> dict[str, str]:
-    """Return environment variables that isolate a network; variables that are set already stay.
+    """Return environment variables that isolate a network; existing values are kept.
 
     Returns
     -------
@@ -44,15 +44,15 @@ class Processes:
         Directory for the output of the processes, ``<name>.log`` each.
     environment
         Environment variables to set for all processes.
-    within
+    command_prefix
         Callable that takes the name of a node and returns a prefix of its command, such as
         ``ip netns exec lab``.
     """
 
     def __init__(
             self, logs: Path, environment: Mapping[str, str],
-            within: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
-        self._logs, self._within = logs, within
+            command_prefix: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
+        self._logs, self._command_prefix = logs, command_prefix
         self._environment = {**os.environ, **environment}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._commands: dict[str, list[str]] = {}
@@ -73,7 +73,7 @@ class Processes:
         if name:
             command += ['-r', f'__node:={name}']
         name = name or executable
-        command = [*self._within(name), *command]
+        command = [*self._command_prefix(name), *command]
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']
@@ -134,7 +134,7 @@ class Processes:
                     continue
 
     def __enter__(self) -> 'Processes':
-        """Return the object."""
+        """Return `self`."""
         return self
 
     def __exit__(

@@ -30,7 +30,7 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
     Raises
     ------
     PushError
-        If there is no optimizer, if it does not respond, or if it refuses the codebook.
+        If there is no optimizer, if it does not respond, or if it rejects the codebook.
     """
     optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
@@ -42,9 +42,8 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
     try:
         while future is None or not future.done():
             if time.monotonic() > end_s:
-                reason = 'no answer' if future else 'not there'
-                raise PushError(
-                    f'{optimizer}: {reason} within {timeout_s:g} s, expected an optimizer')
+                reason = 'no response' if future else 'not found'
+                raise PushError(f'{optimizer}: {reason} within {timeout_s:g} s')
             if future is None and client.services_are_ready():
                 future = client.set_parameters_atomically(parameters)
             executor.spin_once(timeout_sec=0.1)
@@ -53,4 +52,4 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
         executor.shutdown()
     result = future.result().result
     if not result.successful:
-        raise PushError(f'{optimizer}: refused: {result.reason}')
+        raise PushError(f'{optimizer}: codebook rejected: {result.reason}')

@@ -22,9 +22,9 @@ LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-# For a current value whose publisher must stay alive. Subscribers are notified within a second
-# when the publisher dies, long before discovery times out.
-HELD = QoSProfile(
+# For a current value whose publisher must remain alive. Subscribers are notified within a second
+# when the publisher terminates, long before discovery times out.
+LATCHED_WITH_LEASE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL, liveliness=LivelinessPolicy.AUTOMATIC,
     liveliness_lease_duration=Duration(seconds=1))
@@ -32,6 +32,6 @@ HELD = QoSProfile(
 _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
-def of(kind: type[m.Message]) -> QoSProfile:
-    """Return `LATCHED` for messages that are a current value, otherwise `EXCHANGE`."""
+def profile_for(kind: type[m.Message]) -> QoSProfile:
+    """Return `LATCHED` for messages that represent a current value, otherwise `EXCHANGE`."""
     return LATCHED if kind in _LATCHED_MESSAGES else EXCHANGE

@@ -36,7 +36,8 @@ class RecordingError(Exception):
 
 def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
     """Return the type and the quality of service of each recorded topic, by relative name."""
-    found = {name: (convert.ros_type(kind), qos.of(kind)) for kind, name in topics.NAMES.items()}
+    found = {name: (convert.ros_type(kind), qos.profile_for(kind))
+             for kind, name in topics.NAMES.items()}
     found[topics.POSITION] = PoseWithCovarianceStamped, qos.EXCHANGE
     found[topics.CODEBOOK] = ros.Codebook, qos.LATCHED
     found[topics.DIAGNOSTICS] = DiagnosticArray, qos.EXCHANGE
@@ -49,7 +50,7 @@ def type_name(kind: type) -> str:
 
 
 def schema(kind: type) -> str:
-    """Return the definition of a message class and of its parts, in the encoding ``ros2msg``."""
+    """Return the definition of a message class and its nested messages, encoded as ``ros2msg``."""
     first = type_name(kind).replace('/msg/', '/')
     texts: dict[str, str] = {}
     wanted = [first]
@@ -87,8 +88,8 @@ def _parts(text: str, package: str) -> Iterator[str]:
 class Recorder:
     """Writes the messages of a network to a file.
 
-    The file is ``<name>.part`` until it is closed, so that an interrupted run leaves its messages
-    there.
+    The file is ``<name>.part`` until it is closed, so that an interrupted run does not lose its
+    messages.
 
     Parameters
     ----------
@@ -123,7 +124,8 @@ class Recorder:
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
         self.count = 0
 
-    def listen(self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
+    def record_topics(
+            self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
         """Record all topics in the namespace of a node.
 
         Parameters
@@ -189,14 +191,14 @@ def read(
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Read the scenario of a recording; None if it has none, as a recording of ``ros2 bag``.
+    """Read the scenario of a recording; None if it has none, such as one made by ``ros2 bag``.
 
     Raises
     ------
     RecordingError
         If mcap is not installed, or the file is not a recording.
     ScenarioError
-        If the scenario is wrong.
+        If the scenario is invalid.
     """
     with _opened(path) as reader:
         for metadata in reader.iter_metadata():

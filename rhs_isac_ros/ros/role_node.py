@@ -13,10 +13,10 @@ from rhs_isac_ros.protocol.events import (
     Action,
     Event,
     LogMessage,
+    RevertSettings,
     Send,
     SettingsOffered,
-    SettingsReverted,
-    Tick,
+    Timeout,
 )
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, qos, topics
@@ -47,16 +47,16 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     Attributes
     ----------
     role
-        The role, from `start` on.
+        The role; set by `start`.
     scenario
         Scenario of the parameter ``scenario_file``.
 
     Raises
     ------
     ParameterError
-        If a parameter is wrong, or the scenario has more frames than the topics hold.
+        If a parameter is invalid, or the scenario has more frames than the depth of the topics.
     ScenarioError
-        If the scenario file is wrong.
+        If the scenario file is invalid.
     """
 
     role: _RoleT
@@ -99,7 +99,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         for kind in self.role.SENDS:
             if kind not in self._role_publishers:
                 self._role_publishers[kind] = self.create_publisher(
-                    convert.ros_type(kind), topics.NAMES[kind], qos.of(kind))
+                    convert.ros_type(kind), topics.NAMES[kind], qos.profile_for(kind))
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
@@ -107,21 +107,21 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             if kind not in self._subscribed:
                 self._subscribed.add(kind)
                 subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
-                          self._receiver(kind), qos.of(kind), raw=True)
+                          self._receiver(kind), qos.profile_for(kind), raw=True)
 
     def report(self) -> Report:
-        """Return the diagnostics of the role; faults are those since the last report."""
+        """Return the diagnostics of the role, which count the faults since the last report."""
         state = self.role.state
         return self._statistics.report(
             '' if state is None else state.value, self.role.counters,
-            state in self.role.LACKING, self.role.status())
+            state in self.role.BLOCKED_STATES, self.role.status())
 
     def on_settings_changed(self, settings: Any) -> None:
         """Pass new settings to the role."""
         self.dispatch(SettingsOffered(settings))
 
     def follow_codebook(self, on_codebook: Callable[[Codebook], None]) -> None:
-        """Fetch the codebook of the optimizer, and call a function with it and each later one."""
+        """Call a function with the current codebook of the optimizer and with each later one."""
         self._codebook_client = CodebookClient(
             self, self.scenario, on_codebook,
             lambda present: self._statistics.set_available(topics.OPTIMIZER_NODE, present))
@@ -132,11 +132,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         return time.monotonic()
 
     def dispatch(self, event: Event) -> None:
-        """Pass an event to the role, then a `Tick` for each deadline that has passed."""
+        """Pass an event to the role, then a `Timeout` for each deadline that has passed."""
         now_s = self.now_s()
         self._handle(event, now_s)
         while (deadline_s := self.role.next_deadline()) is not None and deadline_s <= now_s:
-            self._handle(Tick(), now_s)
+            self._handle(Timeout(), now_s)
         if deadline_s is not None and (
                 self._timer_due_s is None or deadline_s < self._timer_due_s):
             self._set_timer(deadline_s - now_s, deadline_s)
@@ -190,13 +190,13 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self.get_logger().warning(text)  # type: ignore[no-untyped-call]
             case LogMessage(text):
                 self.get_logger().info(text)  # type: ignore[no-untyped-call]
-            case SettingsReverted(settings):
+            case RevertSettings(settings):
                 self.revert_parameters(settings)
             case _:
                 self.execute(action)
 
     def _log_error(self, consequence: str, error: m.MessageError) -> None:
-        """Log an error once for each field, which comes first in its text."""
+        """Log an error once for each field, whose name comes first in the text of the error."""
         field = str(error).partition(':')[0]
         self._log_once.error(f'{consequence} {field}', f'{consequence}: {error}')
 
@@ -213,6 +213,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if deadline_s is None:
             return
         if deadline_s <= now_s:
-            self.dispatch(Tick())
+            self.dispatch(Timeout())
         else:
             self._set_timer(deadline_s - now_s, deadline_s)

@@ -55,7 +55,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     Returns
     -------
     int
-        Exit code: 0 after a signal, a shutdown or when done; 2 if a parameter or a file is wrong.
+        Exit code: 0 after a signal, a shutdown or when done; 2 if a parameter or a file is
+        invalid.
     """
     # A list, because a handler may interrupt the other one and must not take a lock.
     signals: list[int] = []

@@ -31,7 +31,7 @@ def subscribe(
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
 
 
-def listen(
+def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         on_message: Callable[[m.Message], None],
         on_error: Callable[[m.MessageError], None] | None = None) -> None:
@@ -40,7 +40,7 @@ def listen(
     Parameters
     ----------
     sizes
-        Array sizes by symbol, as in `Scenario.sizes`, that the messages must have; None: any.
+        Required array sizes by symbol, as in `Scenario.sizes`; None: any.
     on_error
         Called with the reason why a message was dropped; by default, the node logs it.
     """
@@ -58,4 +58,4 @@ def listen(
         on_message(plain)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
-                  functools.partial(receive, kind), qos.of(kind), raw=True)
+                  functools.partial(receive, kind), qos.profile_for(kind), raw=True)

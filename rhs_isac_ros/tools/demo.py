@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 if every cycle was served, also after Ctrl-C; 1 if one was not; 2 if an
+        Exit code: 0 if every cycle was served, including after Ctrl-C; 1 if not; 2 if an
         argument or a file is invalid.
     """
     parser = _parser()

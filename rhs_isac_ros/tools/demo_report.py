@@ -46,7 +46,7 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
     users = len({cycle.user for cycle in cycles})
     lines = [
         f'{len(cycles)} cycles of {users} users served, {len(given_up)} given up',
-        f'error: median {np.median(errors):.2f} m, root mean square '
+        f'position error: median {np.median(errors):.2f} m, root mean square '
         f'{np.sqrt(np.mean(errors**2)):.2f} m; median √CRLB {np.median(bounds):.2f} m',
         f'cycle: median {1e3 * np.nanmedian(lengths):.1f} ms; estimator: median '
         f'{1e3 * np.median([cycle.estimate.latency_s for cycle in cycles]):.1f} ms',

@@ -35,7 +35,7 @@ _LABELS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command on parameters, and return the exit code as of `run_tool`."""
+    """Run a command on parameters and return the exit code of `run_tool`."""
     return run_tool(_parser(), arguments)
 
 

@@ -38,7 +38,7 @@ _VERSION = '0.2.0'
 class Permissions(NamedTuple):
     """Topics and services of a node.
 
-    Names are relative to its namespace, or with a ``~`` to the node.
+    Names are relative to the namespace of the node or, if they begin with ``~``, to the node.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ def _paths(users: int) -> tuple[str, ...]:
 def _operator(nodes: Iterable[str], users: int) -> Permissions:
     """Return the permissions to subscribe to all topics and to set the parameters of all nodes.
 
-    Command-line tools have fixed names, those of ``ros2`` with a number.
+    The node names of the command-line tools are fixed; those of ``ros2`` end in a number.
     """
     readable = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
                 topics.POSITION, *_paths(users)}

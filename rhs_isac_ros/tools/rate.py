@@ -6,7 +6,7 @@ import statistics
 
 
 class Rate:
-    """Intervals between the newest messages of a topic.
+    """Intervals between the latest messages of a topic.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ class RecorderNode(Node):
         super().__init__('recorder')
         self._recorder = recorder
         self._topics: set[str] = set()
-        recorder.listen(self, self._log_topic)
+        recorder.record_topics(self, self._log_topic)
         self._log = self.get_logger()  # type: ignore[no-untyped-call]
         self._log.info('recording; press Ctrl-C to stop')
 

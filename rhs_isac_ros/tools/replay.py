@@ -61,7 +61,7 @@ def load(path: str | Path, namespace: str = '/', scenario: Scenario | None = Non
         If the file is not a recording, has no complete cycle in the namespace, or contains a
         malformed message.
     ScenarioError, CodebookError
-        If the scenario or a codebook in it is invalid.
+        If the scenario or a recorded codebook is invalid.
     """
     scenario = scenario or read_scenario(path) or Scenario()
     prefix = topic_prefix(namespace)
@@ -89,7 +89,7 @@ def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator
     Parameters
     ----------
     cycles
-        The cycles.
+        Complete cycles, with their received signals and true positions.
     estimators
         Estimators by the id of the codebook with which the signals were received.
 
@@ -109,7 +109,7 @@ def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the recorded errors and those of estimators with the same signals.
+    """Print the recorded position errors and those of estimators applied to the same signals.
 
     Parameters
     ----------
@@ -119,15 +119,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0, also after a signal; 1 if the signals cannot be published to running nodes;
-        2 if an argument or a file is invalid.
+        Exit code: 0, including after a signal; 1 if the signals cannot be published to running
+        nodes; 2 if an argument or a file is invalid.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
     options = parser.parse_args(remove_ros_args(['replay', *arguments])[1:])
     if options.publish and (options.estimator or options.model):
-        parser.error('argument --publish: running nodes estimate, expected no --estimator or '
-                     '--model')
+        parser.error('argument --publish: not allowed with --estimator or --model, because '
+                     'running nodes estimate')
     try:
         if options.publish:
             return republish(options, ['replay', *arguments])
@@ -167,7 +167,7 @@ def _row(name: str, errors: np.ndarray) -> str:
 
 
 def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
-    """Return the codebooks to assume, by the ids of those with which signals were received."""
+    """Return the codebooks to assume, by the id of the codebook used for the signals."""
     used = sorted({cycle.signals.codebook_id for cycle in recording.cycles})
     if file:
         codebook = Codebook.load(file)
@@ -179,8 +179,8 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
     else:
         missing = [codebook_id for codebook_id in used if codebook_id not in recording.codebooks]
         if missing:
-            raise RecordingError(f'codebook {missing[0]}: not in the recording, expected its '
-                                 'file: --codebook FILE')
+            raise RecordingError(f'codebook {missing[0]}: not in the recording; give its file '
+                                 'with --codebook FILE')
         assumed = {codebook_id: recording.codebooks[codebook_id] for codebook_id in used}
     for codebook in assumed.values():
         codebook.check(recording.scenario)
@@ -204,8 +204,8 @@ def _parser() -> argparse.ArgumentParser:
                         help='namespace of the recorded network (default: /)')
     live = parser.add_argument_group(
         'running nodes', 'Publish the recorded signals again, with their timing, in the namespace '
-        'of --ros-args -r __ns:=... Unless the namespace has an optimizer, the replay provides '
-        'the recorded codebook like one.')
+        'of --ros-args -r __ns:=... If the namespace has no optimizer, the replay provides the '
+        'recorded codebook instead.')
     live.add_argument('--publish', action='store_true', help='publish instead of estimating')
     live.add_argument('--rate', type=positive_float, default=1.0, metavar='R',
                       help='speed relative to the recording (default: 1)')

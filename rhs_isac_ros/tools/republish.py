@@ -1,4 +1,4 @@
-"""Publishes a recording again to running nodes, with its timing and its codebooks."""
+"""Republishes a recording to running nodes, with its timing and its codebooks."""
 
 import argparse
 import sys
@@ -88,8 +88,8 @@ class RepublisherNode(Node):
         """Return whether the subscribers of a topic are present."""
         publisher, n_expected = self._message_publishers[name], 1
         if name == _SIGNALS:
-            # Observers may subscribe to the signals as well. Needed are the nodes that publish
-            # estimates, and these subscribe to the signals only when their tables are complete.
+            # Observers may subscribe to the signals as well. Wait for the nodes that publish
+            # estimates, which subscribe to the signals only once their tables are complete.
             estimators = {_full_name(endpoint) for endpoint in self.get_publishers_info_by_topic(
                 self.resolve_topic_name(_ESTIMATES))} - {self.get_fully_qualified_name()}
             subscribers = {_full_name(endpoint) for endpoint in
@@ -142,7 +142,7 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     Returns
     -------
     int
-        Exit code: 0, also after a signal; 2 if a ROS argument is invalid.
+        Exit code: 0, including after a signal; 2 if a ROS argument is invalid.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         def done() -> bool:
             node = nodes[0]
             if conflicts := node.conflicts():
-                raise RepublishError(f'{conflicts[0]}: another node publishes it, expected none')
+                raise RepublishError(f'{conflicts[0]}: already published by another node')
             if node.waits_for and time.monotonic() > begin_s + options.timeout:
                 raise RepublishError(f'{node.waits_for}: no subscriber within '
                                      f'{options.timeout:g} s')
@@ -230,7 +230,8 @@ def _optimizer_present(node: Node) -> bool:
     present = AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
         _DISCOVERY_TIMEOUT_S)
     if present:
-        print(f'the {topics.OPTIMIZER_NODE} of the namespace keeps its codebook', file=sys.stderr)
+        print(f'using the codebook of the {topics.OPTIMIZER_NODE} in the namespace',
+              file=sys.stderr)
     return present
 
 

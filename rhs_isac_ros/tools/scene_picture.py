@@ -62,11 +62,11 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
 
 
 def _title(scene: SceneState) -> str:
-    newest = scene.newest
-    if newest is None or newest.estimate is None:
+    latest = scene.latest_user
+    if latest is None or latest.estimate is None:
         return 'no estimate yet'
-    error = f', error {newest.error_m:.2f} m' if not math.isnan(newest.error_m) else ''
-    return f'cycle {newest.estimate.cycle_id}, user {newest.user}{error}'
+    error = f', error {latest.error_m:.2f} m' if not math.isnan(latest.error_m) else ''
+    return f'cycle {latest.estimate.cycle_id}, user {latest.user}{error}'
 
 
 def _pattern(beam: BeamMessage | None, scenario: Scenario) -> BeamPattern | None:
@@ -81,7 +81,7 @@ def _colour(user: int) -> str:
 
 
 def _limit_m(scenario: Scenario, axis: int) -> float:
-    """Return the limit of a view along y or z, in both directions [m]."""
+    """Return the half-width of a view along y or z [m]."""
     return float(np.abs(scenario.roi_bounds_m)[:, axis].max()) + _MARGIN_M
 
 
@@ -104,7 +104,7 @@ def _draw_view(
     half_m = element_interval_m(scenario) * scenario.elements_per_side / 2
     axes.plot([0, 0], [-half_m, half_m], color='black', linewidth=_SURFACE_WIDTH_POINTS,
               solid_capstyle='butt', zorder=4)
-    axes.annotate('board', (0, half_m), xytext=(0, 8), textcoords='offset points', ha='center')
+    axes.annotate('surface', (0, half_m), xytext=(0, 8), textcoords='offset points', ha='center')
     for user in scene.users.values():
         _draw_user(axes, plane, user)
     axes.set(xlabel='x [m]', ylabel=f'{"xyz"[plane[1]]} [m]', aspect='equal')
@@ -153,7 +153,7 @@ def _draw_surface(axes: Any, scene: SceneState, scenario: Scenario) -> None:
         phase = 'positioning' if message.mode is Mode.POSITIONING else 'transmission'
         mean = f', mean of {len(message.analog)} frames' if len(message.analog) > 1 else ''
         text = f'{phase}, band {message.band}{mean}'
-    axes.set_title(f'board from the front\n{text}', fontsize='medium')
+    axes.set_title(f'surface from the front\n{text}', fontsize='medium')
     axes.set(xlabel='y [cm]', ylabel='z [cm]')
 
 

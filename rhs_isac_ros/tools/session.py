@@ -1,4 +1,4 @@
-"""The node of a command, which lists of nodes hide, and its exit codes."""
+"""The hidden node of a command-line tool, and its exit codes."""
 
 import argparse
 import os
@@ -18,7 +18,7 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from rhs_isac_ros.ros.run import use_discovery_profile
 
-# Changes of the graph do not wake the executor up, so it is polled with this period [s].
+# Changes of the graph do not wake the executor, so the graph is polled with this period [s].
 _POLL_PERIOD_S = 0.02
 # Discovery is complete when the graph has not changed for this time [s].
 _SETTLE_S = 0.4
@@ -29,7 +29,7 @@ class ToolError(RuntimeError):
 
 
 class Session:
-    """A context with one node, which the command itself spins."""
+    """A context manager with one node, which the command itself spins."""
 
     def __init__(self) -> None:
         use_discovery_profile()
@@ -39,7 +39,7 @@ class Session:
         self._executor.add_node(self.node)
 
     def __enter__(self) -> 'Session':
-        """Return the session."""
+        """Return `self`."""
         return self
 
     def __exit__(
@@ -111,7 +111,7 @@ def print_now(*values: object, end: str = '\n') -> None:
 
 
 def discard_stdout() -> None:
-    """Redirect the standard output to nowhere after its reader has closed it.
+    """Redirect the standard output to `os.devnull` after its reader has closed it.
 
     Otherwise the flush at the exit of Python would fail.
     """
@@ -131,7 +131,8 @@ def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
     Returns
     -------
     int
-        Exit code: 0, also after a signal or when the reader closes the output; 1 after an error.
+        Exit code: 0, including after a signal or when the reader closes the output; 1 after an
+        error.
     """
     options = parser.parse_args(arguments)
     try:

@@ -15,7 +15,7 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.subscriptions import listen
+from rhs_isac_ros.ros.subscriptions import subscribe_messages
 from rhs_isac_ros.tools.scene_picture import draw
 
 # Within this time [s], every user publishes its true position; within twice this time, the
@@ -29,7 +29,7 @@ class SnapshotNode(Node):
     Attributes
     ----------
     scene
-        The scene, on the clock `time.monotonic`.
+        The scene, with times of `time.monotonic`.
     mismatch
         Error of the last message that does not match the scenario; empty if there was none.
     """
@@ -39,7 +39,7 @@ class SnapshotNode(Node):
         self.scene = SceneState()
         self.mismatch = ''
         self._began_s: float | None = None
-        listen(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
+        subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()
@@ -55,8 +55,8 @@ class SnapshotNode(Node):
         return self.scene.complete and self._receiving_for(_REPORT_PERIOD_S)
 
     @property
-    def foreign(self) -> bool:
-        """Whether the network has another scenario: no configuration of the surface matches."""
+    def has_other_scenario(self) -> bool:
+        """Whether the network uses another scenario: no surface configuration matches."""
         return bool(self.mismatch and self.scene.configuration is None
                     and self._receiving_for(2 * _REPORT_PERIOD_S))
 
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0, also after a signal; 1 if there is no network or the picture cannot be
+        Exit code: 0, including after a signal; 1 if there is no network or the picture cannot be
         written; 2 if an argument or a file is invalid.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -95,7 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return nodes
 
     def done() -> bool:
-        return nodes[0].complete or nodes[0].foreign or time.monotonic() > end_s
+        return (nodes[0].complete or nodes[0].has_other_scenario
+                or time.monotonic() > end_s)
     code = run(create, ['snapshot', *arguments], done)
     if not nodes or not done():
         return code
@@ -116,11 +117,11 @@ def write_picture(
     Returns
     -------
     int
-        Exit code: 0, or 1 as of `main`.
+        Exit code: 0 or 1, as for `main`.
     """
     if mismatch and scene.configuration is None:
-        print(f'error: {mismatch}: does the network have another scenario? --config FILE',
-              file=sys.stderr)
+        print(f'error: {mismatch}; if the network uses another scenario, pass it with '
+              '--config FILE', file=sys.stderr)
         return 1
     if not scene.users:
         print(f'error: no user found within {options.timeout:g} s, in the domain '
@@ -128,8 +129,8 @@ def write_picture(
         return 1
     missing = sorted(user for user, state in scene.users.items() if not state.estimate)
     if missing:
-        print(f'no estimate within {options.timeout:g} s of user '
-              f'{", ".join(map(str, missing))}', file=sys.stderr)
+        print(f'no estimate of user {", ".join(map(str, missing))} within '
+              f'{options.timeout:g} s', file=sys.stderr)
     try:
         draw(scene, scenario, options.output)
     except OSError as error:

@@ -33,7 +33,7 @@ _DISCOVERY_TIMEOUT_S = 3.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command on topics, and return the exit code as of `run_tool`."""
+    """Run a command on topics and return the exit code of `run_tool`."""
     return run_tool(_parser(), arguments)
 
 
@@ -134,7 +134,7 @@ def _select(message: Any, field: str | None) -> Any:
 
 
 def _matching_qos(session: Session, name: str, options: argparse.Namespace) -> QoSProfile:
-    """Return the strictest profile that is compatible with all present publishers."""
+    """Return the strictest profile that is compatible with all known publishers."""
     offered = [info.qos_profile for info in session.node.get_publishers_info_by_topic(name)]
     reliable = bool(offered) and all(
         profile.reliability == ReliabilityPolicy.RELIABLE for profile in offered)
@@ -176,7 +176,7 @@ def show_rate(session: Session, options: argparse.Namespace) -> None:
 
 def _published_type(
         session: Session, name: str, given_name: str, timeout_s: float | None) -> type[Any]:
-    """Wait for a topic, without a timeout if it is None, and return the class of its messages."""
+    """Wait for a topic, indefinitely if `timeout_s` is None, and return its message class."""
     def types() -> list[str]:
         return dict(session.node.get_topic_names_and_types()).get(name, [])
     warn_after_s = _DISCOVERY_TIMEOUT_S if timeout_s is None else timeout_s

@@ -16,7 +16,7 @@ from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
 from rhs_isac_ros.ros import diagnostics, qos, topics
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.subscriptions import listen, subscribe
+from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
 from rhs_isac_ros.tools.session import discard_stdout, print_now
 from rhs_isac_ros.tools.watch_view import render
 
@@ -36,15 +36,16 @@ class WatchNode(Node):
     Attributes
     ----------
     overview
-        The overview, on the clock `time.monotonic`.
+        The overview, with times of `time.monotonic`.
     """
 
     def __init__(self) -> None:
         super().__init__('watch', start_parameter_services=False)
         self.overview = Overview()
         # Log messages would disturb the view; the nodes themselves count malformed messages.
-        listen(self, RECEIVES, None,
-               lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
+        subscribe_messages(
+            self, RECEIVES, None,
+            lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
         subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.EXCHANGE)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -63,8 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0, also after a signal; 1 if rich is missing or, with ``--once``, no cycle was
-        complete in time.
+        Exit code: 0, including after a signal; 1 if rich is missing or, with ``--once``, no cycle
+        was complete in time.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(remove_ros_args(['watch', *arguments])[1:])
@@ -89,7 +90,7 @@ def _show_live(arguments: Sequence[str]) -> int:
         draw, period_s = _renderer(stack)
 
         def refresh() -> bool:
-            """Draw between two turns of the executor, where an exception ends the program."""
+            """Draw between two executor iterations; an exception here ends the program."""
             nonlocal drawn_s
             now_s = time.monotonic()
             if now_s > drawn_s + period_s:

@@ -28,7 +28,7 @@ def test_the_overview_is_empty_before_the_first_message():
     assert overview.rate_hz(5.0) == 0
 
 
-def test_users_have_the_results_of_their_newest_cycle(network, codebooks):
+def test_users_have_the_results_of_their_latest_cycle(network, codebooks):
     net = network(users=2, rest_s=0.5)
     net.run_cycles(4)
     overview = overview_of(net)

@@ -5,7 +5,7 @@ import pytest
 
 from rhs_isac_ros.monitoring.role_statistics import RoleStatistics
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, PeersChanged, Send, Timeout
 
 
 def state(outcome, cycle_id=1):
@@ -54,9 +54,9 @@ def test_messages_and_served_cycles_are_counted(codebooks):
     for cycle_id, outcome in enumerate(['served', 'rhs_silent', 'served'], 1):
         begin_s = 10.0 * cycle_id
         beacon = m.Beacon(cycle_id=cycle_id, attempt=0)
-        statistics.record(Tick(), [Send(beacon), LogMessage('x')], begin_s, 0.0)
-        statistics.record(Tick(), [state('', cycle_id)], begin_s, 0.0)
-        statistics.record(Tick(), [state(outcome, cycle_id)], begin_s + 0.25, 0.0)
+        statistics.record(Timeout(), [Send(beacon), LogMessage('x')], begin_s, 0.0)
+        statistics.record(Timeout(), [state('', cycle_id)], begin_s, 0.0)
+        statistics.record(Timeout(), [state(outcome, cycle_id)], begin_s + 0.25, 0.0)
     values = statistics.report('', {'rhs_silent': 1}).values
     assert values['codebook_id'] == codebooks[1].id
     assert (values['cycles.served'], values['cycles.rhs_silent']) == ('2', '1')
@@ -64,12 +64,12 @@ def test_messages_and_served_cycles_are_counted(codebooks):
     assert {values[f'cycle_ms.p{percent}'] for percent in (50, 95, 99)} == {'250.000'}
 
 
-def test_latencies_are_percentiles_of_the_newest_durations(example):
+def test_latencies_are_percentiles_of_the_latest_durations(example):
     statistics = RoleStatistics()
     times_s = np.random.default_rng(0).exponential(size=2000)
     for time_s in times_s:
         estimate = example(m.PositionEstimate, latency_s=2 * time_s)
-        statistics.record(Tick(), [Send(estimate)], 0.0, time_s)
+        statistics.record(Timeout(), [Send(estimate)], 0.0, time_s)
     values = statistics.report('', {}).values
     for percent in (50, 95, 99):
         expected = 1e3 * np.percentile(times_s[-512:], percent)
@@ -82,7 +82,7 @@ def test_a_fault_is_reported_once_and_a_missing_role_until_it_is_present():
     counters = {'wrong_user': 2, 'unanswered': 5}
     first, second = (statistics.report('', counters) for _ in range(2))
     assert (first.fault, second.fault) == (True, False)
-    assert first.summary == '2 faults just now'
+    assert first.summary == '2 new faults'
     statistics.record(PeersChanged(('channel', 'bs')), [], 0.0, 0.0)
     for _ in range(2):
         report = statistics.report('', counters)

@@ -37,7 +37,7 @@ def test_the_scene_is_complete_once_every_user_has_an_estimate():
     assert not scene.complete
     scene.add(estimate(2, [8, 1, 0], 2), 1.0)
     assert scene.complete
-    assert scene.newest.user == 2
+    assert scene.latest_user.user == 2
 
 
 def test_the_messages_of_a_network_complete_it(network):
@@ -48,7 +48,7 @@ def test_the_messages_of_a_network_complete_it(network):
         if isinstance(sent.message, RECEIVES):
             scene.add(sent.message, sent.time_s)
     assert scene.complete
-    assert scene.newest.estimate.cycle_id == 3
+    assert scene.latest_user.estimate.cycle_id == 3
     assert len(scene.users[1].estimated_path) == 3
     assert scene.beam.cycle_id == 3
 

@@ -261,7 +261,7 @@ def not_finite(message):
 
 
 def test_nan_from_a_faulty_node_is_dropped(network, join):
-    """A faulty node sends NaN for the present cycle."""
+    """A faulty node sends NaN for the current cycle."""
     watch, running = network.watch, network.running
     codebook = Codebook.load(default_codebook_file())
     feeds, received = watch.publisher(m.FeedSignals), watch.publisher(m.ReceivedSignals)

@@ -98,7 +98,7 @@ def test_changes_of_policy_and_noise_are_reported(running):
     assert running.set('bs', policy='round_robin', receiver_noise=True).successful
     running.watch.until_served(2, processes=[running.process])
     assert len(running.watch.given_up) == before
-    assert "from now on: policy 'first', receiver_noise 'false'" in running.process.log
+    assert "settings applied: policy 'first', receiver_noise 'false'" in running.process.log
 
 
 @pytest.mark.parametrize(('node', 'values', 'reason'), [
@@ -139,7 +139,7 @@ def test_a_model_for_another_codebook_keeps_the_old_estimator(running, model):
     assert 'trained for codebook' in running.diagnostics['positioner']['failed.estimator']
     assert set(running.next_estimators().values()) == {'bayes'}
     assert running.get('positioner', 'estimator') == 'bayes'
-    assert running.process.log.count('estimator neural not used, keeping bayes') == 1
+    assert running.process.log.count('cannot build estimator neural, keeping bayes') == 1
     # Set separately, the model comes first.
     assert running.set('positioner', model_file=model('first')).successful
     assert running.set('positioner', estimator='neural').successful
@@ -153,7 +153,7 @@ def test_a_model_for_another_codebook_keeps_the_old_estimator(running, model):
 def test_band_and_impairments_change(running):
     for band in (0, 1):
         assert running.set('transmission', band=band).successful
-        # The beam of the present cycle may arrive after the response.
+        # The beam of the current cycle may arrive after the response.
         running.watch.until_served(1, processes=[running.process])
         before = len(running.watch.received[m.Beam])
         running.watch.until_served(2, processes=[running.process])

@@ -61,7 +61,7 @@ def test_a_codebook_of_another_scenario_is_rejected(
     table1.codebook.save(tmp_path / 'large.yaml')
     code, log = call(processes, network, '--push-file', tmp_path / 'large.yaml')
     assert code == 1, log
-    assert 'error: /push/optimizer: refused: analog: shape' in log
+    assert 'error: /push/optimizer: codebook rejected: analog: shape' in log
     assert ids[-1] == before
     assert process.running
 
@@ -85,7 +85,7 @@ def test_the_error_names_a_missing_optimizer(small_files):
     rclpy.init(args=[], context=context)
     node = Node('pusher', namespace='/nobody', context=context)
     try:
-        with pytest.raises(PushError, match='^/nobody/optimizer: not there within 0.2 s'):
+        with pytest.raises(PushError, match='^/nobody/optimizer: not found within 0.2 s'):
             push(node, Codebook.load(small_files / 'first.yaml'), timeout_s=0.2)
     finally:
         node.destroy_node()

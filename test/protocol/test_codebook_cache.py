@@ -59,7 +59,7 @@ def test_an_item_no_longer_in_use_is_discarded_by_age(shelf):
     assert shelf.ids() == ['b', 'c', 'd', 'e']
 
 
-def test_an_item_stored_again_is_the_newest(shelf):
+def test_an_item_stored_again_is_the_latest(shelf):
     shelf.put('a', 'again')
     shelf.put('d', 'D')
     assert shelf.ids() == ['c', 'a', 'd']

@@ -141,7 +141,7 @@ def test_a_codebook_offered_twice_while_beaconing_costs_no_cycle(network, codebo
 
 
 def test_no_cycle_is_lost_while_an_estimator_is_built(network, codebooks):
-    """The signals of the new codebook wait for it, within the time-out of the base station."""
+    """The signals of the new codebook wait for it, within the timeout of the base station."""
     net = network(make_s=0.8, step_timeout_s=1.0)
     net.run_cycles(2)
     net.run_to(State.SOUNDING)

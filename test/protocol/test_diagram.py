@@ -40,8 +40,8 @@ def test_edges_are_the_changes_of_state(role):
 
 def test_some_edges_of_the_base_station():
     edges = {(edge.source.value, edge.target.value): edge.text for edge in diagram.edges('bs')}
-    assert edges['beaconing', 'configuring'] == 'Tick [some_acks], Ack [last_ack]'
-    assert edges['estimating', 'resting'] == 'Tick, NoFix'
+    assert edges['beaconing', 'configuring'] == 'Timeout [some_acks], Ack [last_ack]'
+    assert edges['estimating', 'resting'] == 'Timeout, NoFix'
     assert ('resting', 'transmitting') not in edges
 
 

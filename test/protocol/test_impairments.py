@@ -5,7 +5,7 @@ import pytest
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.events import LogMessage, Send, Tick
+from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.protocol.role import PlainRole
 
@@ -30,7 +30,7 @@ def through(role, n):
     arrived = [action for cycle in range(n) for action in role.handle(m.Beacon(
         cycle_id=cycle, attempt=0), 0.0)]
     while (due_s := role.next_deadline()) is not None:
-        arrived += role.handle(Tick(), due_s)
+        arrived += role.handle(Timeout(), due_s)
     assert sum(isinstance(action, LogMessage) for action in arrived) == n
     return [action.message.cycle_id for action in arrived if isinstance(action, Send)]
 
@@ -61,8 +61,8 @@ def test_messages_are_delayed_at_random_and_reordered(impaired):
     role.handle(m.Beacon(cycle_id=1, attempt=0), 10.0)
     due_s = role.next_deadline()
     assert 10.5 <= due_s <= 10.7
-    assert role.handle(Tick(), due_s - 1e-6) == []
-    (sent,) = role.handle(Tick(), due_s)
+    assert role.handle(Timeout(), due_s - 1e-6) == []
+    (sent,) = role.handle(Timeout(), due_s)
     assert sent.message.cycle_id == 1
     arrived = through(role, 100)
     assert sorted(arrived) == list(range(100))

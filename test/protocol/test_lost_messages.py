@@ -14,7 +14,7 @@ DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}
 OFFERED, DELIVERED = {'stage': m.Stage.OFFERED}, {'stage': m.Stage.DELIVERED}
 # The result if the first message of a class does not reach one of its recipients: the outcome of
-# the cycle, and other counters by role. The user detects it by the next beacon or by a time-out.
+# the cycle, and other counters by role. The user detects it by the next beacon or by a timeout.
 LOST = [
     (m.Beacon, {}, 'user1', 'served', {'bs': {'unanswered': 1}}),
     (m.Ack, {}, 'bs', 'served', {'bs': {'unanswered': 1}}),
@@ -177,7 +177,7 @@ def test_a_lost_cycle_is_published(network):
     net = network(transport=LosesFirst(m.ReceivedSignals, {}))
     net.run_cycles(1)
     warnings = [s.message.text for s in net.logs if s.role == 'bs' and s.message.warning]
-    assert warnings == ['cycle 1: user 1 given up: positioner_silent']
+    assert warnings == ['cycle 1 of user 1 given up: positioner_silent']
     (last,) = net.sent(m.ProtocolState, phase=m.Phase.BEACONING)
     assert (last.cycle_id, last.user, last.outcome) == (1, 1, 'positioner_silent')
     assert net['bs'].state is State.RESTING

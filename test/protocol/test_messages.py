@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, PeersChanged, Send, Timeout
 
 KINDS = [kind for _, kind in inspect.getmembers(m, inspect.isclass)
          if issubclass(kind, m.Message) and kind is not m.Message]
@@ -54,7 +54,7 @@ def test_messages_are_the_same_if_all_fields_are_equal(example):
 
 
 def test_events_without_arrays_compare_by_value():
-    assert Tick() == Tick()
+    assert Timeout() == Timeout()
     assert PeersChanged(('a',)) == PeersChanged(('a',)) != PeersChanged(('b',))
     assert LogMessage('a') == LogMessage('a', False) != LogMessage('a', True)
 
@@ -153,8 +153,8 @@ def test_the_ends_of_the_range_are_valid(example, scenario, kind):
     m.check(message, scenario.sizes)
 
 
-INDICES = [(kind, field.name, field.metadata['below']) for kind in KINDS
-           for field in dataclasses.fields(kind) if 'below' in field.metadata]
+INDICES = [(kind, field.name, field.metadata['index_of']) for kind in KINDS
+           for field in dataclasses.fields(kind) if 'index_of' in field.metadata]
 
 
 @pytest.mark.parametrize(('kind', 'field', 'symbol'), INDICES, ids=name_of)
@@ -192,23 +192,23 @@ def test_a_number_must_be_finite_unless_it_may_be_unknown(example, scenario, kin
 
 
 RANGES = [(kind, field) for kind in KINDS for field in dataclasses.fields(kind)
-          if 'least' in field.metadata]
+          if 'low' in field.metadata and 'dims' not in field.metadata]
 
 
 @pytest.mark.parametrize(('kind', 'field'), RANGES, ids=name_of)
 def test_a_number_out_of_range_is_named(example, scenario, kind, field):
-    least, most = field.metadata['least'], field.metadata['most']
-    for good in (least, most):
+    low, high = field.metadata['low'], field.metadata['high']
+    for good in (low, high):
         m.check(example(kind, **{field.name: field.type(good)}), scenario.sizes)
-    for bad in (least - 1, most + 1):
+    for bad in (low - 1, high + 1):
         with pytest.raises(m.MessageError) as caught:
             m.check(example(kind, **{field.name: field.type(bad)}), scenario.sizes)
         assert str(caught.value) == (
-            f'{kind.__name__}.{field.name}: {field.type(bad)}, expected {least:g} to {most:g}')
+            f'{kind.__name__}.{field.name}: {field.type(bad)}, expected {low:g} to {high:g}')
 
 
 def test_users_start_at_one_and_amounts_are_not_negative():
-    ranges = {(kind, field.name): field.metadata['least'] for kind, field in RANGES}
+    ranges = {(kind, field.name): field.metadata['low'] for kind, field in RANGES}
     for kind in KINDS:
         for field in dataclasses.fields(kind):
             if field.name == 'user':

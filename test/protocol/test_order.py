@@ -99,7 +99,7 @@ def test_the_surface_may_be_ready_before_the_base_station_has_estimate_and_beam(
     ((m.FeedSignals, 'bs'), (m.PositionEstimate, 'transmission')),
 ], ids=['positioner and transmission', 'channel and surface', 'channel and transmission'])
 def test_slow_steps_within_their_timeouts_lose_no_cycle(network, slow):
-    """Each step has its own time-out; two steps at 60 % of it must not lose the user."""
+    """Each step has its own timeout; two steps at 60 % of it must not lose the user."""
     transports = [Delays(kind, recipient, 0.6) for kind, recipient in slow]
     net = network(transport=lambda message, recipient: max(
         (t(message, recipient) for t in transports), key=lambda arriving: arriving[0][0]))

@@ -7,7 +7,7 @@ from rhs_isac_ros.protocol.outage_log import OutageLog
 def test_a_reason_is_logged_once_until_a_cycle_is_served():
     outages = OutageLog()
     assert outages.log_lost_cycle(3, 1, 'rhs_silent') == [
-        LogMessage('cycle 3: user 1 given up: rhs_silent', warning=True)]
+        LogMessage('cycle 3 of user 1 given up: rhs_silent', warning=True)]
     assert outages.log_lost_cycle(4, 2, 'rhs_silent') == []
     assert len(outages.log_lost_cycle(5, 2, 'positioner_silent')) == 1
     assert outages.log_served_cycle(6, 1) == [
@@ -50,7 +50,7 @@ def test_a_network_without_a_positioner_logs_the_outage_once(network):
     net.run_cycles(1)
     net.remove('positioner', noticed=False)
     net.run_cycles(5)
-    assert net.logged('bs') == ['cycle 2: user 1 given up: positioner_silent']
+    assert net.logged('bs') == ['cycle 2 of user 1 given up: positioner_silent']
     net.add('positioner')
     net.run_cycles(2)
     assert net.logged('bs')[1:] == ['cycle 7: user 1 served again after: positioner_silent']

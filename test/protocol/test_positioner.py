@@ -116,7 +116,7 @@ def test_the_old_estimator_is_used_while_the_new_one_is_built(
     assert positioner.counters == {}
 
 
-def test_the_newest_of_waiting_signals_are_used(positioner, codebooks, signals):
+def test_the_latest_of_waiting_signals_are_used(positioner, codebooks, signals):
     *before, (estimate,), after = feed(
         positioner, [CodebookOffered(codebooks[0]), signals(1), signals(2), ready(codebooks[0]),
                      CodebookOffered(codebooks[0])])
@@ -125,7 +125,7 @@ def test_the_newest_of_waiting_signals_are_used(positioner, codebooks, signals):
     assert after == []
 
 
-def test_estimators_are_built_one_at_a_time_the_newest_next(
+def test_estimators_are_built_one_at_a_time_the_latest_next(
         positioner, codebooks, signals):
     first, second, third = codebooks
     offers = [requested(positioner.handle(CodebookOffered(codebook), 0.0))

@@ -40,15 +40,15 @@ def test_a_malformed_list_of_users_is_an_error(users):
         BaseStationSettings(allowed_users=users)
 
 
-def test_the_newest_settings_are_pending_until_they_are_applied():
+def test_the_latest_settings_are_pending_until_they_are_applied():
     old, new = PositionerSettings(), PositionerSettings('ml')
     pending = PendingSettings(old)
     assert pending.apply() == []
-    pending.newest = PositionerSettings('neural')
-    pending.newest = new
+    pending.latest = PositionerSettings('neural')
+    pending.latest = new
     assert pending.in_use == old
     assert pending.describe()['pending.estimator'] == 'ml'
-    assert pending.apply() == [LogMessage("from now on: estimator 'ml'")]
+    assert pending.apply() == [LogMessage("settings applied: estimator 'ml'")]
     assert pending.in_use == new
     assert 'pending.estimator' not in pending.describe()
     assert pending.apply() == []

@@ -42,7 +42,7 @@ def test_noise_does_not_change_within_a_cycle(network, state):
     net.run_cycles(3)
     assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 5
     assert status_of(net, 'bs', 'pending') == {}
-    assert net.logged('bs') == ["from now on: receiver_noise 'false'"]
+    assert net.logged('bs') == ["settings applied: receiver_noise 'false'"]
     # The reference signals use the noise setting at the time of the grant.
     net.verify()
     first = 4 if waits else 3
@@ -56,7 +56,7 @@ def test_a_policy_takes_effect_with_the_next_cycle_and_keeps_the_turns(network):
     net.run_to(State.SOUNDING)
     net.change('bs', policy='first')
     net.run_cycles(3)
-    # The rest of the present cycle, then the first user to answer; all answer at once.
+    # The rest of the current cycle, then the first user to answer; all answer at once.
     first = net.sent(m.Ack, cycle_id=4)[0].user
     assert net.served() == [1, 2, 3, first, first]
     net.change('bs', policy='round_robin')
@@ -154,7 +154,7 @@ def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(network, make_
     assert set(estimators(net).values()) == {'centre'}
     assert net.kept == [PositionerSettings()]
     assert net.logged('positioner')[1:] == [
-        'estimator neural not used, keeping bayes: model_file: unfit']
+        'cannot build estimator neural, keeping bayes: model_file: unfit']
     assert status_of(net, 'positioner', 'pending') == {}
     assert status_of(net, 'positioner', 'failed') == {
         'failed.estimator': 'neural: model_file: unfit'}
@@ -213,7 +213,7 @@ def test_estimator_and_codebook_change_together(network, codebooks, codebook_fir
     net.verify()
 
 
-def test_a_codebook_offered_again_uses_the_newest_estimator(network, codebooks):
+def test_a_codebook_offered_again_uses_the_latest_estimator(network, codebooks):
     net = network()
     net.run_cycles(1)
     net.offer(codebooks[1])

@@ -19,7 +19,7 @@ from rhs_isac_ros.protocol.events import (
     PeersChanged,
     Send,
     SettingsOffered,
-    Tick,
+    Timeout,
 )
 from rhs_isac_ros.protocol.outcomes import Kind, Outcome
 from rhs_isac_ros.protocol.settings import BaseStationSettings
@@ -31,10 +31,10 @@ from rhs_isac_ros.protocol.user_scheduler import POLICIES
 ROLES = {
     'bs': types.SimpleNamespace(
         machine=bs.BaseStation, initial=State.WAITING, final=State.BEACONING,
-        endless={State.WAITING}, events={Tick, CodebookOffered, PeersChanged, SettingsOffered}),
+        endless={State.WAITING}, events={Timeout, CodebookOffered, PeersChanged, SettingsOffered}),
     'user': types.SimpleNamespace(
         machine=user.User, initial=user.State.DISCONNECTED, final=user.State.NO_BEACON,
-        endless={user.State.DISCONNECTED, user.State.NO_BEACON}, events={Tick, PeersChanged}),
+        endless={user.State.DISCONNECTED, user.State.NO_BEACON}, events={Timeout, PeersChanged}),
     'rhs_controller': types.SimpleNamespace(
         machine=rhs_controller.RhsController, initial=rhs_controller.State.IDLE,
         final=rhs_controller.State.POSITIONING, endless=set(rhs_controller.State),
@@ -54,7 +54,7 @@ def role(request):
 
 @pytest.fixture
 def machine(scenario):
-    """Function that returns the machine of a role, with time-outs of 1 s."""
+    """Function that returns the machine of a role, with timeouts of 1 s."""
     def make(name):
         role = ROLES[name]
         if name == 'bs':
@@ -69,7 +69,7 @@ def machine(scenario):
 
 
 def settings(**values):
-    """Return settings of a base station whose time-outs are 1 s."""
+    """Return settings of a base station whose timeouts are 1 s."""
     return BaseStationSettings(
         ack_timeout_s=1.0, step_timeout_s=1.0, rest_s=1.0, retries=0, **values)
 
@@ -145,7 +145,7 @@ def test_every_state_can_be_left(role):
 
 def test_exactly_the_states_with_a_timeout_have_rows_for_a_tick():
     rows = [(name, state) for name, role in ROLES.items() for state in role.machine.STATES
-            if rows_for(role.machine.TABLE, state, Tick)]
+            if rows_for(role.machine.TABLE, state, Timeout)]
     assert rows == TIMED
 
 
@@ -154,11 +154,11 @@ def test_timeouts_alone_lead_to_the_final_state(name, state):
     """The last row for a tick has no guard: it ends the state whatever the memory holds."""
     role, path = ROLES[name], [state]
     while path[-1] is not role.final:
-        row = rows_for(role.machine.TABLE, path[-1], Tick)[-1]
+        row = rows_for(role.machine.TABLE, path[-1], Timeout)[-1]
         assert row.guard is always
         assert row.target is not SAME and row.target not in path
         path.append(row.target)
-    final_rows = rows_for(role.machine.TABLE, role.final, Tick)
+    final_rows = rows_for(role.machine.TABLE, role.final, Timeout)
     if role.final in role.endless:
         assert final_rows == []
     else:
@@ -168,13 +168,13 @@ def test_timeouts_alone_lead_to_the_final_state(name, state):
 
 @pytest.mark.parametrize(('name', 'state'), TIMED)
 def test_a_timeout_is_counted_unless_it_ends_the_pause(name, state):
-    row = rows_for(ROLES[name].machine.TABLE, state, Tick)[-1]
+    row = rows_for(ROLES[name].machine.TABLE, state, Timeout)[-1]
     assert (row.outcome is None) == (state is State.RESTING)
     assert row.outcome is None or row.outcome.kind in (Kind.LOST, Kind.IDLE)
 
 
 def test_outcomes_of_timeouts_differ(role):
-    outcomes = [row.outcome for row in role.machine.TABLE if row.event is Tick and row.outcome]
+    outcomes = [row.outcome for row in role.machine.TABLE if row.event is Timeout and row.outcome]
     assert len(set(outcomes)) == len(outcomes)
 
 
@@ -251,7 +251,7 @@ def test_a_snapshot_shows_changes_at_every_depth(machine):
 
 def test_there_are_events_without_rows():
     assert {name for name, _, _ in WITHOUT_ROWS} == {'bs', 'user'}
-    assert ('bs', State.WAITING, Tick) in WITHOUT_ROWS
+    assert ('bs', State.WAITING, Timeout) in WITHOUT_ROWS
 
 
 @pytest.mark.parametrize(('name', 'state', 'event'), WITHOUT_ROWS)
@@ -283,11 +283,11 @@ def test_a_message_that_the_role_does_not_receive_is_an_error(machine, name, kin
 
 
 def random_event(rng, subject, example, codebooks):
-    """Return an event of a machine that fits its present cycle more often than not."""
+    """Return an event of a machine that fits its current cycle more often than not."""
     events = list(subject.EVENT_NAMES)
     kind = events[rng.integers(len(events))]
-    if kind is Tick:
-        return Tick()
+    if kind is Timeout:
+        return Timeout()
     if kind is CodebookOffered:
         return CodebookOffered(codebooks[rng.integers(3)])
     if kind is PeersChanged:
@@ -347,6 +347,6 @@ def test_machines_take_the_first_row_that_matches(
             assert deadline_s == now_s + 1.0
     assert len(visited) >= 3
     assert sent
-    # An idle RHS controller refuses all beams but one without a codebook.
+    # An idle RHS controller rejects all beams but one without a codebook.
     assert unexpected or name == 'rhs_controller'
     assert all(n > 0 for n in subject.counters.values())

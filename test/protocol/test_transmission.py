@@ -228,7 +228,7 @@ def test_a_cycle_keeps_its_bands_when_the_settings_change(
     role = Transmission(scenario, TransmissionSettings(1))
     (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
     assert role.handle(SettingsOffered(TransmissionSettings(0)), 0.0) == [
-        LogMessage("from now on: band '0'")]
+        LogMessage("settings applied: band '0'")]
     assert role.status()['parameter.band'] == '0'
     moved = dataclasses.replace(estimate, position=estimate.position + 0.1)
     (again,), (other,), _, (report, _) = feed(role, [estimate, moved, truth, configured(beam)])

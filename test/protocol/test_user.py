@@ -5,7 +5,7 @@ import pytest
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Send, Tick
+from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Send, Timeout
 from rhs_isac_ros.protocol.user import State, User, timeouts
 
 DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
@@ -14,7 +14,7 @@ OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
 
 @pytest.fixture
 def user():
-    """User 4, connected, with time-outs of 2 s for a grant and 3 s after it."""
+    """User 4, connected, with timeouts of 2 s for a grant and 3 s after it."""
     way = mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)
     made = User(4, way, {State.ACKNOWLEDGED: 2.0, State.GRANTED: 3.0})
     made.handle(PeersChanged(()), 0.0)
@@ -166,7 +166,7 @@ def test_a_timeout_leads_back_to_listening(user, granted, deadline_s, reason):
     if granted:
         user.handle(m.Grant(cycle_id=7, user=4), 10.0)
     assert user.next_deadline() == deadline_s
-    assert user.handle(Tick(), deadline_s) == []
+    assert user.handle(Timeout(), deadline_s) == []
     assert user.state is State.LISTENING
     assert user.counters == {reason: 1}
     assert user.next_deadline() is None

@@ -29,15 +29,15 @@ ENUMS = {'RhsConfiguration': [m.Mode], 'Data': [m.Direction, m.Stage], 'Protocol
 
 def random_scalar(field, rng):
     meta = field.metadata
-    if 'below' in meta:
-        return int(rng.integers(SIZES[meta['below']]))
+    if 'index_of' in meta:
+        return int(rng.integers(SIZES[meta['index_of']]))
     if issubclass(field.type, enum.IntEnum):
         return rng.choice(list(field.type))
     if field.type is int:
         bits = 64 if field.name == 'cycle_id' else 32
         return [0, 1, 2**bits - 1, int(rng.integers(2**32))][rng.integers(4)]
     if field.type is float:
-        special = [math.nan, math.inf] if 'open' in meta else [0.0]
+        special = [math.nan, math.inf] if 'nan_allowed' in meta else [0.0]
         return float(rng.choice([-0.0, 5e-324, 1.7e308, rng.normal(), *special]))
     assert field.type is str
     return ''.join(rng.choice(list('aZ09 _/µ漢\n"'), size=rng.integers(0, 20)))

@@ -37,7 +37,7 @@ def received(cycle_id):
 def recording(bench, probe, tmp_path):
     """A recording of three messages of two types, and the messages."""
     recorder = Recorder(tmp_path / 'run.mcap', Scenario(n_frames=2))
-    recorder.listen(probe)
+    recorder.record_topics(probe)
     sent = [received(1), ros.PositionEstimate(cycle_id=1, covariance_m2=np.arange(9.0)),
             received(2)]
     publishers = {ros.ReceivedSignals: 'received_signals',
@@ -208,7 +208,7 @@ def test_rosbags_reads_all_topics(bench, probe, tmp_path):
     """Types, counts and contents follow from the definitions in the file alone."""
     highlevel = pytest.importorskip('rosbags.highlevel', reason='there is no rosbags here')
     recorder, rng, sent = Recorder(tmp_path / 'all.mcap', Scenario()), np.random.default_rng(0), {}
-    recorder.listen(probe)
+    recorder.record_topics(probe)
     for number, (name, (kind, profile)) in enumerate(recorded_topics().items()):
         publisher = probe.create_publisher(kind, name, profile)
         bench.until(publisher.get_subscription_count, 'the recorder')

@@ -8,7 +8,7 @@ import pytest
 from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import LogMessage, Send, Tick
+from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -33,7 +33,7 @@ class Scripted(PlainRole):
 
     @property
     def ticks_s(self):
-        return [now_s for event, now_s in self.events if isinstance(event, Tick)]
+        return [now_s for event, now_s in self.events if isinstance(event, Timeout)]
 
 
 @pytest.fixture
@@ -237,7 +237,7 @@ def test_a_deadline_in_the_past_causes_a_tick_at_once(bench, start):
     role = deadlines(-1.0, 0.0, -5.0, 0.02)
     node = start(bench, role)
     node.dispatch(m.Ack(cycle_id=1, user=1))
-    assert [type(event) for event, _ in role.events] == [m.Ack, Tick, Tick, Tick]
+    assert [type(event) for event, _ in role.events] == [m.Ack, Timeout, Timeout, Timeout]
     bench.until(lambda: len(role.ticks_s) == 4, 'the tick that was not due')
 
 
@@ -247,7 +247,7 @@ def test_deadlines_are_kept_while_messages_arrive(each_bench, start):
     deadlines_s = []
 
     def script(role, event, now_s):
-        if isinstance(event, Tick):
+        if isinstance(event, Timeout):
             assert now_s >= role.deadline_s
             role.deadline_s = None
             return

@@ -56,7 +56,7 @@ def test_a_late_joiner_receives_latched_messages_only(
 
 
 def test_only_the_statistics_are_latched():
-    assert {kind for kind in topics.NAMES if qos.of(kind) is qos.LATCHED} == {
+    assert {kind for kind in topics.NAMES if qos.profile_for(kind) is qos.LATCHED} == {
         m.CapacityStatistics}
-    assert {kind for kind in topics.NAMES if qos.of(kind) is qos.EXCHANGE} == set(
+    assert {kind for kind in topics.NAMES if qos.profile_for(kind) is qos.EXCHANGE} == set(
         topics.NAMES) - {m.CapacityStatistics}

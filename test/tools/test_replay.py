@@ -171,7 +171,7 @@ def test_topics_of_a_running_network_are_not_published(run, shared_session):
         check=False)
     assert (done.returncode, done.stdout) == (1, '')
     assert done.stderr.splitlines()[-1] == (
-        'error: received_signals: another node publishes it, expected none')
+        'error: received_signals: already published by another node')
 
 
 @pytest.mark.parametrize('arguments, error', [

@@ -58,7 +58,7 @@ def test_no_text_is_cut_off_or_overlaps_another(monkeypatch):
     scenario = Scenario()
     figure = compose(make_scene(scenario, 12), scenario)
     found = texts(figure, monkeypatch)
-    assert {'x [m]', 'y [m]', 'z [m]', 'user 8', 'and 4 more', 'board'} <= {
+    assert {'x [m]', 'y [m]', 'z [m]', 'user 8', 'and 4 more', 'surface'} <= {
         text for text, _ in found}
     page = figure.bbox.padded(1)
     for text, box in found:
@@ -88,8 +88,8 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
                 if line.get_marker() == 'o'}
         assert dots == {tuple(np.round(position[plane] + 0.8, 9)) for position in POSITIONS}
         assert axes.get_aspect() == 1.0
-    board = views['z [cm]'].images[0].get_array()
-    assert board.shape == (10, 10)
+    surface = views['z [cm]'].images[0].get_array()
+    assert surface.shape == (10, 10)
     # No error is shown: the true position of user 3 belongs to another cycle.
     assert figure.get_suptitle() == 'cycle 103, user 3'
 

@@ -18,7 +18,7 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.experiments.arguments import check_directory
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.monitoring.invariants import SETTLE_S
+from rhs_isac_ros.monitoring.invariants import CHECK_DELAY_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
@@ -95,7 +95,7 @@ def _soak(
         observer, processes, options.soak, lambda minutes, cycles: _show_progress(
             f'{minutes:.1f} of {options.soak:g} minutes, {cycles} cycles'))
     # The last results are checked after the settling time.
-    observer.spin_for(SETTLE_S)
+    observer.spin_for(CHECK_DELAY_S)
     figures = report.soak_figures(result, observer.invariants)
     print(report.soak_text(result, figures))
     return figures
@@ -118,7 +118,7 @@ def _crash(
     trials = crashes.crash_all(
         observer, processes, options.nodes, [m.Phase[name.upper()] for name in options.phases],
         lambda trial: print(report.crash_line(trial), flush=True))
-    observer.spin_for(SETTLE_S)
+    observer.spin_for(CHECK_DELAY_S)
     figures = report.crash_figures(trials, observer.invariants)
     print(report.crash_summary(figures))
     return figures

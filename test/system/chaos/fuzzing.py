@@ -30,7 +30,7 @@ _MAX_ORIGINALS = 32
 _PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
 # Topics with other messages.
 _OTHERS = {
-    topics.CODEBOOK: (ros.Codebook, qos.HELD),
+    topics.CODEBOOK: (ros.Codebook, qos.LATCHED_WITH_LEASE),
     topics.POSITION: (PoseWithCovarianceStamped, qos.EXCHANGE),
     topics.DIAGNOSTICS: (DiagnosticArray, qos.EXCHANGE),
     topics.MARKERS: (MarkerArray, qos.EXCHANGE),
@@ -156,7 +156,7 @@ def fuzz(
     ChaosError
         If a node does not receive the messages of another one, or a mutation.
     """
-    mutators = [_Mutator(observer, name, convert.ros_type(kind), qos.of(kind))
+    mutators = [_Mutator(observer, name, convert.ros_type(kind), qos.profile_for(kind))
                 for name, kind in _PROTOCOL.items()]
     mutators += [_Mutator(observer, name, kind, profile)
                  for name, (kind, profile) in _OTHERS.items()]

@@ -86,7 +86,7 @@ class Trial:
 
     def settle(self) -> None:
         """Wait until all results have been checked."""
-        self._spin(invariants.SETTLE_S)
+        self._spin(invariants.CHECK_DELAY_S)
 
     def _spin(self, seconds: float, cycles: int = 0) -> None:
         """Observe for a time, or until this many cycles have begun and been served."""
