@@ -159,9 +159,9 @@ def test_a_codebook_that_does_not_fit_is_rejected_with_one_error(
 
     def has_error():
         log.append(capfd.readouterr().err)
-        return 'not used' in ''.join(log)
+        return 'rejected' in ''.join(log)
     bench.until(has_error, 'the error')
-    text = next(line for line in ''.join(log).splitlines() if 'not used' in line)
+    text = next(line for line in ''.join(log).splitlines() if 'rejected' in line)
     assert '[ERROR]' in text
     assert 'optimizer' in text
     sizes = small.scenario.sizes
@@ -178,7 +178,7 @@ def test_a_codebook_that_does_not_fit_is_rejected_with_one_error(
     bench.until(lambda: got, 'the codebook that fits')
     assert got[-1].id in {codebook.id for codebook in stored.values()}
     log.append(capfd.readouterr().err)
-    assert sum('[client]' in line and 'not used' in line
+    assert sum('[client]' in line and 'rejected' in line
                for line in ''.join(log).splitlines()) == 1
 
 

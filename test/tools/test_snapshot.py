@@ -36,7 +36,7 @@ def test_snapshot_draws_a_running_network(shared_session, snapshot, tmp_path):
 def test_a_network_of_another_scenario_is_named(shared_session, snapshot, tmp_path):
     done = snapshot()
     assert (done.returncode, done.stdout) == (1, '')
-    assert 'another scenario? --config FILE' in done.stderr
+    assert 'another scenario, pass it with --config FILE' in done.stderr
     assert not list(tmp_path.iterdir())
 
 
