@@ -41,7 +41,7 @@ class GradientSums(NamedTuple):
 
 
 class Evaluation(Protocol):
-    """One evaluation for one measurement model, block by block."""
+    """Whitened means for one measurement model and the sums for its gradient, in blocks."""
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
         """Compute the whitened means of a block of n items, complex128 [n, G, N_SB F]."""

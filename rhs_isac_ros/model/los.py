@@ -25,7 +25,7 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
 def los_derivative(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
     """Compute the derivative of the line-of-sight gains, complex128 [N, 3, N_SB, N_E] [1/m].
 
-    This is H-dot in Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d. A gain
+    This is the H-dot of Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d. A gain
     pattern adds a term for the change of the gain with the angle from the boresight.
     """
     return los_and_derivative(scenario, positions, band)[1]

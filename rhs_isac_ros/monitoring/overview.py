@@ -48,7 +48,7 @@ class NodeStatus:
     Attributes
     ----------
     received_s
-        Arrival of the report [s].
+        Time at which the report arrived [s].
     """
 
     report: Report

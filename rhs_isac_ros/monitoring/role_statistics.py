@@ -27,10 +27,11 @@ class Report:
     summary
         One line that describes the fault.
     values
-        ``phase``, ``codebook_id``, ``parameter.<name>`` in use, ``pending.<name>`` not yet in
-        use, ``failed.<name>`` without effect, ``cycles.<outcome>``, ``dropped.<reason>``,
-        ``retries.<step>``, ``beacons.<reason>``, ``received.<message>``, ``sent.<message>`` and
-        percentiles such as ``handling_ms.p95``.
+        Settings: ``parameter.<name>`` (in use), ``pending.<name>`` (not in use yet) and
+        ``failed.<name>`` (why a change failed). Counts: ``cycles.<outcome>``,
+        ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``, ``received.<message>``
+        and ``sent.<message>``. Also ``phase``, ``codebook_id`` and percentiles such as
+        ``handling_ms.p95``.
     """
 
     fault: bool

@@ -54,7 +54,7 @@ class Modes(NamedTuple):
 
     @property
     def roi_points(self) -> np.ndarray:
-        """Most likely points of the modes inside the region, (r [m], u, v), float64 [M, 3]."""
+        """For each mode, its most likely point inside the region, (r [m], u, v), [M, 3]."""
         points: np.ndarray = self.points + self.roi_offset
         return points
 

@@ -45,7 +45,7 @@ class TemplateTable:
     points
         Grid (r [m], u, v), float64 [G, 3].
     range_offsets_m
-        Offsets of the fine range steps from the range of a grid point, float64 [D] [m].
+        Fine range steps, relative to the range of a grid point, float64 [D] [m].
     normal
         Points that represent a standard Gaussian, float64 [128, 3].
     """

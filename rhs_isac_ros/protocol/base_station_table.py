@@ -104,7 +104,7 @@ TABLE = (
     Row(event=m.Ack, guard=Steps.duplicate_ack, actions=(Steps.count_ack,),
         outcome=Outcome.DUPLICATE),
     Row(event=m.Ack, guard=Steps.crowded, actions=(Steps.count_ack,), outcome=Outcome.CROWDED),
-    # A late ack: the cycle is already granted, so the user is registered for the next cycle.
+    # A late ack: this cycle no longer collects acks; the user is registered for the next one.
     Row(source=NOT_BEACONING, event=m.Ack, actions=(Steps.count_ack, Steps.register_user),
         outcome=Outcome.LATE_ACK),
     Row(source=(State.BEACONING,), event=m.Ack, guard=Steps.last_ack,

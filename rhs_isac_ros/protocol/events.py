@@ -30,7 +30,7 @@ class SettingsOffered:
 
 @dataclasses.dataclass(frozen=True)
 class PeersChanged:
-    """The set of missing roles, among those that a role needs, has changed."""
+    """The set of required roles that are missing has changed."""
 
     missing: tuple[str, ...]
 

@@ -50,7 +50,7 @@ class Parameter:
 
     @property
     def range(self) -> str:
-        """Valid values within the type, as text; empty if all."""
+        """Valid values as text; empty if every value of the type is valid."""
         if self.choices:
             return ', '.join(self.choices) + (' or a plug-in' if self.plugins else '')
         if self.low is None:

@@ -191,7 +191,9 @@ def read(
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Read the scenario of a recording; None if it has none, such as one made by ``ros2 bag``.
+    """Read the scenario of a recording.
+
+    Return None if the recording contains none, as when ``ros2 bag`` made it.
 
     Raises
     ------

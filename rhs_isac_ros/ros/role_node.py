@@ -142,7 +142,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self._set_timer(deadline_s - now_s, deadline_s)
 
     def publish(self, message: m.Message) -> bool:
-        """Check and publish a message; return False if it is invalid and only logged."""
+        """Publish a valid message and return True; log the error of an invalid one, return False."""
         try:
             m.check(message, self._sizes)
         except m.MessageError as error:

@@ -113,7 +113,7 @@ def start_network(
         processes: Processes, users: int, seed: int, scenario_file: Path | None,
         codebook_file: Path, scenario: Scenario, rest_s: float = 0.1, first_cycle: int = 1,
         impairments: Impairments | None = None) -> None:
-    """Start every node of a network as a process.
+    """Start each node of a network in a process of its own.
 
     Parameters
     ----------
@@ -126,8 +126,8 @@ def start_network(
     rest_s
         Pause between cycles [s].
     first_cycle
-        Number of the first cycle. With 1, cycles are reproducible for a seed; with 0, numbers
-        are derived from the clock, so that the base station can be restarted.
+        Number of the first cycle. With 1, cycles are reproducible for a seed; with 0, cycle
+        numbers are derived from the clock, so that the base station can be restarted.
     impairments
         Impairments of signals and packets; by default none.
     """

@@ -19,7 +19,8 @@ def ellipse_95(covariance_m2: np.ndarray) -> tuple[float, float, float]:
     Returns
     -------
     tuple of float
-        Width and height [m], and the angle from the first axis to the width [deg].
+        Lengths of the two axes, called width and height [m], and the angle from the first
+        coordinate axis to the axis of the width [deg].
     """
     variances, directions = np.linalg.eigh(covariance_m2)
     width, height = (2 * np.sqrt(_CHI_SQUARE_95 * np.maximum(variances, 0))).tolist()
