@@ -13,7 +13,7 @@ from rhs_isac_ros.positioning.search import SearchEstimator
 
 
 class BayesEstimator(SearchEstimator):
-    """Estimates mean and covariance of the posterior for a uniform prior on the region.
+    """Estimates mean and covariance of the posterior; the prior is uniform on the region.
 
     The table gives the modes, Gauss-Newton steps on the exact near-field model refine them, and
     every mode contributes with the mass of its Gaussian inside the region. Parameters and errors

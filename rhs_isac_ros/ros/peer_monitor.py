@@ -43,8 +43,8 @@ def identifying_endpoints(role: str) -> Endpoints:
     """Return the endpoints that show the presence of a role.
 
     These are the first message in `SENDS` that no other role sends, and the first in `RECEIVES`
-    that no other role receives, if any. One of each is enough, because a node creates its publishers together and
-    its subscriptions together.
+    that no other role receives, if any. One of each is enough, because a node creates its
+    publishers together and its subscriptions together.
     """
     others = [endpoints for name, endpoints in _ENDPOINTS.items() if name != role]
     sent = {kind for other in others for kind in other.publishers}

@@ -142,7 +142,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self._set_timer(deadline_s - now_s, deadline_s)
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a valid message and return True; log the error of an invalid one, return False."""
+        """Publish a valid message and return True, or log its error and return False."""
         try:
             m.check(message, self._sizes)
         except m.MessageError as error:
