@@ -60,10 +60,11 @@ def test_publishers_are_those_of_the_documentation():
     for topic, publishers in rows:
         allowed_to = {path[1:].replace('user_1', 'user') for path, rights in allowed.items()
                if f'/{topic}' in rights['publish']}
-        # The visualizer has no diagnostics, and the operator does not publish.
-        every_node = {path[1:].replace('user_1', 'user') for path in allowed} - {
+        # The operator does not publish.
+        reporting = {path[1:].replace('user_1', 'user') for path in allowed} - {
             'visualizer', 'operator'}
-        expected = every_node if publishers == 'every node' else set(publishers.split(', '))
+        expected = (reporting if publishers == 'every node except visualizer'
+                    else set(publishers.split(', ')))
         assert allowed_to == expected
 
 
