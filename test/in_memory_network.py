@@ -81,6 +81,33 @@ def on_time(message: m.Message, recipient: str) -> list[tuple[float, m.Message]]
     return [(LATENCY_S, message)]
 
 
+def matches(message: m.Message, kind: type[m.Message], fields: dict[str, Any]) -> bool:
+    return isinstance(message, kind) and all(
+        getattr(message, name) == value for name, value in fields.items())
+
+
+class LosesFirst:
+    """Loses the first message of a class to one recipient, or to all."""
+
+    def __init__(
+            self, kind: type[m.Message], fields: dict[str, Any], recipient: str = '') -> None:
+        self.kind, self.fields, self.recipient = kind, fields, recipient
+        self.lost: m.Message | None = None
+
+    def __call__(self, message: m.Message, recipient: str) -> list[tuple[float, m.Message]]:
+        if matches(message, self.kind, self.fields) and recipient.startswith(self.recipient):
+            self.lost = self.lost or message
+            if message is self.lost:
+                return []
+        return [(1e-3, message)]
+
+
+def feed(role: Any, events: Iterable[Any]) -> list[list[m.Message]]:
+    """Return the messages that a role sends, one list for each event."""
+    return [[action.message for action in role.handle(event, float(n))
+             if isinstance(action, Send)] for n, event in enumerate(events)]
+
+
 class Noisy:
     """Loses, duplicates and delays messages at random; a lost message reaches no recipient."""
 

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args, try_shutdown
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options
 from rhs_isac_ros.codebook.command import run as run_command
 from rhs_isac_ros.monitoring.role_statistics import Report
@@ -21,7 +21,6 @@ from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.parameters import CODEBOOK
 from rhs_isac_ros.ros.push import PushError, push
-from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import run
 
 PUSHER_NODE = 'codebook_pusher'

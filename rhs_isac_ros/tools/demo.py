@@ -14,14 +14,13 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.experiments.arguments import check_directory, nonnegative_int, positive_int
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
-from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo_report import draw, summary, table
 

@@ -17,12 +17,12 @@ import numpy as np
 import rclpy
 from parts.hops import hops_of, ping_pong
 
+from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import start_network, watch
 

@@ -18,10 +18,10 @@ import rclpy
 from parts.hops import hops_of, ping_pong
 from system.observer import NetworkObserver
 
+from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.resources import default_codebook_file
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import start_network
 

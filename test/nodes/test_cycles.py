@@ -8,14 +8,13 @@ import types
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fields import check
 from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.codebook_client import CodebookClient
-from rhs_isac_ros.ros.resources import default_codebook_file
 
 SCENARIO = Scenario()
 SIZES = SCENARIO.sizes

@@ -5,21 +5,15 @@ import math
 
 import numpy as np
 import pytest
+from in_memory_network import feed
 
 from rhs_isac_ros.link import Beam, capacity, steer
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.events import Send
 
 PLACE = np.array([8.0, -2.0, 0.5])
-
-
-def feed(role, events):
-    """Return the messages that a role sends, one list for each event."""
-    return [[action.message for action in role.handle(event, float(n))
-             if isinstance(action, Send)] for n, event in enumerate(events)]
 
 
 @pytest.fixture

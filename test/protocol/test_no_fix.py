@@ -2,30 +2,11 @@
 
 import numpy as np
 import pytest
+from in_memory_network import LosesFirst
 
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_states import State
-
-
-def matches(message, kind, fields):
-    return isinstance(message, kind) and all(
-        getattr(message, name) == value for name, value in fields.items())
-
-
-class LosesFirst:
-    """Loses the first message of a class to one recipient, or to all."""
-
-    def __init__(self, kind, fields, recipient=''):
-        self.kind, self.fields, self.recipient = kind, fields, recipient
-        self.lost = None
-
-    def __call__(self, message, recipient):
-        if matches(message, self.kind, self.fields) and recipient.startswith(self.recipient):
-            self.lost = self.lost or message
-            if message is self.lost:
-                return []
-        return [(1e-3, message)]
 
 
 class NoFixInCycles:

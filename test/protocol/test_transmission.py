@@ -5,25 +5,19 @@ import math
 
 import numpy as np
 import pytest
+from in_memory_network import feed
 
 from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
-    Send,
     SettingsOffered,
 )
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 
 PLACE = np.array([8.0, -2.0, 0.5])
-
-
-def feed(role, events):
-    """Return the messages that a role sends, one list for each event."""
-    return [[action.message for action in role.handle(event, float(n))
-             if isinstance(action, Send)] for n, event in enumerate(events)]
 
 
 @pytest.fixture

@@ -12,12 +12,11 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.resources import default_codebook_file
 
 TYPES = {
     'codebook.id': Parameter.Type.STRING,
