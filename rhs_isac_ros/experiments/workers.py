@@ -22,7 +22,8 @@ def run_locally(
     """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
     There are `n_jobs` processes: -1 selects one per core; 1 runs all jobs in this process.
-    Closing the generator ends them.
+    Closing the generator ends them. Before joblib 1.4, a result also waits for those of all
+    earlier jobs.
 
     Raises
     ------
@@ -39,7 +40,7 @@ def run_locally(
         with _interrupts_ignored(), joblib.parallel_config(
                 backend='loky', inner_max_num_threads=1):
             results = joblib.Parallel(
-                n_jobs=n_jobs, batch_size=1, return_as='generator_unordered')(
+                n_jobs=n_jobs, batch_size=1, return_as=_return_as(joblib.__version__))(
                     joblib.delayed(attempt)(function, job) for job in jobs)
         # `yield from` would close the generator outside the filter for warnings below.
         while result := next(results, None):
@@ -92,6 +93,12 @@ def run_on_cluster(
                 yield future.result()
             except Exception as error:  # the job killed its worker or could not be sent to one
                 yield JobResult(jobs_by_future[future], error=f'{type(error).__name__}: {error}')
+
+
+def _return_as(version: str) -> str:
+    """Return the option of a version of joblib that yields results as early as possible."""
+    release = tuple(int(part) for part in version.split('.')[:2])
+    return 'generator_unordered' if release >= (1, 4) else 'generator'
 
 
 @contextlib.contextmanager

@@ -19,6 +19,8 @@ from rhs_isac_ros.tools.ellipses import ellipse_95
 _FIGURE_SIZE_IN = (14.0, 9.6)
 _DPI = 120
 _MARGIN_M = 0.8
+# Height of the row of the legend, apart from the legend, relative to the views.
+_LEGEND_ROW = 0.001
 # Line width of the surface: to scale, a surface of some decimetres would be too thin to see.
 _SURFACE_WIDTH_POINTS = 6
 # Maximum number of users in the legend.
@@ -44,20 +46,25 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=_FIGURE_SIZE_IN, layout='constrained')
-    # Both views have the same scale, so that their x axes are aligned.
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1),
-                               height_ratios=[_limit_m(scenario, axis) for axis in (1, 2)])
+    # Both views have the same scale, so that their x axes are aligned. The layout adds the height of
+    # the legend to the last row.
+    limits_m = [_limit_m(scenario, axis) for axis in (1, 2)]
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.9, 1),
+                               height_ratios=[*limits_m, _LEGEND_ROW * sum(limits_m)])
     pattern = _pattern(scene.beam, scenario)
     above, side = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     _draw_view(above, [0, 1], scene, scenario, pattern)
     _draw_view(side, [0, 2], scene, scenario, pattern)
     above.set_title('from above', loc='left')
     side.set_title('from the side', loc='left')
-    right = grid[:, 1].subgridspec(2, 1, height_ratios=(1.5, 1))
+    right = grid[:2, 1].subgridspec(2, 1, height_ratios=(1.5, 1))
     _draw_surface(figure.add_subplot(right[0]), scene, scenario)
     _draw_pattern(figure.add_subplot(right[1], projection='polar'), scene.beam, pattern)
     figure.suptitle(_title(scene), fontsize='x-large')
-    figure.legend(handles=_legend(scene), loc='outside lower center', ncols=6)
+    # A legend of the figure gets room from the layout only since Matplotlib 3.7.
+    below = figure.add_subplot(grid[2, :])
+    below.axis('off')
+    below.legend(handles=_legend(scene), loc='upper center', ncols=6)
     return figure
 
 

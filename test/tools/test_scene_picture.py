@@ -91,7 +91,7 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
     surface = views['z [cm]'].images[0].get_array()
     assert surface.shape == (10, 10)
     # No error is shown: the true position of user 3 belongs to another cycle.
-    assert figure.get_suptitle() == 'cycle 103, user 3'
+    assert [text.get_text() for text in figure.texts] == ['cycle 103, user 3']
 
 
 def test_the_surface_is_shown_from_the_front(small):
