@@ -1,7 +1,9 @@
 """Fixtures that all tests share, and the paper's equations written out index by index."""
 
+import contextlib
 import importlib.util
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +19,7 @@ pytest_plugins = ['in_memory_network']
 if importlib.util.find_spec('rclpy'):
     pytest_plugins.append('node_processes')
 HERE = Path(__file__).resolve().parent
+LIBRARIES = ('numpy', 'scipy', 'scikit-learn', 'matplotlib', 'pyyaml', 'joblib', 'dask', 'rich')
 
 # The profile quick uses the same examples in every run; thorough uses many more, which differ from
 # run to run.
@@ -35,6 +38,15 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     thorough = config.getoption('thorough')
     hypothesis.settings.load_profile('thorough' if thorough else 'quick')
+
+
+def pytest_report_header():
+    """Return the versions of the libraries that the package imports."""
+    found = []
+    for name in LIBRARIES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found.append(f'{name} {metadata.version(name)}')
+    return f'libraries: {", ".join(found)}'
 
 
 class Case(NamedTuple):

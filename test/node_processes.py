@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
+from ros_domain import claim_domain
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
@@ -29,7 +30,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 
 # Set before rclpy reads them; the child processes inherit them.
-os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+os.environ['ROS_DOMAIN_ID'] = claim_domain()
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 # Type supports load a parser that uses deprecated modules.
 with warnings.catch_warnings():

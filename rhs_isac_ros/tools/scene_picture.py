@@ -46,8 +46,8 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=_FIGURE_SIZE_IN, layout='constrained')
-    # Both views have the same scale, so that their x axes are aligned. The layout adds the height of
-    # the legend to the last row.
+    # Both views have the same scale, so that their x axes are aligned. The layout adds the height
+    # of the legend to the last row.
     limits_m = [_limit_m(scenario, axis) for axis in (1, 2)]
     grid = figure.add_gridspec(3, 2, width_ratios=(1.9, 1),
                                height_ratios=[*limits_m, _LEGEND_ROW * sum(limits_m)])

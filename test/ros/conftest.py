@@ -1,8 +1,7 @@
-"""Nodes in the process of the test, which spins them itself, on a domain of that process."""
+"""Nodes in the process of the test, which spins them itself, on the domain of `node_processes`."""
 
 import contextlib
 import dataclasses
-import os
 import time
 import warnings
 
@@ -20,10 +19,6 @@ from rclpy.type_support import check_for_type_support
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.ros import convert, qos, topics
-
-# Set before rclpy reads them.
-os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 # Type supports load a parser that uses deprecated modules.
 with warnings.catch_warnings():

@@ -93,10 +93,11 @@ def test_a_user_without_messages_is_removed(bench, probe, shown, small):
     assert np.linalg.norm(lobe, axis=1).max() == pytest.approx(distance)
     sending.remove(1)
     bench.until(lambda: ('truth', 1) not in shown, 'removal of user 1')
-    assert set(shown) == {('region', 0), ('board', 0), ('truth', 2)}
+    # On a loaded machine, a delayed message may remove user 2 until the next one.
+    bench.until(lambda: set(shown) == {('region', 0), ('board', 0), ('truth', 2)}, 'user 2')
     bench.until(lambda: not probe.count_publishers('users/user_1/true_path'),
                 'removal of its path')
-    assert probe.count_publishers('users/user_2/true_path')
+    bench.until(lambda: probe.count_publishers('users/user_2/true_path'), 'its path')
 
 
 def test_each_user_has_a_path(bench, probe, shown):

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from ros_domain import claim_domain
 
 from system.chaos.command import main
 
@@ -17,7 +18,7 @@ FOLDER = Path(__file__).parents[2]
 def chaos(small_files, tmp_path, *arguments):
     """Run the command; return its figures and its output."""
     file = tmp_path / 'figures.json'
-    environment = {**os.environ, 'ROS_DOMAIN_ID': str(101 - os.getpid() % 100)}
+    environment = {**os.environ, 'ROS_DOMAIN_ID': claim_domain()}
     done = subprocess.run(
         [sys.executable, '-m', 'system.chaos', '--config',
          small_files / 'scenario.yaml', '--codebook', small_files / 'first.yaml',
