@@ -36,6 +36,8 @@ class Installation:
         # The caller's environment may name ROS and the clone itself.
         environment = {name: value for name, value in os.environ.items() if name not in (
             'PYTHONPATH', 'PYTHONHOME', 'LD_LIBRARY_PATH', 'VIRTUAL_ENV')}
+        # Compiling all modules of SciPy takes longer than the rest of the installation.
+        environment['PIP_NO_COMPILE'] = '1'
         return subprocess.run(
             [self.prefix / 'bin' / program, *arguments], cwd=self.folder, env=environment,
             capture_output=True, text=True, timeout=SECONDS, check=False)
