@@ -35,7 +35,7 @@ def to_ros(message: Message, stamp: Time | None) -> Any:
     Parameters
     ----------
     stamp
-        Time for the header, if the type has one.
+        Time for the header; None: zero.
 
     Returns
     -------
@@ -46,8 +46,9 @@ def to_ros(message: Message, stamp: Time | None) -> Any:
     for name, encode, _ in _FIELDS[type(message)]:
         value = getattr(message, name)
         setattr(result, name, encode(value) if encode else value)
-    if hasattr(result, 'header'):
-        result.header = Header(stamp=stamp, frame_id=MAP_FRAME)
+    if stamp is not None:
+        result.header.stamp = stamp
+    result.header.frame_id = MAP_FRAME
     return result
 
 
