@@ -158,6 +158,9 @@ class Network:
         self._ends: list[tuple[int, int, str]] = []
         self.codebooks = {} if codebook is None else {codebook.id: codebook}
         self._roles: dict[str, Any] = {}
+        # Instance of each role, in the order in which they were started.
+        self.instances: dict[str, int] = {}
+        self._next_instance = itertools.count(1)
         self._queue: list[tuple[float, int, str, Any, m.Message]] = []
         self._serial = itertools.count()
         self._last_arrival_s: dict[tuple[str, str, type], float] = {}
@@ -182,15 +185,17 @@ class Network:
     def __contains__(self, name: str) -> bool:
         return name in self._roles
 
-    def add_user(self, user: int, place) -> None:
-        moves = hasattr(place, 'state')
-        self._mobilities[f'user{user}'] = place if moves else mobility.Static(place)
-        self.add(f'user{user}')
+    def add_user(self, user: int, place, suffix: str = '') -> None:
+        """Start a user; with the suffix ``_twin`` it may have the number of another one."""
+        moves, name = hasattr(place, 'state'), f'user{user}{suffix}'
+        self._mobilities[name] = place if moves else mobility.Static(place)
+        self.add(name)
 
     def add(self, name: str) -> None:
-        """Start a role anew."""
+        """Start a role anew; ``<name>_twin`` is a second one."""
+        self.instances[name] = next(self._next_instance)
         role = self._roles[name] = self._build(name)
-        if name in USE_CODEBOOKS and self._codebook is not None:
+        if self._kind(name) in USE_CODEBOOKS and self._codebook is not None:
             self.dispatch(name, CodebookOffered(self._codebook))
         self._reported.pop(role, None)
         self._report_missing()
@@ -209,8 +214,8 @@ class Network:
         """Offer a codebook to all roles that use one, at the same time."""
         self._codebook = codebook
         self.codebooks[codebook.id] = codebook
-        for name in USE_CODEBOOKS:
-            if name in self._roles:
+        for name in list(self._roles):
+            if self._kind(name) in USE_CODEBOOKS:
                 self.dispatch(name, CodebookOffered(codebook))
 
     def change(self, name: str, **values) -> None:
@@ -247,9 +252,11 @@ class Network:
 
     def publish(self, message: m.Message, sender: str = 'external') -> None:
         m.check(message, self.scenario.sizes)
+        if sender in self.instances:
+            message = dataclasses.replace(message, sender=self.instances[sender])
         self.log.append(Sent(self.now_s, sender, message))
-        if isinstance(message, m.Grant) and sender == 'bs':
-            self._noise[message.cycle_id] = self._roles['bs']._settings.in_use.receiver_noise
+        if isinstance(message, m.Grant) and self._kind(sender) == 'bs':
+            self._noise[message.cycle_id] = self._roles[sender]._settings.in_use.receiver_noise
         if isinstance(message, m.ProtocolState) and message.outcome:
             self._ends.append((message.cycle_id, message.user, message.outcome))
         for name, role in self._roles.items():
@@ -323,10 +330,11 @@ class Network:
                 continue
             match message:
                 case m.GroundTruth():
-                    truths[message.cycle_id, message.user] = message.position
+                    truths[message.cycle_id, message.user, message.sender] = message.position
                 case m.ReceivedSignals():
                     key = (message.cycle_id, message.user, message.codebook_id)
-                    expected = self.expected_signals(*key, truths[key[:2]])
+                    truth = truths[message.cycle_id, message.user, message.user_instance]
+                    expected = self.expected_signals(*key, truth)
                     np.testing.assert_allclose(
                         message.signals, expected, rtol=1e-9, atol=1e-9 * abs(expected).max())
                     signals.add(key)
@@ -361,7 +369,7 @@ class Network:
 
     @staticmethod
     def _kind(name: str) -> str:
-        return name.rstrip('0123456789')
+        return name.removesuffix('_twin').rstrip('0123456789')
 
     def _build(self, name: str):
         scenario, step_s = self.scenario, self.settings.step_timeout_s
@@ -374,8 +382,8 @@ class Network:
                 return BaseStation(scenario, self.settings, rng, self._receive, first)
             case 'user':
                 return user_role.User(
-                    int(name.removeprefix('user')), self._mobilities[name],
-                    user_role.timeouts(step_s, self._beacon_timeout_s))
+                    int(name.removeprefix('user').removesuffix('_twin')), self._mobilities[name],
+                    user_role.timeouts(step_s, self._beacon_timeout_s), self.instances[name])
             case 'rhs_controller':
                 return RhsController()
             case 'channel':

@@ -63,7 +63,7 @@ def topic_table():
     publishers = {topics.MARKERS: (MarkerArray, qos.EXCHANGE), **recording.recorded_topics()}
     rows = []
     for name, (kind, profile) in sorted(publishers.items()):
-        kept = 'latched' if profile is qos.LATCHED else f'last {profile.depth}'
+        kept = 'latched' if profile in (qos.LATCHED, qos.PRESENCES) else f'last {profile.depth}'
         text = recording.type_name(kind).replace('/msg/', '/')
         shown = f':ref:`{text} <message-{kind.__name__.lower()}>`' if text.startswith(
             'rhs_isac_msgs') else code(text)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import hashlib
+import json
 import math
 import numbers
 from pathlib import Path
@@ -128,6 +130,16 @@ class Scenario:
         """
         return {field.name: _plain(value) for field in dataclasses.fields(self)
                 if (value := getattr(self, field.name)) != field.default}
+
+    def fields(self) -> dict[str, Any]:
+        """Return all fields by name, as plain values; see `changes`."""
+        return {field.name: _plain(getattr(self, field.name))
+                for field in dataclasses.fields(self)}
+
+    @functools.cached_property
+    def id(self) -> str:
+        """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
+        return f'sc{hashlib.sha256(json.dumps(self.fields()).encode()).hexdigest()[:16]}'
 
     @property
     def n_bands(self) -> int:

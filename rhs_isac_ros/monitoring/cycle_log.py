@@ -67,23 +67,33 @@ class CycleRecord(CycleTimes):
     ----------
     outcome
         ``served``, or the reason why the cycle was given up; empty while it runs.
-    truth, signals, estimate, capacity
+    truths
+        True positions by the instance of the user that sent them.
+    signals, estimate, capacity
         The messages of the cycle; None if not received.
     """
 
     outcome: str = ''
-    truth: m.GroundTruth | None = None
+    truths: dict[int, m.GroundTruth] = dataclasses.field(default_factory=dict)
     signals: m.ReceivedSignals | None = None
     estimate: m.PositionEstimate | None = None
     capacity: m.Capacity | None = None
 
+    @property
+    def truth(self) -> m.GroundTruth | None:
+        """The true position of the instance whose position was estimated; None if unknown."""
+        instance = self.estimate.user_instance if self.estimate else 0
+        return next((truth for sender, truth in reversed(self.truths.items())
+                     if m.same_instance(sender, instance)), None)
+
     def completed(self) -> CompleteCycle | None:
         """Return the complete cycle; None unless it was served and no message is missing."""
-        if (self.outcome != 'served' or self.truth is None or self.signals is None
+        truth = self.truth
+        if (self.outcome != 'served' or truth is None or self.signals is None
                 or self.estimate is None or self.capacity is None):
             return None
         return CompleteCycle(
-            self.cycle_id, self.user, self.began_s, self.phase_s, self.ended_s, truth=self.truth,
+            self.cycle_id, self.user, self.began_s, self.phase_s, self.ended_s, truth=truth,
             signals=self.signals, estimate=self.estimate, capacity=self.capacity)
 
 
@@ -120,7 +130,7 @@ class CycleLog:
             return
         match message:
             case m.GroundTruth():
-                record.truth = message
+                record.truths[message.sender] = message
             case m.ReceivedSignals():
                 record.signals = message
             case m.PositionEstimate():

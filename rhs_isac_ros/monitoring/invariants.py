@@ -1,7 +1,8 @@
 """Invariants of the published results, checked passively against the messages on the topics.
 
 No position and no capacity may be published for a cycle whose signals were incomplete, stale,
-mixed between users, or received with two codebooks.
+mixed between users or channels, received with two codebooks, or inconsistent with the true
+position of the node that was granted the cycle.
 """
 
 import collections
@@ -11,19 +12,21 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 
 # Messages that the checker needs.
-RECEIVES = (m.Grant, m.RhsConfiguration, m.FeedSignals, m.ReceivedSignals, m.PositionEstimate,
-            m.Beam, m.Capacity)
+RECEIVES = (m.Grant, m.GroundTruth, m.RhsConfiguration, m.FeedSignals, m.ReceivedSignals,
+            m.PositionEstimate, m.Beam, m.Capacity)
 # Messages of different topics arrive in any order, so a result is checked after this delay [s].
 CHECK_DELAY_S = 1.0
 # Number of cycles whose messages are kept.
 _MAX_CYCLES = 64
 # Noise is complex Gaussian: |n|^2 exceeds this multiple of its power with probability e^-40.
 _MAX_NOISE_FACTOR = 40.0
+# Signals may deviate from their mean by as much as they do with probability e^-20.
+_RESIDUAL_EXPONENT = 20.0
 # The type of message whose absence is the fault, if any, and a description.
 _Fault = tuple[type[m.Message] | None, str]
 
@@ -33,6 +36,9 @@ class _CycleMessages:
     """The messages of a cycle; each may be repeated, but repetitions must agree."""
 
     users: set[int] = dataclasses.field(default_factory=set)
+    instances: set[int] = dataclasses.field(default_factory=set)
+    # True positions by user and instance.
+    truths: dict[tuple[int, int], np.ndarray] = dataclasses.field(default_factory=dict)
     # Configurations for positioning by band.
     applied: dict[int, list[m.RhsConfiguration]] = dataclasses.field(
         default_factory=lambda: collections.defaultdict(list))
@@ -50,6 +56,9 @@ class _CycleMessages:
         match message:
             case m.Grant():
                 self.users.add(message.user)
+                self.instances.add(message.user_instance)
+            case m.GroundTruth():
+                self.truths[message.user, message.sender] = message.position
             case m.RhsConfiguration(mode=m.Mode.POSITIONING):
                 self.applied[message.band].append(message)
             case m.RhsConfiguration():
@@ -80,6 +89,7 @@ class InvariantChecker:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
+        self._models: dict[str, MeasurementModel] = {}
         self._codebooks: dict[str, Codebook] = {}
         self._cycles: dict[int, _CycleMessages] = {}
         self._results: collections.deque[tuple[float, m.PositionEstimate | m.Capacity]] = (
@@ -92,6 +102,7 @@ class InvariantChecker:
     def add_codebook(self, codebook: Codebook) -> None:
         """Add a codebook that cycles may use."""
         self._codebooks[codebook.id] = codebook
+        self._models.setdefault(codebook.id, MeasurementModel(self._scenario, codebook))
 
     def expect_rediscovery(self, kinds: Iterable[type[m.Message]]) -> None:
         """Tolerate missing messages of some types until the first of each type arrives.
@@ -171,6 +182,7 @@ class InvariantChecker:
         users = {feeds.user for messages in cycle.feeds.values() for feeds in messages}
         if users - {estimate.user}:
             yield None, f'signals of users {sorted(users)}'
+        yield from _identity_faults(estimate, cycle)
         codebook = self._codebooks.get(estimate.codebook_id)
         if codebook is None:
             yield None, 'codebook that was never offered'
@@ -181,18 +193,42 @@ class InvariantChecker:
             self, cycle: _CycleMessages, codebook: Codebook, frames: list[tuple[int, int]]
     ) -> Iterator[_Fault]:
         """Compare the received signals with those at the feeds, combined by the codebook."""
+        yield from self._position_faults(cycle)
         for band, reports in cycle.applied.items():
             if any(not np.array_equal(report.analog, codebook.analog[band]) for report in reports):
                 yield None, f'band {band} measured with a configuration not in the codebook'
+        # Two channels may have answered, but the base station must have used one of them.
+        channels = [feeds for sender in {feeds.sender for feeds in cycle.feeds[frames[0]]}
+                    if (feeds := _feeds_of(sender, cycle, frames))]
+        if not channels:
+            yield None, 'signals of several channels'
+        elif not any(self._matches(feeds, cycle, codebook) for feeds in channels):
+            yield None, 'received signals do not match the feed signals'
+
+    def _matches(
+            self, feeds: list[np.ndarray], cycle: _CycleMessages, codebook: Codebook) -> bool:
+        """Return whether the received signals are those at the feeds, combined, and noise."""
         sizes = self._scenario.sizes
-        feeds = np.stack([cycle.feeds[key][0].signals for key in frames])
-        shape = sizes['N_B'], sizes['F'], *feeds.shape[1:]
-        expected = receive_feeds(self._scenario, codebook, feeds.reshape(shape), None)
+        stacked = np.stack(feeds).reshape(sizes['N_B'], sizes['F'], *feeds[0].shape)
+        expected = receive_feeds(self._scenario, codebook, stacked, None)
         noise = np.abs(cycle.signals[0].signals - expected)**2
         allowed = (_MAX_NOISE_FACTOR * self._scenario.noise_power_w
                    + 1e-12 * np.abs(expected).max()**2)
-        if noise.max() > allowed:
-            yield None, 'received signals do not match the feed signals'
+        return bool(noise.max() <= allowed)
+
+    def _position_faults(self, cycle: _CycleMessages) -> Iterator[_Fault]:
+        """Compare the received signals with their distribution at the true position."""
+        received = cycle.signals[0]
+        position = cycle.truths.get((received.user, received.user_instance))
+        if position is None:
+            return
+        model = self._models[received.codebook_id]
+        signals = received.signals.reshape(model.shape)
+        residual = model.whiten(signals - model.mean(position[None])[0])
+        n, t = residual.size, _RESIDUAL_EXPONENT
+        # The bound of Laurent and Massart (2000) on the norm of n complex unit Gaussians.
+        if np.sum(np.abs(residual)**2) > n + np.sqrt(2 * n * t) + t:
+            yield None, f'received signals do not match the true position {position.round(3)}'
 
     def _beam_faults(self, report: m.Capacity, cycle: _CycleMessages) -> Iterator[_Fault]:
         """Yield the faults of the beam for which a capacity was reported."""
@@ -207,3 +243,19 @@ class InvariantChecker:
                      applied.codebook_id == report.codebook_id
                      for applied in cycle.beam_applied for beam in beams):
             yield m.RhsConfiguration, 'beam not applied by the surface'
+
+
+def _identity_faults(estimate: m.PositionEstimate, cycle: _CycleMessages) -> Iterator[_Fault]:
+    """Yield the faults of the nodes that took part in the measurement."""
+    instances = {estimate.user_instance, *cycle.instances,
+                 *(received.user_instance for received in cycle.signals)}
+    if len(instances) > 1:
+        yield None, f'estimate for other nodes of the user than granted: {sorted(instances)}'
+
+
+def _feeds_of(
+        sender: int, cycle: _CycleMessages, frames: list[tuple[int, int]]) -> list[np.ndarray]:
+    """Return the signals of all frames from one channel; empty if a frame is missing."""
+    found = [feeds.signals for key in frames
+             for feeds in [f for f in cycle.feeds[key] if f.sender == sender][:1]]
+    return found if len(found) == len(frames) else []

@@ -11,7 +11,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import streams
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged
+from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, Resumed, StoodBy
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.peer_monitor import REQUIRED_BY_BASE_STATION, PeerMonitor
@@ -26,13 +26,23 @@ class BsNode(RoleNode[BaseStation]):
         super().__init__('bs', **node_options)
         values = self.values
         rng = streams.generator(values.seed, streams.BASE_STATION)
+        self._peers = PeerMonitor(
+            self, REQUIRED_BY_BASE_STATION,
+            lambda missing: self.dispatch(PeersChanged(missing)))
         self.start(BaseStation(
             self.scenario, self.make_settings(values), rng, self._receive,
             values.first_cycle or _cycle_from_clock()))
         self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
-        self._peers = PeerMonitor(
-            self, REQUIRED_BY_BASE_STATION,
-            lambda missing: self.dispatch(PeersChanged(missing)))
+
+    def stand_by(self) -> None:
+        """Abandon the cycle, and wait."""
+        self._peers.stop()
+        self.dispatch(StoodBy())
+
+    def resume(self) -> None:
+        """Begin cycles once the other nodes have discovered the publishers again."""
+        self.dispatch(Resumed(_cycle_from_clock()))
+        self._peers.restart()
 
     def make_settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
         """Return the settings for parameter values.

@@ -10,6 +10,7 @@ import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.utilities import remove_ros_args, try_shutdown
 
 import rhs_isac_msgs.msg as ros
@@ -20,6 +21,7 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.parameters import CODEBOOK
+from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
 from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.run import run
 
@@ -30,19 +32,23 @@ class OptimizerNode(Node):
     """Holds the codebook as parameters, checks each change as a whole, and publishes it latched.
 
     The first codebook comes from a parameter file on the command line or from ``codebook_file``.
+    While a newer optimizer is present, this one withdraws its announcement.
     """
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__(topics.OPTIMIZER_NODE, **node_options)
         values = parameters.declare(self, 'optimizer')
         self._scenario = parameters.scenario_of(values)
-        self._publisher = self.create_publisher(
-            ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
+        self._instance = new_instance()
+        # None while the node stands by.
+        self._publisher: Publisher | None = None
         defaults = Codebook.load(values.codebook_file or default_codebook_file()).to_parameters()
         for name, text in CODEBOOK.items():
             self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
         self._codebook_id, self._refused = '', 0
-        self._publish(self._assemble({}))
+        self._announce(False)
+        self._presence = PresenceClient(
+            self, topics.OPTIMIZER_NODE, self._instance, self._scenario, self._announce)
         self._diagnostics = Diagnostics(self, self._report)
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._on_set)
@@ -66,13 +72,28 @@ class OptimizerNode(Node):
             self._publish(self._assemble({}))
 
     def _report(self) -> Report:
-        values = {'codebook_id': self._codebook_id, 'dropped.wrong_codebook': str(self._refused)}
-        return Report(False, 'no fault', values)
+        conflicts = self._presence.conflicts()
+        values = {'codebook_id': self._codebook_id, 'dropped.wrong_codebook': str(self._refused),
+                  **conflicts}
+        return Report(bool(conflicts), '; '.join(conflicts.values()) or 'no fault', values)
+
+    def _announce(self, stands_by: bool) -> None:
+        """Announce the codebook, also again, or withdraw the announcement."""
+        if self._publisher is not None and stands_by:
+            self.destroy_publisher(self._publisher)
+            self._publisher = None
+        if not stands_by:
+            self._publisher = self._publisher or self.create_publisher(
+                ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
+            self._publish(self._assemble({}))
 
     def _publish(self, codebook: Codebook) -> None:
         self._codebook_id = codebook.id
+        if self._publisher is None:
+            return
         stamp = self.get_clock().now().to_msg()
-        self._publisher.publish(convert.codebook_to_ros(codebook, stamp))
+        self._publisher.publish(convert.codebook_to_ros(
+            codebook, stamp, self._instance, self._scenario.id))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 

@@ -18,12 +18,14 @@ from rhs_isac_ros.ros.timers import steady_timer
 class UserNode(RoleNode[User]):
     """A user of the network."""
 
+    is_unique = False
+
     def __init__(self, name: str = '', **node_options: Any) -> None:
         super().__init__('user', name, **node_options)
         values = self.values
         self.start(User(
             values.user_id, self._mobility(),
-            timeouts(values.step_timeout_s, values.beacon_timeout_s)))
+            timeouts(values.step_timeout_s, values.beacon_timeout_s), self.instance))
         self._peers = PeerMonitor(
             self, REQUIRED_BY_USER, lambda missing: self.dispatch(PeersChanged(missing)))
         steady_timer(self, values.ground_truth_period_s, self._publish_ground_truth)

@@ -4,7 +4,14 @@ from rhs_isac_ros.protocol import base_station_table
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.base_station_steps import BaseStationSteps
-from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, SettingsOffered, Timeout
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    PeersChanged,
+    Resumed,
+    SettingsOffered,
+    StoodBy,
+    Timeout,
+)
 
 
 class BaseStation(BaseStationSteps):
@@ -31,6 +38,7 @@ class BaseStation(BaseStationSteps):
     TABLE = base_station_table.TABLE
     EVENT_NAMES = {
         CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
-        Timeout: 'timeout', m.Ack: 'ack', m.RhsConfiguration: 'configured', m.FeedSignals: 'frame',
-        m.PositionEstimate: 'estimate', m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
+        StoodBy: 'stood_by', Resumed: 'resumed', Timeout: 'timeout', m.Ack: 'ack',
+        m.RhsConfiguration: 'configured', m.FeedSignals: 'frame', m.PositionEstimate: 'estimate',
+        m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
     BLOCKED_STATES = frozenset({State.WAITING})

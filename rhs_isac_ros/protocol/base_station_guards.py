@@ -16,6 +16,7 @@ from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.phase_times import PhaseTimes
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.state_machine import StateMachine
+from rhs_isac_ros.protocol.user_instances import UserInstances
 from rhs_isac_ros.protocol.user_scheduler import UserScheduler
 
 
@@ -29,6 +30,7 @@ class BaseStationGuards(StateMachine[State]):
         super().__init__(State.WAITING, {})
         self._scenario, self._receiver = scenario, receiver
         self._users = UserScheduler(settings.policy, rng)
+        self._instances = UserInstances()
         self._settings = PendingSettings(settings)
         self._use(settings)
         # The codebook of the current cycle, and the one for the next.
@@ -45,8 +47,9 @@ class BaseStationGuards(StateMachine[State]):
         self._timeouts_s = timeouts(settings)
 
     def status(self) -> Mapping[str, str]:
-        """Return the settings and the codebook in use, and the pending settings."""
-        return self._settings.describe() | {'codebook_id': self._codebook_id}
+        """Return the settings and the codebook in use, pending settings and conflicts."""
+        return (self._settings.describe() | {'codebook_id': self._codebook_id}
+                | self._instances.conflicts())
 
     @property
     def _codebook_id(self) -> str:
@@ -86,6 +89,12 @@ class BaseStationGuards(StateMachine[State]):
         """Whether a message concerns a user other than the granted one."""
         return event.user != self._cycle.user
 
+    def wrong_instance(self, event: m.FeedSignals, now_s: float) -> bool:
+        """Whether feed signals concern another instance of the user or of the channel."""
+        cycle = self._cycle
+        return not (m.same_instance(event.user_instance, cycle.user_instance)
+                    and m.same_instance(event.sender, cycle.channel))
+
     def wrong_codebook(
             self, event: m.RhsConfiguration | m.PositionEstimate | m.NoFix | m.Beam,
             now_s: float) -> bool:
@@ -115,6 +124,15 @@ class BaseStationGuards(StateMachine[State]):
     def too_often(self, event: m.Ack, now_s: float) -> bool:
         """Whether the user has reached its rate of acks."""
         return not self._ack_filter.within_rate(event.user, now_s)
+
+    def superseded(self, event: m.Ack, now_s: float) -> bool:
+        """Whether a newer instance owns the number of the user."""
+        return self._instances.is_superseded(event.user, event.sender)
+
+    def supersedes(self, event: m.Ack, now_s: float) -> bool:
+        """Whether an older instance of the user acknowledged this cycle before."""
+        return (self.duplicate_ack(event, now_s)
+                and event.sender > self._instances.owner(event.user))
 
     def duplicate_ack(self, event: m.Ack, now_s: float) -> bool:
         """Whether the user acknowledged this cycle before."""

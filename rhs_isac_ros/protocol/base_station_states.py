@@ -43,6 +43,10 @@ class Cycle:
         Number of beacons sent before the current one.
     user
         User that was granted the cycle; 0 before the grant.
+    user_instance
+        The granted instance of the user; if unknown, that of the first frame; otherwise 0.
+    channel
+        Instance of the channel that sent the first frame; 0 before it or if unknown.
     band
         Band that is being sounded.
     received
@@ -55,6 +59,8 @@ class Cycle:
     frames: FrameBuffer
     attempt: int = 0
     user: int = 0
+    user_instance: int = 0
+    channel: int = 0
     band: int = 0
     received: m.ReceivedSignals | None = None
     beam: m.Beam | None = None

@@ -8,8 +8,10 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     Event,
     PeersChanged,
+    Resumed,
     Send,
     SettingsOffered,
+    StoodBy,
     Timeout,
 )
 from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
@@ -28,6 +30,15 @@ class BaseStationSteps(BaseStationGuards):
     def store_peers(self, event: PeersChanged, now_s: float) -> None:
         """Store which roles are missing."""
         self._missing = event.missing
+
+    def forget_peers(self, event: StoodBy, now_s: float) -> None:
+        """Forget which roles are missing, so that no cycle begins until they are known again."""
+        self._missing = None
+
+    def skip_cycles(self, event: Resumed, now_s: float) -> None:
+        """Skip the ids of cycles that another base station has used."""
+        first = max(event.first_cycle_id, self._cycle.id + 1)
+        self._cycle = Cycle(first - 1, FrameBuffer(self._scenario.sizes))
 
     def store_settings(self, event: SettingsOffered, now_s: float) -> None:
         """Store settings until they may be applied."""
@@ -77,18 +88,32 @@ class BaseStationSteps(BaseStationGuards):
     def accept_ack(self, event: m.Ack, now_s: float) -> None:
         """Add a user to those that may be granted the cycle."""
         self._users.add_answer(event.user)
+        self.own_number(event, now_s)
+
+    def own_number(self, event: m.Ack, now_s: float) -> None:
+        """Record the instance that owns the number of the user."""
+        self._instances.accept(event.user, event.sender)
+
+    def log_superseded(self, event: m.Ack, now_s: float) -> list[Action]:
+        """Log once that two nodes have the number of a user."""
+        return [*self._instances.reject(event.user, now_s)]
 
     def register_user(self, event: m.Ack, now_s: float) -> None:
         """Register a user, for which the next cycle waits as well."""
         self._users.register(event.user)
+        self.own_number(event, now_s)
 
     def grant(self, event: m.Ack | Timeout, now_s: float) -> list[Action]:
         """Grant the cycle to one of the users that answered."""
         lost = self._users.remove_absent()
         self.count(Outcome.USER_LOST, len(lost))
-        self._cycle.user = self._users.select()
-        self._cycle.band = -1
-        return [Send(m.Grant(cycle_id=self._cycle.id, user=self._cycle.user)),
+        self._instances.forget(lost, now_s)
+        cycle = self._cycle
+        cycle.user = self._users.select()
+        cycle.user_instance = self._instances.owner(cycle.user)
+        cycle.band = -1
+        return [Send(m.Grant(
+            cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance)),
                 *self._outages.log_lost_users(lost)]
 
     # Positioning
@@ -109,12 +134,15 @@ class BaseStationSteps(BaseStationGuards):
 
     def request_pilots(self, event: Event, now_s: float) -> list[Action]:
         """Request the pilots of the band."""
+        cycle = self._cycle
         return [Send(m.PilotRequest(
-            cycle_id=self._cycle.id, user=self._cycle.user, band=self._cycle.band,
-            n_frames=self._scenario.n_frames))]
+            cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance,
+            band=cycle.band, n_frames=self._scenario.n_frames))]
 
     def store_frame(self, event: m.FeedSignals, now_s: float) -> None:
-        """Store the feed signals of a frame."""
+        """Store the feed signals of a frame; all frames come from the same instances."""
+        self._cycle.user_instance = self._cycle.user_instance or event.user_instance
+        self._cycle.channel = self._cycle.channel or event.sender
         self._cycle.frames.add(event)
 
     def send_signals(self, event: m.FeedSignals, now_s: float) -> list[Action]:
@@ -124,7 +152,8 @@ class BaseStationSteps(BaseStationGuards):
         signals = self._receiver(self._codebook, cycle.frames.stack(), cycle.user, cycle.id,
                                  self._settings.in_use.receiver_noise)
         cycle.received = m.ReceivedSignals(
-            cycle_id=cycle.id, user=cycle.user, codebook_id=self._codebook_id, signals=signals)
+            cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance,
+            codebook_id=self._codebook_id, signals=signals)
         return [Send(cycle.received), *self._announce(m.Phase.ESTIMATING, now_s)]
 
     def resend_signals(self, event: Timeout, now_s: float) -> list[Action]:
@@ -159,6 +188,7 @@ class BaseStationSteps(BaseStationGuards):
     def remove_user(self, event: Timeout, now_s: float) -> None:
         """Stop waiting for the user until it answers again."""
         self._users.remove(self._cycle.user)
+        self._instances.forget([self._cycle.user], now_s)
 
     def abandon(self, outcome: Outcome, now_s: float) -> list[Action]:
         """End the cycle without service."""

@@ -10,7 +10,9 @@ from rhs_isac_ros.protocol.events import (
     Action,
     CodebookOffered,
     PeersChanged,
+    Resumed,
     SettingsOffered,
+    StoodBy,
     Timeout,
 )
 from rhs_isac_ros.protocol.outcomes import Outcome
@@ -53,6 +55,10 @@ TABLE = (
     Row(source=(State.RESTING,), event=SettingsOffered,
         actions=(Steps.store_settings, Steps.apply_settings), restart_timeout=True),
     Row(event=SettingsOffered, actions=(Steps.store_settings,)),
+
+    # A newer base station serves, or has gone.
+    Row(event=StoodBy, actions=(Steps.forget_peers,), target=State.WAITING),
+    Row(source=(State.WAITING,), event=Resumed, actions=(Steps.skip_cycles,)),
 
     # Timeouts.
     Row(source=(State.RESTING,), event=Timeout, guard=Steps.not_ready,
@@ -101,6 +107,11 @@ TABLE = (
     Row(event=m.Ack, guard=Steps.too_often, outcome=Outcome.TOO_OFTEN),
     Row(event=m.Ack, guard=Steps.wrong_cycle, actions=(Steps.count_ack,),
         outcome=Outcome.WRONG_CYCLE),
+    # Of several nodes with the same number, the newest is served.
+    Row(event=m.Ack, guard=Steps.superseded, actions=(Steps.count_ack, Steps.log_superseded),
+        outcome=Outcome.SUPERSEDED),
+    Row(event=m.Ack, guard=Steps.supersedes, actions=(Steps.count_ack, Steps.own_number),
+        outcome=Outcome.SUPERSEDED),
     Row(event=m.Ack, guard=Steps.duplicate_ack, actions=(Steps.count_ack,),
         outcome=Outcome.DUPLICATE),
     Row(event=m.Ack, guard=Steps.crowded, actions=(Steps.count_ack,), outcome=Outcome.CROWDED),
@@ -135,6 +146,7 @@ TABLE = (
     # Feed signals.
     Row(event=m.FeedSignals, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
     Row(event=m.FeedSignals, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(event=m.FeedSignals, guard=Steps.wrong_instance, outcome=Outcome.WRONG_INSTANCE),
     Row(event=m.FeedSignals, guard=Steps.wrong_band, outcome=Outcome.WRONG_BAND),
     Row(event=m.FeedSignals, guard=Steps.duplicate_frame, outcome=Outcome.DUPLICATE),
     Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_frame,

@@ -69,7 +69,7 @@ class Channel(PlainRole):
         # The first draw factorises covariances. Draw once now, so that it does not delay the first
         # cycle.
         draw_multipath(scenario, 0, 1, np.random.default_rng(0))
-        # Cycle, user and position of the cycles begun.
+        # Cycle, user, instance and position of the cycles begun.
         self._begun: NewestDict[tuple[float, ...], None] = NewestDict(_MAX_REMEMBERED)
         # Configurations and beams of the current and of future cycles.
         self._configurations: NewestDict[tuple[int, m.Mode, int], np.ndarray] = NewestDict(
@@ -89,7 +89,7 @@ class Channel(PlainRole):
                 discarded = self._configurations.put(
                     (event.cycle_id, event.mode, event.band), event.analog)
             case m.Beam():
-                discarded = self._beams.put((event.cycle_id, event.user), event)
+                discarded = self._keep_beam(event)
             case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
                 discarded = self._pending.put(next(self._serial), event)
             case _:
@@ -97,9 +97,18 @@ class Channel(PlainRole):
         self.count(Outcome.OVERFLOW, discarded)
         return self._answer_pending(self._cycle) if self._cycle else []
 
+    def _keep_beam(self, beam: m.Beam) -> int:
+        """Store a beam unless another instance sent one for the cycle; return the overflow."""
+        key = beam.cycle_id, beam.user
+        known = self._beams.get(key)
+        if known and not m.same_instance(known.sender, beam.sender):
+            self.count(Outcome.WRONG_INSTANCE)
+            return 0
+        return self._beams.put(key, beam)
+
     def _begin(self, truth: m.GroundTruth) -> None:
         # A restarted base station may repeat a cycle id, with the user at another position.
-        key = truth.cycle_id, truth.user, *truth.position.tolist()
+        key = truth.cycle_id, truth.user, truth.sender, *truth.position.tolist()
         if key in self._begun:
             self.count(Outcome.DUPLICATE)
             return
@@ -122,6 +131,10 @@ class Channel(PlainRole):
                 continue
             if event.user != cycle.truth.user:
                 self.count(Outcome.WRONG_USER)
+                del self._pending[serial]
+                continue
+            if _is_from_other_instance(event, cycle.truth):
+                self.count(Outcome.WRONG_INSTANCE)
                 del self._pending[serial]
                 continue
             answer = self._answer(event, cycle)
@@ -148,8 +161,8 @@ class Channel(PlainRole):
             complex(pilot.symbol_re, pilot.symbol_im))
         feeds = feed_signals(self._scenario, band, applied[pilot.frame], elements)
         return m.FeedSignals(
-            cycle_id=pilot.cycle_id, user=pilot.user, band=band, frame=pilot.frame,
-            signals=feeds)
+            cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender, band=band,
+            frame=pilot.frame, signals=feeds)
 
     def _deliver(self, data: m.Data, cycle: _Cycle) -> m.Data | None:
         """Return the data within the capacity of the true channel; the rest is lost."""
@@ -164,3 +177,10 @@ class Channel(PlainRole):
         rate_bps = float(capacity(self._scenario, used, truth.position[None])[0])
         bits = min(data.bits, rate_bps * data.duration_s // 1)
         return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)
+
+
+def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
+    """Return whether another node than the one at the true position transmits."""
+    if isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK:
+        return False
+    return not m.same_instance(event.sender, truth.sender)

@@ -35,6 +35,18 @@ class PeersChanged:
     missing: tuple[str, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class StoodBy:
+    """The node stands by, because a newer one has the same role."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Resumed:
+    """The node serves again; ids of cycles used meanwhile are below `first_cycle_id`."""
+
+    first_cycle_id: int = 0
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorReady:
     """The estimator requested by `BuildEstimator` was built in `elapsed_s` seconds."""
@@ -52,8 +64,8 @@ class EstimatorFailed:
     reason: str
 
 
-Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | EstimatorReady
-         | EstimatorFailed)
+Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | StoodBy | Resumed
+         | EstimatorReady | EstimatorFailed)
 
 
 @dataclasses.dataclass(frozen=True)

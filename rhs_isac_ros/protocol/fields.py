@@ -100,8 +100,9 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
 
 @functools.cache
 def _fields(kind: type[Checkable]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-    """Return name and declaration of every field."""
-    return tuple((field.name, field.metadata) for field in dataclasses.fields(kind))
+    """Return name and declaration of every field whose values are restricted."""
+    return tuple((field.name, field.metadata) for field in dataclasses.fields(kind)
+                 if field.metadata or field.type is float)
 
 
 def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[str, int]) -> str:

@@ -46,9 +46,23 @@ class Phase(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Message:
-    """Base of all messages."""
+    """Base of all messages.
+
+    The adapter to ROS sets `sender` and `scenario_id` of the messages that a role sends, and drops
+    received messages of another scenario.
+
+    Attributes
+    ----------
+    sender
+        Instance of the node that sent the message: its start in nanoseconds since 1970; 0 if
+        unknown, as in messages sent by hand.
+    scenario_id
+        `Scenario.id` of that node; empty if unknown.
+    """
 
     cycle_id: int
+    sender: int = 0
+    scenario_id: str = ''
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return sizes that depend on the content, by symbol.
@@ -59,6 +73,11 @@ class Message:
             Sizes by symbol, as in `Scenario.sizes`.
         """
         return {}
+
+
+def same_instance(one: int, other: int) -> bool:
+    """Return whether two instances of a node are equal, or one of them is 0, which is unknown."""
+    return one == other or not one or not other
 
 
 def same(one: Message, other: Message) -> bool:
@@ -87,6 +106,7 @@ class Grant(Message):
     """Assignment of the cycle to a user."""
 
     user: int = number(1, _LAST_USER)
+    user_instance: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,6 +136,7 @@ class PilotRequest(Message):
     """Request to a user to send the pilots of a band."""
 
     user: int = number(1, _LAST_USER)
+    user_instance: int = 0
     band: int = index('N_B')
     n_frames: int = size('F')
 
@@ -136,6 +157,7 @@ class FeedSignals(Message):
     """Signals at the feeds for one pilot."""
 
     user: int = number(1, _LAST_USER)
+    user_instance: int = 0
     band: int = index('N_B')
     frame: int = index('F')
     signals: np.ndarray = array('N_SB K', complex)
@@ -146,6 +168,7 @@ class ReceivedSignals(Message):
     """Combined signals of a positioning phase."""
 
     user: int = number(1, _LAST_USER)
+    user_instance: int = 0
     codebook_id: str
     signals: np.ndarray = array('N_B N_SB F', complex)
 
@@ -155,6 +178,7 @@ class PositionEstimate(Message):
     """Estimate of the position of a user."""
 
     user: int = number(1, _LAST_USER)
+    user_instance: int = 0
     codebook_id: str
     position: np.ndarray = array('3', low=-1e6, high=1e6)
     covariance_m2: np.ndarray = array('3 3')

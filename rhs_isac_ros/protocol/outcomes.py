@@ -28,6 +28,9 @@ class Outcome(enum.Enum):
     # A message that belongs to no step of the current cycle, or that is rejected.
     WRONG_CYCLE = 'wrong_cycle', Kind.DROPPED
     WRONG_USER = 'wrong_user', Kind.DROPPED
+    WRONG_INSTANCE = 'wrong_instance', Kind.DROPPED
+    WRONG_SCENARIO = 'wrong_scenario', Kind.DROPPED
+    SUPERSEDED = 'superseded', Kind.DROPPED
     WRONG_BAND = 'wrong_band', Kind.DROPPED
     WRONG_CODEBOOK = 'wrong_codebook', Kind.DROPPED
     DUPLICATE = 'duplicate', Kind.DROPPED

@@ -193,7 +193,8 @@ class Positioner(PlainRole):
         self._no_fix_logged = False
         bound = float(crlb_of(model, estimate.mean[None])[0])
         return [Send(m.PositionEstimate(
-            cycle_id=received.cycle_id, user=received.user, codebook_id=received.codebook_id,
+            cycle_id=received.cycle_id, user=received.user,
+            user_instance=received.user_instance, codebook_id=received.codebook_id,
             position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
             crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))]
 

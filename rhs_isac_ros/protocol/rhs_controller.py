@@ -31,6 +31,8 @@ class RhsControllerSteps(StateMachine[State]):
         super().__init__(State.IDLE, {})
         self._codebooks: CodebookCache[Codebook] = CodebookCache()
         self._cycle_id = 0
+        # Instance that sent the beam applied last.
+        self._beam_sender = 0
         # The user of each granted cycle.
         self._granted: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
         # Cycle, band and codebook of the latest executed commands; the last one is the current
@@ -66,6 +68,11 @@ class RhsControllerSteps(StateMachine[State]):
         """Whether the cycle of a beam is known to be granted to another user."""
         return self._granted.get(event.cycle_id, event.user) != event.user
 
+    def wrong_instance(self, event: m.Beam, now_s: float) -> bool:
+        """Whether the beam of another sender is applied in the cycle."""
+        return (self.state is State.TRANSMITTING
+                and not m.same_instance(self._beam_sender, event.sender))
+
     def wrong_codebook(self, event: m.Beam, now_s: float) -> bool:
         """Whether a beam belongs to a codebook other than the one applied."""
         return event.codebook_id != self._codebooks.in_use
@@ -91,6 +98,7 @@ class RhsControllerSteps(StateMachine[State]):
 
     def apply_beam(self, event: m.Beam, now_s: float) -> list[Action]:
         """Report the configuration of a beam."""
+        self._beam_sender = event.sender
         return [Send(m.RhsConfiguration(
             cycle_id=event.cycle_id, mode=m.Mode.TRANSMISSION, band=event.band,
             codebook_id=event.codebook_id, analog=event.analog[None]))]
@@ -130,6 +138,7 @@ TABLE = (
 
     Row(event=m.Beam, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
     Row(event=m.Beam, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
+    Row(event=m.Beam, guard=Steps.wrong_instance, outcome=Outcome.WRONG_INSTANCE),
     Row(event=m.Beam, guard=Steps.wrong_codebook, actions=(Steps.log_unknown_codebook,),
         outcome=Outcome.WRONG_CODEBOOK),
     Row(source=(State.POSITIONING,), event=m.Beam, actions=(Steps.apply_beam,),

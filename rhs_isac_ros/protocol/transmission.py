@@ -60,7 +60,8 @@ class Transmission(PlainRole):
         self._codebooks: CodebookCache[None] = CodebookCache()
         # By cycle. `_counted` holds the cycles that the statistics already include.
         self._steered: NewestDict[int, _Steered] = NewestDict(_MAX_REMEMBERED)
-        self._truths: NewestDict[int, m.GroundTruth] = NewestDict(_MAX_REMEMBERED)
+        self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
+            _MAX_REMEMBERED)
         self._counted: NewestDict[int, None] = NewestDict(_MAX_REMEMBERED)
         self._quartiles = RunningQuartiles(len(_FIGURES))
 
@@ -74,7 +75,7 @@ class Transmission(PlainRole):
                 self._settings.latest = settings
                 return [*self._settings.apply()]
             case m.GroundTruth() if event.cycle_id:
-                self._truths.put(event.cycle_id, event)
+                self._truths.put((event.cycle_id, event.user, event.sender), event)
             case m.PositionEstimate() if event.codebook_id not in self._codebooks:
                 self.count(outcomes.Outcome.WRONG_CODEBOOK)
             case m.PositionEstimate():
@@ -96,6 +97,10 @@ class Transmission(PlainRole):
         known = self._steered.get(estimate.cycle_id)
         if known and m.same(known.estimate, estimate):
             self.count(outcomes.Outcome.DUPLICATE)
+            return [Send(known.beam)]
+        if known and not m.same_instance(known.estimate.sender, estimate.sender):
+            # The first estimate of a cycle stands. A repeated answer is due all the same.
+            self.count(outcomes.Outcome.WRONG_INSTANCE)
             return [Send(known.beam)]
         self._codebooks.take(estimate.codebook_id)
         bands = known.bands if known else self._bands()
@@ -121,9 +126,9 @@ class Transmission(PlainRole):
         if applied.band != beam.band:
             self.count(outcomes.Outcome.WRONG_BAND)
             return []
-        truth = self._truths.get(applied.cycle_id)
+        truth = self._truth_of(steered.estimate)
         result = CapacityReport(math.nan, math.nan)
-        if truth and truth.user == beam.user:
+        if truth:
             used = Beam(applied.analog[0], beam.digital, beam.band)
             result = capacity_report(self._scenario, used, truth.position, steered.bands)
         report = m.Capacity(
@@ -132,6 +137,13 @@ class Transmission(PlainRole):
             perfect_bps=result.perfect_bps, loss_bps=result.loss_bps,
             loss_percent=result.loss_percent, at_estimate_bps=steered.at_estimate_bps)
         return [Send(report), *self._summarize(report)]
+
+    def _truth_of(self, estimate: m.PositionEstimate) -> m.GroundTruth | None:
+        """Return the true position of the node whose position was estimated, if known."""
+        found = [truth for (cycle_id, user, instance), truth in self._truths.items()
+                 if (cycle_id, user) == (estimate.cycle_id, estimate.user)
+                 and m.same_instance(instance, estimate.user_instance)]
+        return found[-1] if found else None
 
     def _summarize(self, report: m.Capacity) -> list[Action]:
         """Add a report to the statistics, once for each cycle, and return them."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from rhs_isac_ros.model.mobility import Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, LogMessage, PeersChanged, Send, Timeout
+from rhs_isac_ros.protocol.instance import started
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
@@ -51,9 +52,12 @@ class UserSteps(StateMachine[State]):
     """The memory of a user, and the guards and actions of its table."""
 
     def __init__(
-            self, user: int, mobility: Mobility, timeouts_s: Mapping[State, float]) -> None:
+            self, user: int, mobility: Mobility, timeouts_s: Mapping[State, float],
+            instance: int = 0) -> None:
         super().__init__(State.DISCONNECTED, timeouts_s)
-        self.user = user
+        self.user, self._instance = user, instance
+        # Describes the node with the same number that is served instead; empty if there is none.
+        self._conflict = ''
         self._mobility = mobility
         self._cycle_id = 0
         # Cycle and band of the last pilot request answered.
@@ -76,6 +80,10 @@ class UserSteps(StateMachine[State]):
         return m.GroundTruth(
             cycle_id=cycle_id, user=self.user, position=position, velocity=velocity)
 
+    def status(self) -> Mapping[str, str]:
+        """Return ``conflict.user`` while another node with the same number is served."""
+        return {'conflict.user': self._conflict} if self._conflict else {}
+
     # Guards
 
     def peers_missing(self, event: PeersChanged, now_s: float) -> bool:
@@ -94,6 +102,18 @@ class UserSteps(StateMachine[State]):
     def other_user_granted(self, event: m.Grant, now_s: float) -> bool:
         """Whether the acknowledged cycle is granted to another user."""
         return event.user != self.user and event.cycle_id == self._cycle_id
+
+    def other_instance_granted(self, event: m.Grant, now_s: float) -> bool:
+        """Whether the acknowledged cycle is granted to another node with the same number."""
+        return self.other_instance(event, now_s) and event.cycle_id == self._cycle_id
+
+    def other_instance(self, event: m.Grant | m.PilotRequest, now_s: float) -> bool:
+        """Whether a message is addressed to another node with the same number."""
+        return not m.same_instance(event.user_instance, self._instance)
+
+    def not_granted(self, event: m.Data, now_s: float) -> bool:
+        """Whether this node was not granted the cycle of the data."""
+        return event.cycle_id not in self._truths
 
     def wrong_cycle(self, event: m.Grant | m.PilotRequest | m.Data, now_s: float) -> bool:
         """Whether a message belongs to a cycle other than the one acknowledged last."""
@@ -130,6 +150,13 @@ class UserSteps(StateMachine[State]):
         """Log that the base station is active again."""
         return [LogMessage('beacons resumed')]
 
+    def log_other_instance(self, event: m.Grant, now_s: float) -> list[Action]:
+        """Log once that another node with the same number is served."""
+        text = (f'user {self.user}: two nodes have this number; the other one, '
+                f'{started(event.user_instance)}, is served')
+        known, self._conflict = self._conflict, text
+        return [] if known else [LogMessage(text, warning=True)]
+
     def acknowledge(self, event: m.Beacon, now_s: float) -> list[Action]:
         """Answer a beacon."""
         self._cycle_id = event.cycle_id
@@ -138,6 +165,7 @@ class UserSteps(StateMachine[State]):
 
     def publish_position(self, event: m.Grant | m.PilotRequest, now_s: float) -> list[Action]:
         """Publish the position that applies to the cycle."""
+        self._conflict = ''
         truth = self._truths.get(event.cycle_id) or self.ground_truth(now_s, event.cycle_id)
         self._truths.put(event.cycle_id, truth)
         return [Send(truth)]
@@ -192,6 +220,10 @@ TABLE = (
     Row(source=(State.ACKNOWLEDGED,), event=m.Grant, guard=Steps.other_user_granted,
         target=State.LISTENING),
     Row(event=m.Grant, guard=Steps.other_user),
+    Row(source=(State.ACKNOWLEDGED,), event=m.Grant, guard=Steps.other_instance_granted,
+        actions=(Steps.log_other_instance,), target=State.LISTENING, outcome=Outcome.SUPERSEDED),
+    Row(event=m.Grant, guard=Steps.other_instance, actions=(Steps.log_other_instance,),
+        outcome=Outcome.SUPERSEDED),
     Row(event=m.Grant, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
     Row(event=m.Grant, guard=Steps.late_grant, outcome=Outcome.LATE_GRANT),
     # The base station may wait for longer than the user did.
@@ -202,6 +234,7 @@ TABLE = (
     Row(source=(State.GRANTED,), event=m.Grant),
 
     Row(event=m.PilotRequest, guard=Steps.other_user),
+    Row(event=m.PilotRequest, guard=Steps.other_instance),
     Row(event=m.PilotRequest, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
     # A request that overtakes the grant implies it.
     Row(source=(State.ACKNOWLEDGED,), event=m.PilotRequest, guard=Steps.new_request,
@@ -216,6 +249,7 @@ TABLE = (
     Row(event=m.Data, guard=Steps.not_delivered_downlink),
     Row(event=m.Data, guard=Steps.other_user),
     Row(event=m.Data, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+    Row(event=m.Data, guard=Steps.not_granted),
     Row(source=(State.GRANTED,), event=m.Data, actions=(Steps.send_uplink,),
         target=State.LISTENING),
     Row(source=(State.LISTENING,), event=m.Data, actions=(Steps.send_uplink,),
@@ -234,6 +268,8 @@ class User(UserSteps):
         The user's position as a function of time.
     timeouts_s
         Timeouts by state [s].
+    instance
+        Instance of the node; only the instance that a grant names answers it.
     """
 
     SENDS = (m.Ack, m.GroundTruth, m.Pilot, m.Data)

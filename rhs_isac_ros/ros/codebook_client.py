@@ -1,20 +1,23 @@
 """A client that fetches the codebook from the parameters of the optimizer."""
 
+import contextlib
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.log_once import LogOnce
 from rhs_isac_ros.ros.parameters import CODEBOOK
 from rhs_isac_ros.ros.timers import steady_timer
@@ -27,8 +30,10 @@ _RESPONSE_TIMEOUT_S = 2.0
 class CodebookClient:
     """Fetches the codebook from the parameters of the optimizer whenever it changes.
 
-    A message on the latched topic only triggers a request, including after a restart of the
-    optimizer; the codebook itself comes from the parameter service.
+    A message on the latched topic announces the codebook and triggers a request to the parameter
+    service. Two optimizers have the same services, and either may answer. The announced codebook,
+    whose id proves its content, therefore replaces a response with another codebook or a missing
+    response. The optimizers agree on which of them announces; see `Presences`.
 
     Parameters
     ----------
@@ -52,8 +57,9 @@ class CodebookClient:
             GetParameters, f'{topics.OPTIMIZER_NODE}/get_parameters')
         # Serial numbers of announcements. A response is stale if its request was sent before the
         # latest announcement.
-        self._announced, self._requested, self._fetched = 1, 0, 0
-        self._requested_s = -math.inf
+        self._announced, self._requested, self._fetched = 0, 0, 0
+        self._announced_s = math.inf
+        self._announcement: Codebook | None = None
         self._log_once = LogOnce(node)
         self._codebook_id = ''
         node.create_subscription(
@@ -63,10 +69,36 @@ class CodebookClient:
         self._timer = steady_timer(node, _RETRY_S, self._request)
 
     def _on_announcement(self, content: bytes) -> None:
-        # Ignore the content, which may be malformed. Send the request even if the id is unchanged,
-        # because a response with a withdrawn codebook may be in transit.
+        try:
+            message = deserialize_message(content, ros.Codebook)
+            codebook = convert.codebook_from_ros(message)
+        # Anything may be published on the topic, and rclpy raises a RuntimeError without a public
+        # class.
+        except (CodebookError, RuntimeError, ValueError):
+            return
+        if message.codebook_id != codebook.id or not self._fits(message, codebook):
+            return
+        # Send the request even if the id is unchanged, because a response with a withdrawn
+        # codebook may be in transit.
+        self._announcement = codebook
         self._announced += 1
+        self._announced_s = time.monotonic()
         self._timer.reset()
+
+    def _fits(self, message: ros.Codebook, codebook: Codebook) -> bool:
+        """Return whether a codebook fits the scenario, or log that it does not."""
+        try:
+            codebook.check(self._scenario)
+            if message.scenario_id not in ('', self._scenario.id):
+                raise CodebookError(
+                    f'scenario {message.scenario_id}, expected {self._scenario.id}')
+        except CodebookError as error:
+            self._log_once.error(
+                'codebook', f'codebook of {self._optimizer} rejected: {error}',
+                repeat_if_changed=True)
+            return False
+        self._log_once.clear('codebook')
+        return True
 
     def _on_liveliness(self, event: Any) -> None:
         present = event.alive_count > 0 or self._is_in_this_process()
@@ -103,29 +135,28 @@ class CodebookClient:
         if self._fetched == self._announced:
             self._timer.cancel()
             return
-        now_s = time.monotonic()
-        is_pending = (self._requested == self._announced
-                      and now_s - self._requested_s < _RESPONSE_TIMEOUT_S)
-        if not is_pending and self._client.service_is_ready():
-            self._requested, self._requested_s = self._announced, now_s
+        if time.monotonic() - self._announced_s > _RESPONSE_TIMEOUT_S:
+            self._use(())
+        elif self._requested != self._announced and self._client.service_is_ready():
+            self._requested = self._announced
             future = self._client.call_async(GetParameters.Request(names=_NAMES))
             future.add_done_callback(functools.partial(self._on_response, self._announced))
 
     def _on_response(self, serial: int, future: Any) -> None:
         values = future.result().values if future.exception() is None else ()
-        if serial != self._announced or len(values) != len(_NAMES):
-            return
-        self._fetched = serial
-        try:
-            codebook = Codebook.from_parameters(
+        if serial == self._announced:
+            self._use(values)
+
+    def _use(self, values: Sequence[ParameterValue]) -> None:
+        """Use the codebook of a response, if it is the announced one, or that itself."""
+        self._fetched = self._announced
+        assert self._announcement
+        codebook = self._announcement
+        # An invalid or incomplete response is not the announced codebook.
+        with contextlib.suppress(CodebookError, ValueError):
+            fetched = Codebook.from_parameters(
                 dict(zip(_NAMES, map(parameter_value_to_python, values), strict=True)))
-            codebook.check(self._scenario)
-        except CodebookError as error:
-            self._log_once.error(
-                'codebook', f'codebook of {self._optimizer} rejected: {error}',
-                repeat_if_changed=True)
-            return
-        self._log_once.clear('codebook')
+            codebook = fetched if fetched.id == codebook.id else codebook
         if codebook.id != self._codebook_id:
             self._codebook_id = codebook.id
             self._on_codebook(codebook)

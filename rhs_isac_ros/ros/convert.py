@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import yaml
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
 from rclpy.serialization import deserialize_message
@@ -19,6 +20,7 @@ from std_msgs.msg import Header
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
+from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros.topics import MAP_FRAME, NAMES
 
 _Codec = Callable[[Any], Any]
@@ -29,13 +31,16 @@ def ros_type(kind: type[Message]) -> Any:
     return getattr(ros, kind.__name__)
 
 
-def to_ros(message: Message, stamp: Time | None) -> Any:
+def to_ros(
+        message: Message, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
     """Convert a message to ROS.
 
     Parameters
     ----------
     stamp
         Time for the header; None: zero.
+    identity
+        Sender and id of the scenario; by default those of the message.
 
     Returns
     -------
@@ -49,6 +54,8 @@ def to_ros(message: Message, stamp: Time | None) -> Any:
     if stamp is not None:
         result.header.stamp = stamp
     result.header.frame_id = MAP_FRAME
+    if identity is not None:
+        result.sender, result.scenario_id = identity
     return result
 
 
@@ -74,27 +81,39 @@ def from_ros(kind: type[Message], message: Any) -> Message:
 def from_bytes(kind: type[Message], serialized: bytes) -> Message:
     """Convert a serialized message (CDR), as a raw subscription receives it.
 
-    Other subscriptions of rclpy silently drop what they cannot deserialize.
-
     Raises
     ------
     MessageError
         If the bytes are not a message of `ros_type`, or for the reasons given in `from_ros`.
     """
+    return from_ros(kind, deserialize(kind, serialized))
+
+
+def deserialize(kind: type[Message], serialized: bytes) -> Any:
+    """Return the ROS message that bytes (CDR) contain, as a raw subscription receives them.
+
+    Other subscriptions of rclpy silently drop what they cannot deserialize.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are not a message of `ros_type`.
+    """
     try:
-        message = deserialize_message(serialized, ros_type(kind))
+        return deserialize_message(serialized, ros_type(kind))
     # rclpy raises a RuntimeError without a public class; a string may be invalid UTF-8.
     except (RuntimeError, ValueError) as error:
         raise MessageError(
             f'{kind.__name__}: invalid CDR data of {len(serialized)} bytes: '
             f'{str(error).splitlines()[0]}') from None
-    return from_ros(kind, message)
 
 
-def codebook_to_ros(codebook: Codebook, stamp: Time) -> ros.Codebook:
-    """Convert a codebook to ROS."""
+def codebook_to_ros(
+        codebook: Codebook, stamp: Time, sender: int = 0, scenario_id: str = '') -> ros.Codebook:
+    """Convert a codebook to ROS; `sender` and `scenario_id` are as in `Message`."""
     return ros.Codebook(
-        header=Header(stamp=stamp, frame_id=MAP_FRAME), codebook_id=codebook.id,
+        header=Header(stamp=stamp, frame_id=MAP_FRAME), sender=sender, scenario_id=scenario_id,
+        codebook_id=codebook.id,
         analog=_encode_real(codebook.analog), digital=_encode_complex(codebook.digital),
         average_crlb_m2=float(codebook.average_crlb_m2))
 
@@ -114,6 +133,30 @@ def codebook_from_ros(message: ros.Codebook) -> Codebook:
     except ValueError as error:
         raise MessageError(f'Codebook: {error}') from None
     return Codebook(analog, digital, message.average_crlb_m2)
+
+
+def presence_to_ros(presence: Presence, stamp: Time) -> ros.Presence:
+    """Convert an announcement to ROS."""
+    return ros.Presence(
+        header=Header(stamp=stamp), sender=presence.sender, scenario_id=presence.scenario_id,
+        role=presence.role, node=presence.node,
+        scenario=yaml.safe_dump(dict(presence.scenario), sort_keys=False))
+
+
+def presence_from_ros(message: ros.Presence) -> Presence:
+    """Convert an announcement from ROS.
+
+    Raises
+    ------
+    MessageError
+        If the scenario is not a mapping.
+    yaml.YAMLError
+        If the scenario is not YAML.
+    """
+    scenario = yaml.safe_load(message.scenario)
+    if not isinstance(scenario, dict):
+        raise MessageError('Presence.scenario: expected a mapping of field names to values')
+    return Presence(message.sender, message.scenario_id, message.role, message.node, scenario)
 
 
 def pose(estimate: PositionEstimate, stamp: Time) -> PoseWithCovarianceStamped:

@@ -79,10 +79,20 @@ class PeerMonitor:
             self, node: Node, required: Mapping[str, Endpoints],
             on_change: Callable[[tuple[str, ...]], None]) -> None:
         self._node, self._required, self._on_change = node, required, on_change
-        self._absent_before: frozenset[str] = frozenset(required)
+        self._timer = steady_timer(node, _POLL_S, self._poll)
+        self.restart()
+
+    def stop(self) -> None:
+        """Report no more changes."""
+        self._timer.cancel()
+
+    def restart(self) -> None:
+        """Report the missing roles anew, as after the start."""
+        self._absent_before: frozenset[str] = frozenset(self._required)
         self._reported: tuple[str, ...] | None = None
         self._polls = 0
-        self._timer = steady_timer(node, _POLL_S, self._poll)
+        self._timer.timer_period_ns = int(1e9 * _POLL_S)
+        self._timer.reset()
 
     def _poll(self) -> None:
         absent = frozenset(role for role, endpoints in self._required.items()

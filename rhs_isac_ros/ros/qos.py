@@ -22,6 +22,11 @@ LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+# For `LATCHED` values of many publishers, of which a subscription keeps one each.
+PRESENCES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
 # For a current value whose publisher must remain alive. Subscribers are notified within a second
 # when the publisher terminates, long before discovery times out.
 LATCHED_WITH_LEASE = QoSProfile(

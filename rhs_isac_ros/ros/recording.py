@@ -40,6 +40,7 @@ def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
              for kind, name in topics.NAMES.items()}
     found[topics.POSITION] = PoseWithCovarianceStamped, qos.EXCHANGE
     found[topics.CODEBOOK] = ros.Codebook, qos.LATCHED
+    found[topics.PRESENCE] = ros.Presence, qos.PRESENCES
     found[topics.DIAGNOSTICS] = DiagnosticArray, qos.EXCHANGE
     return found
 

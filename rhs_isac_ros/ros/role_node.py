@@ -1,5 +1,6 @@
 """The adapter between a role of the protocol and ROS 2."""
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
@@ -18,6 +19,8 @@ from rhs_isac_ros.protocol.events import (
     SettingsOffered,
     Timeout,
 )
+from rhs_isac_ros.protocol.instance import started
+from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
@@ -26,8 +29,12 @@ from rhs_isac_ros.ros.log_once import LogOnce
 from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
+from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
 from rhs_isac_ros.ros.subscriptions import subscribe
 from rhs_isac_ros.ros.timers import steady_timer
+
+# Maximum number of senders whose wrong scenario is logged, which bounds the log.
+_MAX_LOGGED = 16
 
 _RoleT = TypeVar('_RoleT', bound=Role)
 
@@ -50,6 +57,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         The role; set by `start`.
     scenario
         Scenario of the parameter ``scenario_file``.
+    instance
+        Instance of the node; see `Message.sender`.
 
     Raises
     ------
@@ -60,15 +69,23 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """
 
     role: _RoleT
+    # Whether only one node may serve in the role, so that others stand by.
+    is_unique = True
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(executable, name, **node_options)
+        self._executable = executable
         self.scenario = scenario_of(self.values)
         if self.scenario.n_frames > qos.EXCHANGE.depth:
             raise ParameterError(
                 f'scenario_file: n_frames {self.scenario.n_frames}, expected at most '
                 f'{qos.EXCHANGE.depth}, the depth of the topics')
         self._sizes = self.scenario.sizes
+        self.instance = new_instance()
+        self._identity = self.instance, self.scenario.id
+        self._foreign: set[int] = set()
+        self._presence: PresenceClient | None = None
+        self._is_advertised = self._stands_by = False
         self._role_publishers: dict[type[m.Message], Publisher] = {}
         self._subscribed: set[type[m.Message]] = set()
         self._log_once = LogOnce(self)
@@ -91,12 +108,19 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if advertise:
             self.advertise()
         self._diagnostics = Diagnostics(self, self.report)
+        if self.is_unique:
+            self._presence = PresenceClient(
+                self, self._executable, self.instance, self.scenario, self._on_presence)
         if subscribe:
             self.subscribe()
 
     def advertise(self) -> None:
-        """Create the publishers of the role; the graph then shows that the role is present."""
-        for kind in self.role.SENDS:
+        """Create the publishers of the role; the graph then shows that the role is present.
+
+        A node that stands by creates them when it resumes.
+        """
+        self._is_advertised = True
+        for kind in () if self._stands_by else self.role.SENDS:
             if kind not in self._role_publishers:
                 self._role_publishers[kind] = self.create_publisher(
                     convert.ros_type(kind), topics.NAMES[kind], qos.profile_for(kind))
@@ -112,9 +136,37 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
         state = self.role.state
-        return self._statistics.report(
+        report = self._statistics.report(
             '' if state is None else state.value, self.role.counters,
             state in self.role.BLOCKED_STATES, self.role.status())
+        own = self._presence.conflicts() if self._presence else {}
+        values = {**report.values, **own}
+        conflicts = [text for key, text in values.items() if key.startswith('conflict.')]
+        if not conflicts:
+            return report
+        return dataclasses.replace(
+            report, fault=True, summary='; '.join(conflicts), values=values)
+
+    def stand_by(self) -> None:
+        """Handle that a newer node has the role; nodes with more than a role override this."""
+
+    def resume(self) -> None:
+        """Handle that the node serves again."""
+
+    def _on_presence(self, stands_by: bool) -> None:
+        if stands_by == self._stands_by:
+            return
+        self._stands_by = stands_by
+        if stands_by:
+            self.stand_by()
+            # Subscriptions remain: the executor may hold messages for them. They are ignored.
+            for publisher in self._role_publishers.values():
+                self.destroy_publisher(publisher)
+            self._role_publishers.clear()
+        else:
+            if self._is_advertised:
+                self.advertise()
+            self.resume()
 
     def on_settings_changed(self, settings: Any) -> None:
         """Pass new settings to the role."""
@@ -142,14 +194,20 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self._set_timer(deadline_s - now_s, deadline_s)
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a valid message and return True, or log its error and return False."""
+        """Publish a valid message and return True, or log its error and return False.
+
+        A node that stands by publishes nothing.
+        """
+        if self._stands_by:
+            return False
         try:
             m.check(message, self._sizes)
         except m.MessageError as error:
             self._log_error('not sent', error)
             return False
         stamp = self.get_clock().now().to_msg()
-        self._role_publishers[type(message)].publish(convert.to_ros(message, stamp))
+        self._role_publishers[type(message)].publish(
+            convert.to_ros(message, stamp, self._identity))
         return True
 
     def execute(self, action: Action) -> None:
@@ -166,14 +224,28 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         def receive(serialized: bytes) -> None:
             self._statistics.count_received(kind)
             try:
-                message = convert.from_bytes(kind, serialized)
+                ros_message = convert.deserialize(kind, serialized)
+                if ros_message.scenario_id not in ('', self.scenario.id):
+                    self._drop_foreign(ros_message)
+                    return
+                message = convert.from_ros(kind, ros_message)
                 m.check(message, self._sizes)
             except m.MessageError as error:
                 self.role.counters['malformed'] += 1
                 self._log_error('dropped', error)
                 return
-            self.dispatch(message)
+            if not self._stands_by:
+                self.dispatch(message)
         return receive
+
+    def _drop_foreign(self, message: Any) -> None:
+        """Count a message of another scenario, and log the first of each sender."""
+        self.role.counters[Outcome.WRONG_SCENARIO.value] += 1
+        if message.sender not in self._foreign and len(self._foreign) < _MAX_LOGGED:
+            self._foreign.add(message.sender)
+            self.get_logger().warning(  # type: ignore[no-untyped-call]
+                f'{type(message).__name__} dropped: sent with scenario {message.scenario_id}, '
+                f'expected {self.scenario.id}; sender {started(message.sender)}')
 
     def _handle(self, event: Event, now_s: float) -> None:
         start_s = time.perf_counter()

@@ -28,6 +28,7 @@ POSITION = 'position'
 CODEBOOK = 'codebook'
 DIAGNOSTICS = 'diagnostics'
 MARKERS = 'markers'
+PRESENCE = 'presence'
 
 # Estimated and true path of a user.
 PATH = 'users/user_{user}/path'

@@ -70,14 +70,15 @@ def permissions(users: int) -> dict[str, Permissions]:
     """
     diagnostics = (topics.DIAGNOSTICS,)
     nodes = {
-        'bs': _with_codebook(_of_messages(BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)),
-        'channel': _of_messages(Channel.SENDS, Channel.RECEIVES, diagnostics),
-        'optimizer': _of_messages((), (), (*diagnostics, topics.CODEBOOK)),
-        'positioner': _with_codebook(_of_messages(
+        'bs': _with_codebook(_unique(
+            BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)),
+        'channel': _unique(Channel.SENDS, Channel.RECEIVES, diagnostics),
+        'optimizer': _unique((), (), (*diagnostics, topics.CODEBOOK)),
+        'positioner': _with_codebook(_unique(
             Positioner.SENDS, Positioner.RECEIVES, (*diagnostics, topics.POSITION))),
-        'rhs_controller': _with_codebook(_of_messages(
+        'rhs_controller': _with_codebook(_unique(
             RhsController.SENDS, RhsController.RECEIVES, diagnostics)),
-        'transmission': _with_codebook(_of_messages(
+        'transmission': _with_codebook(_unique(
             Transmission.SENDS, Transmission.RECEIVES, diagnostics)),
         'visualizer': _of_messages((), SCENE_RECEIVES, (topics.MARKERS, *_paths(users))),
         **{f'user_{number}': _of_messages(User.SENDS, User.RECEIVES, diagnostics)
@@ -93,6 +94,15 @@ def _of_messages(
     return Permissions(
         publish=(*sorted([*(topics.NAMES[kind] for kind in sends), *publishes]), *_RCLPY_TOPICS),
         subscribe=tuple(sorted(topics.NAMES[kind] for kind in receives)))
+
+
+def _unique(
+        sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
+        publishes: Iterable[str]) -> Permissions:
+    """Return the permissions of `_of_messages`, and those to announce and detect a second node."""
+    permissions = _of_messages(sends, receives, (*publishes, topics.PRESENCE))
+    return permissions._replace(
+        subscribe=tuple(sorted([*permissions.subscribe, topics.PRESENCE])))
 
 
 def _with_codebook(permissions: Permissions) -> Permissions:
@@ -114,7 +124,7 @@ def _operator(nodes: Iterable[str], users: int) -> Permissions:
     The node names of the command-line tools are fixed; those of ``ros2`` end in a number.
     """
     readable = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
-                topics.POSITION, *_paths(users)}
+                topics.POSITION, topics.PRESENCE, *_paths(users)}
     return Permissions(
         publish=_RCLPY_TOPICS, subscribe=(*sorted(readable), *_RCLPY_TOPICS),
         reply=(*(service.replace('~', PUSHER_NODE) for service in _OFFERED_SERVICES),

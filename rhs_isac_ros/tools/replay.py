@@ -32,8 +32,8 @@ from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, reco
 from rhs_isac_ros.tools.republish import RepublishError, republish, topic_prefix
 
 # Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
-# would contradict those of the running nodes.
-_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS})
+# and announcements of nodes would contradict those of the running nodes.
+_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,8 +17,10 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
     PeersChanged,
+    Resumed,
     Send,
     SettingsOffered,
+    StoodBy,
     Timeout,
 )
 from rhs_isac_ros.protocol.outcomes import Kind, Outcome
@@ -31,7 +33,8 @@ from rhs_isac_ros.protocol.user_scheduler import POLICIES
 ROLES = {
     'bs': types.SimpleNamespace(
         machine=bs.BaseStation, initial=State.WAITING, final=State.BEACONING,
-        endless={State.WAITING}, events={Timeout, CodebookOffered, PeersChanged, SettingsOffered}),
+        endless={State.WAITING},
+        events={Timeout, CodebookOffered, PeersChanged, SettingsOffered, StoodBy, Resumed}),
     'user': types.SimpleNamespace(
         machine=user.User, initial=user.State.DISCONNECTED, final=user.State.NO_BEACON,
         endless={user.State.DISCONNECTED, user.State.NO_BEACON}, events={Timeout, PeersChanged}),
@@ -208,7 +211,8 @@ def test_rows_that_drop_messages_precede_rows_of_single_states(name):
             earlier = [other for other in table[:number] if other.event is row.event]
             acting = [other for other in earlier if other.source is not ANY]
             # A grant to another user ends the wait of this one, before any refusal.
-            assert {other.guard for other in acting} <= {user.UserSteps.other_user_granted}
+            assert {other.guard for other in acting} <= {
+                user.UserSteps.other_user_granted, user.UserSteps.other_instance_granted}
 
 
 # The machines
@@ -292,6 +296,11 @@ def random_event(rng, subject, example, codebooks):
         return CodebookOffered(codebooks[rng.integers(3)])
     if kind is PeersChanged:
         return PeersChanged(('channel',) if rng.random() < 0.3 else ())
+    if kind is StoodBy:
+        # Otherwise, few cycles would get far.
+        return StoodBy() if rng.random() < 0.1 else Timeout()
+    if kind is Resumed:
+        return Resumed(int(rng.integers(1000)))
     if kind is SettingsOffered:
         return SettingsOffered(settings(policy=rng.choice(POLICIES)))
     cycle_id = subject._cycle.id if isinstance(subject, bs.BaseStation) else subject._cycle_id

@@ -23,7 +23,7 @@ STAMP = Time(sec=12, nanosec=345)
 KINDS = list(topics.NAMES)
 FILES = Path(__file__).resolve().parents[2] / 'msg_defs' / 'msg'
 # Types that are parts of messages, and a message outside the protocol.
-OTHER_TYPES = {'RealArray', 'ComplexArray', 'Codebook'}
+OTHER_TYPES = {'Presence', 'RealArray', 'ComplexArray', 'Codebook'}
 ENUMS = {'RhsConfiguration': [m.Mode], 'Data': [m.Direction, m.Stage], 'ProtocolState': [m.Phase]}
 
 

@@ -1,0 +1,161 @@
+"""Which instance of a role serves, and which stand by."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.instance import started
+from rhs_isac_ros.protocol.newest import NewestDict
+
+# While two nodes are in conflict, both announce themselves with this period, and a node that has
+# been silent for the longer time is gone [s].
+PERIOD_S, SILENCE_S = 0.3, 1.5
+# Maximum number of nodes in conflict with this one, which bounds the memory.
+_MAX_OTHERS = 64
+# Maximum number of scenarios that are logged, which bounds the log.
+_MAX_LOGGED = 16
+# Maximum deviation of the clocks of two hosts; an instance that starts later is a forgery [ns].
+_MAX_AHEAD_NS = 3600 * 10**9
+
+
+@dataclasses.dataclass(frozen=True)
+class Presence:
+    """The announcement of a node.
+
+    Attributes
+    ----------
+    sender
+        Instance of the node: its start in nanoseconds since 1970.
+    node
+        Fully qualified name.
+    scenario
+        Fields of the scenario, as `Scenario.fields` returns them.
+    """
+
+    sender: int
+    scenario_id: str
+    role: str
+    node: str
+    scenario: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        """Return name and start of the node, for log messages."""
+        return f'{self.node}, {started(self.sender)}'
+
+
+class Presences:
+    """Decides from the announcements of other nodes whether a node serves or stands by.
+
+    Of the nodes with the same role and scenario, the one that started last serves, as with the
+    fencing tokens of leases: a restarted node serves at once, and the older node resumes when the
+    newer one has gone. Nodes of another scenario are reported and otherwise ignored.
+
+    Nodes announce themselves once. Only nodes in conflict do so repeatedly, so that the absence of
+    a node is noticed without load in a correct network.
+
+    Parameters
+    ----------
+    own
+        Announcement of the node itself.
+    """
+
+    def __init__(self, own: Presence) -> None:
+        self.own = own
+        # By instance: nodes in conflict with this one, and the time of their last announcement.
+        self._others: NewestDict[int, tuple[Presence, float]] = NewestDict(_MAX_OTHERS)
+        self._superseded_by: Presence | None = None
+        self._serves_instead_of: Presence | None = None
+        # By id: the differences of other scenarios.
+        self._scenarios: dict[str, str] = {}
+        self._n_logged = 0
+
+    def add(self, other: Presence, now_ns: int, now_s: float) -> list[LogMessage]:
+        """Process an announcement.
+
+        Parameters
+        ----------
+        now_ns
+            Time since 1970 [ns].
+        now_s
+            Time on any monotonic clock [s].
+        """
+        own = self.own
+        is_stranger = bool(other.scenario_id) and other.scenario_id != own.scenario_id
+        if other.sender in (0, own.sender) or other.sender > now_ns + _MAX_AHEAD_NS or not (
+                is_stranger or other.role == own.role):
+            return []
+        is_new = other.sender not in self._others
+        self._others.put(other.sender, (other, now_s))
+        if is_stranger:
+            return self._report_scenario(other)
+        return self._update() if is_new else []
+
+    def expire(self, now_s: float) -> list[LogMessage]:
+        """Forget nodes that have been silent."""
+        silent = [sender for sender, (_, last_s) in self._others.items()
+                  if now_s - last_s > SILENCE_S]
+        for sender in silent:
+            del self._others[sender]
+        present = {other.scenario_id for other, _ in self._others.values()}
+        ended = self._scenarios.keys() - present
+        for scenario_id in ended:
+            del self._scenarios[scenario_id]
+        return [*(LogMessage(f'no node with scenario {scenario_id} is left')
+                  for scenario_id in sorted(ended)), *self._update()]
+
+    @property
+    def stands_by(self) -> bool:
+        """Whether a newer node has the same role."""
+        return self._superseded_by is not None
+
+    @property
+    def in_conflict(self) -> bool:
+        """Whether any node is in conflict with this one."""
+        return bool(self._others)
+
+    def conflicts(self) -> dict[str, str]:
+        """Return a description of each conflict, by key of the diagnostics."""
+        found = {f'conflict.{scenario_id}': text
+                 for scenario_id, text in self._scenarios.items()}
+        if self._superseded_by:
+            found['conflict.role'] = f'stands by for {self._superseded_by}'
+        elif self._serves_instead_of:
+            found['conflict.role'] = f'serves instead of {self._serves_instead_of}'
+        return found
+
+    def _rivals(self) -> list[Presence]:
+        """Return the other nodes of the same role and scenario, the newest first."""
+        return sorted((other for other, _ in self._others.values()
+                       if other.role == self.own.role
+                       and other.scenario_id in ('', self.own.scenario_id)),
+                      key=lambda other: -other.sender)
+
+    def _update(self) -> list[LogMessage]:
+        """Choose the node that serves, and log a change."""
+        rivals, role = self._rivals(), self.own.role
+        newest = rivals[0] if rivals and rivals[0].sender > self.own.sender else None
+        previous, self._superseded_by = self._superseded_by, newest
+        older = rivals[0] if rivals and not newest else None
+        previous_older, self._serves_instead_of = self._serves_instead_of, older
+        if newest and newest != previous:
+            return [LogMessage(f'two nodes act as {role}: this one stands by for {newest}',
+                               warning=True)]
+        if older and not previous_older:
+            return [LogMessage(f'two nodes act as {role}: this one serves instead of {older}',
+                               warning=True)]
+        if previous and not newest:
+            return [LogMessage(f'{previous.node} has gone; this node acts as {role} again')]
+        return []
+
+    def _report_scenario(self, other: Presence) -> list[LogMessage]:
+        if other.scenario_id in self._scenarios:
+            return []
+        own, theirs = self.own.scenario, other.scenario
+        differences = [f'{name} {theirs.get(name)} instead of {own.get(name)}'
+                       for name in {**own, **theirs} if theirs.get(name) != own.get(name)]
+        text = (f'{other.node} uses another scenario, {other.scenario_id}, with '
+                f'{"; ".join(differences) or "unknown differences"}; its messages are dropped')
+        self._scenarios[other.scenario_id] = text
+        self._n_logged += 1
+        return [LogMessage(text, warning=True)] if self._n_logged <= _MAX_LOGGED else []

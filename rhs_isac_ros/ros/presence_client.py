@@ -1,0 +1,87 @@
+"""The announcement of a node, and its conflicts with other nodes."""
+
+import time
+from collections.abc import Callable
+
+import yaml
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.presences import PERIOD_S, Presence, Presences
+from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.subscriptions import subscribe
+from rhs_isac_ros.ros.timers import steady_timer
+
+_last_instance = 0
+
+
+def new_instance() -> int:
+    """Return the instance of a node that starts now, unique in this process [ns since 1970]."""
+    global _last_instance
+    _last_instance = max(time.time_ns(), _last_instance + 1)
+    return _last_instance
+
+
+class PresenceClient:
+    """Announces a node of the infrastructure, and decides whether it serves or stands by.
+
+    Parameters
+    ----------
+    role
+        Role of the node.
+    on_change
+        Called with whether the node stands by, at each change and whenever a node with the same
+        role has appeared or gone.
+    """
+
+    def __init__(
+            self, node: Node, role: str, instance: int, scenario: Scenario,
+            on_change: Callable[[bool], None]) -> None:
+        self._node, self._on_change = node, on_change
+        self._presences = Presences(Presence(
+            instance, scenario.id, role, node.get_fully_qualified_name(), scenario.fields()))
+        self._publisher = node.create_publisher(
+            ros.Presence, topics.PRESENCE, qos.LATCHED)
+        subscribe(node, ros.Presence, topics.PRESENCE, self._receive, qos.PRESENCES, raw=True)
+        self._timer = steady_timer(node, PERIOD_S, self._on_timer)
+        self._timer.cancel()
+        self._announce()
+
+    def conflicts(self) -> dict[str, str]:
+        """Return a description of each conflict, by key of the diagnostics."""
+        return self._presences.conflicts()
+
+    def _announce(self) -> None:
+        self._publisher.publish(convert.presence_to_ros(
+            self._presences.own, self._node.get_clock().now().to_msg()))
+
+    def _receive(self, content: bytes) -> None:
+        try:
+            presence = convert.presence_from_ros(deserialize_message(content, ros.Presence))
+        # Anything may be published on the topic, and rclpy raises a RuntimeError without a public
+        # class.
+        except (RuntimeError, ValueError, yaml.YAMLError):
+            return
+        if self._handle(self._presences.add(presence, time.time_ns(), time.monotonic())):
+            self._announce()
+        if self._presences.in_conflict and self._timer.is_canceled():
+            self._timer.reset()
+
+    def _on_timer(self) -> None:
+        self._handle(self._presences.expire(time.monotonic()))
+        # Also after the last conflict has ended: a node that was suspended receives this later.
+        self._announce()
+        if not self._presences.in_conflict:
+            self._timer.cancel()
+
+    def _handle(self, messages: list[LogMessage]) -> bool:
+        """Log messages and report the change that they describe; return whether there is one."""
+        logger = self._node.get_logger()
+        for message in messages:
+            (logger.warning if message.warning else logger.info)(message.text)
+        if messages:
+            self._on_change(self._presences.stands_by)
+        return bool(messages)
