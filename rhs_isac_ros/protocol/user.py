@@ -151,8 +151,11 @@ class UserSteps(StateMachine[State]):
         return [LogMessage('beacons resumed')]
 
     def log_other_instance(self, event: m.Grant, now_s: float) -> list[Action]:
-        """Log once that another node with the same number is served."""
-        text = (f'user {self.user}: two nodes have this number; the other one, '
+        """Log once that a newer node with the same number is served."""
+        if event.user_instance < self._instance:
+            # A cycle that was granted before the base station received an ack of this node.
+            return []
+        text = (f'user {self.user}: two nodes have this number; the newer one, '
                 f'{started(event.user_instance)}, is served')
         known, self._conflict = self._conflict, text
         return [] if known else [LogMessage(text, warning=True)]

@@ -81,7 +81,11 @@ class PresenceClient:
         """Log messages and report the change that they describe; return whether there is one."""
         logger = self._node.get_logger()
         for message in messages:
-            (logger.warning if message.warning else logger.info)(message.text)
+            # Not one line: rclpy requires a single severity for each line that logs.
+            if message.warning:
+                logger.warning(message.text)
+            else:
+                logger.info(message.text)
         if messages:
             self._on_change(self._presences.stands_by)
         return bool(messages)

@@ -57,13 +57,17 @@ class Processes:
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._commands: dict[str, list[str]] = {}
 
-    def start(self, executable: str, name: str = '', **parameters: Any) -> None:
+    def start(
+            self, executable: str, name: str = '', process: str = '', **parameters: Any) -> None:
         """Start an executable.
 
         Parameters
         ----------
         name
             Name of its node; by default that of the executable.
+        process
+            Name of the process; by default that of its node. Processes of nodes with the same name
+            need different names.
         **parameters
             ROS parameters.
         """
@@ -72,7 +76,7 @@ class Processes:
         # Only a given name is remapped, because an executable may have several nodes.
         if name:
             command += ['-r', f'__node:={name}']
-        name = name or executable
+        name = process or name or executable
         command = [*self._command_prefix(name), *command]
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)

@@ -14,7 +14,7 @@ import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 
-from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.experiments.arguments import check_directory
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.files import write_whole
@@ -23,11 +23,12 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import load_files, start_network
-from system.chaos import crashes, fuzzing, report, soaking
+from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.observer import NetworkObserver
 
 # Pause between cycles [s]; a longer one during fuzzing leaves room for messages in the queues.
 _REST_S, _FUZZING_REST_S = 0.02, 0.2
+_PHASES = [phase.name.lower() for phase in crashes.PHASES]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     processes, 2, options.seed, options.config, codebook_file, scenario,
                     rest_s=_FUZZING_REST_S if options.fuzz else _REST_S, first_cycle=0,
                     impairments=soaking.IMPAIRMENTS if options.soak else None)
-                figures = _run(observer, processes, scenario, options)
+                figures = _run(observer, processes, scenario, options, Path(logs), codebook_file)
         except crashes.ChaosError as error:
             print(f'error: {error}', file=sys.stderr)
             return 1
@@ -80,12 +81,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(
         observer: NetworkObserver, processes: Processes, scenario: Scenario,
-        options: argparse.Namespace) -> dict[str, Any]:
+        options: argparse.Namespace, folder: Path, codebook_file: Path) -> dict[str, Any]:
     if options.soak:
         return _soak(observer, processes, options)
     if options.fuzz:
         return _fuzz(observer, processes, scenario, options)
-    return _crash(observer, processes, options)
+    trials: list[crashes.CrashTrial | intruders.IntrusionTrial] = []
+    if options.intruders is None:
+        trials += _crash(observer, processes, options)
+    if options.nodes is None and options.phases is None:
+        trials += _intrude(observer, processes, scenario, options, folder, codebook_file)
+    observer.spin_for(CHECK_DELAY_S)
+    figures = report.trial_figures(trials, observer.invariants)
+    print(report.trial_summary(figures))
+    return figures
 
 
 def _soak(
@@ -113,15 +122,24 @@ def _fuzz(
 
 def _crash(
         observer: NetworkObserver, processes: Processes, options: argparse.Namespace
-) -> dict[str, Any]:
+) -> list[crashes.CrashTrial]:
     print(report.CRASH_HEAD)
-    trials = crashes.crash_all(
-        observer, processes, options.nodes, [m.Phase[name.upper()] for name in options.phases],
+    phases = [m.Phase[name.upper()] for name in options.phases or _PHASES]
+    return crashes.crash_all(
+        observer, processes, options.nodes or crashes.NODES, phases,
         lambda trial: print(report.crash_line(trial), flush=True))
-    observer.spin_for(CHECK_DELAY_S)
-    figures = report.crash_figures(trials, observer.invariants)
-    print(report.crash_summary(figures))
-    return figures
+
+
+def _intrude(
+        observer: NetworkObserver, processes: Processes, scenario: Scenario,
+        options: argparse.Namespace, folder: Path, codebook_file: Path
+) -> list[intruders.IntrusionTrial]:
+    print(report.INTRUSION_HEAD)
+    common = {'scenario_file': options.config.resolve()} if options.config else {}
+    return intruders.intrude_all(
+        observer, processes, options.intruders or intruders.INTRUDERS, options.seconds, folder,
+        common, scenario, Codebook.load(codebook_file),
+        lambda trial: print(report.intrusion_line(trial), flush=True))
 
 
 def _show_progress(text: str) -> None:
@@ -132,8 +150,9 @@ def _show_progress(text: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='chaos', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        description='Start a network of processes, kill and restart each node in each phase, and '
-                    'check from outside that no invariant of its results is violated.')
+        description='Start a network of processes, kill and restart each node in each phase, '
+                    'start a second node of each role, and check from outside that no invariant '
+                    'of the results is violated.')
     test = parser.add_mutually_exclusive_group()
     test.add_argument('--soak', type=_positive(float), metavar='MINUTES',
                       help='instead of killing nodes, run for this time with an impaired channel '
@@ -142,11 +161,15 @@ def _parser() -> argparse.ArgumentParser:
     test.add_argument('--fuzz', type=_positive(int), metavar='N',
                       help='instead of killing nodes, publish this number of random and mutated '
                       'messages of every type on every topic')
-    phases = [phase.name.lower() for phase in crashes.PHASES]
-    parser.add_argument('--nodes', nargs='+', default=crashes.NODES, choices=crashes.NODES,
-                        metavar='NODE', help='nodes to kill')
-    parser.add_argument('--phases', nargs='+', default=phases, choices=phases, metavar='PHASE',
-                        help='phases to kill them in')
+    parser.add_argument('--nodes', nargs='+', choices=crashes.NODES, metavar='NODE',
+                        help=f'only kill these nodes; one or more of {", ".join(crashes.NODES)}')
+    parser.add_argument('--phases', nargs='+', choices=_PHASES, metavar='PHASE',
+                        help=f'only kill nodes in these phases; of {", ".join(_PHASES)}')
+    parser.add_argument('--intruders', nargs='+', choices=intruders.INTRUDERS, metavar='NODE',
+                        help='only start these second nodes, which may be repeated; of '
+                             f'{", ".join(intruders.INTRUDERS)}')
+    parser.add_argument('--seconds', type=_positive(float), default=intruders.SECONDS,
+                        metavar='S', help='duration of each intrusion')
     parser.add_argument('--seed', type=int, default=0, help='seed of all random numbers')
     parser.add_argument('--config', type=Path,
                         help="scenario file; by default the paper's Table I")

@@ -118,14 +118,14 @@ def crash(
     ChaosError
         If the network does not serve its users before.
     """
-    _wait_for_service(observer)
+    wait_for_service(observer)
     n_violations = len(observer.invariants.violations)
     log_lengths = {name: len(processes.log(name)) for name in processes.names}
     kill_delay_s = _kill_in(observer, processes, node, phase)
     observer.warnings.clear()
     observer.spin_for(_DOWNTIME_S)
     diagnosed = tuple(sorted(observer.warnings))
-    logged = tuple(_warnings_since(processes, log_lengths, node))
+    logged = tuple(warnings_since(processes, log_lengths, node))
     observer.invariants.expect_rediscovery(PUBLISHES[node])
     n_codebooks = observer.n_codebooks
     restart_s = time.monotonic()
@@ -149,7 +149,7 @@ def both_served(observer: NetworkObserver, first: int) -> bool:
         record.user for record in observer.log.ended[first:] if record.outcome == 'served'}
 
 
-def _wait_for_service(observer: NetworkObserver) -> None:
+def wait_for_service(observer: NetworkObserver) -> None:
     """Wait until both users have been served in cycles that end from now on."""
     first = len(observer.log.ended)
     if not observer.spin_until(lambda: both_served(observer, first), _TIMEOUT_S):
@@ -177,9 +177,15 @@ def _kill_in(
     return delays_s[0]
 
 
-def _warnings_since(
-        processes: Processes, log_lengths: dict[str, int], excluded: str) -> list[str]:
-    """Return new warnings in the logs of all nodes but one, each with the name of its node."""
+def warnings_since(
+        processes: Processes, log_lengths: dict[str, int], excluded: str = '') -> list[str]:
+    """Return new warnings in the logs of all nodes but one, each with the name of its node.
+
+    Parameters
+    ----------
+    log_lengths
+        Length of each log at the beginning, by name of the process.
+    """
     return [f'{name}: {line.split("]: ", 1)[-1]}'
             for name, length in log_lengths.items() if name != excluded
             for line in processes.log(name)[length:].splitlines() if '[WARN]' in line]

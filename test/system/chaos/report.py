@@ -8,6 +8,7 @@ from typing import Any
 from rhs_isac_ros.monitoring.invariants import InvariantChecker
 from system.chaos.crashes import CrashTrial
 from system.chaos.fuzzing import FuzzResult
+from system.chaos.intruders import IntrusionTrial
 from system.chaos.soaking import SoakResult
 
 CRASH_HEAD = (
@@ -16,17 +17,13 @@ CRASH_HEAD = (
 
 def crash_line(trial: CrashTrial) -> str:
     """Return a trial as a row of the table, followed by its violations."""
-    loggers = sorted({line.partition(':')[0] for line in trial.logged})
-    reporters = f'{", ".join(loggers) or "-"}; {", ".join(trial.diagnosed) or "-"}'
-    others = 'running' if trial.others_running else 'ENDED'
-    marks = ('' if trial.recovered else '  NOT IN TIME') + (
-        '' if trial.reported else '  NOT REPORTED ONCE')
-    row = (f'{trial.node:15s} {trial.phase:14s} {trial.recovery_s:7.2f} s   {others:7s}  '
-           f'{reporters}{marks}')
+    row = f'{trial.node:15s} {trial.phase:14s} {_columns(trial)}'
     return '\n'.join([row, *(f'  VIOLATION: {text}' for text in trial.violations)])
 
 
-def crash_figures(trials: Sequence[CrashTrial], invariants: InvariantChecker) -> dict[str, Any]:
+def trial_figures(
+        trials: Sequence[CrashTrial | IntrusionTrial], invariants: InvariantChecker
+) -> dict[str, Any]:
     """Return the figures of all trials, for JSON."""
     worst_s = max((trial.recovery_s for trial in trials), default=0.0)
     return {
@@ -44,8 +41,8 @@ def crash_figures(trials: Sequence[CrashTrial], invariants: InvariantChecker) ->
     }
 
 
-def crash_summary(figures: Mapping[str, Any]) -> str:
-    """Return the figures of `crash_figures` as one line."""
+def trial_summary(figures: Mapping[str, Any]) -> str:
+    """Return the figures of `trial_figures` as one line."""
     worst_s = figures['worst_recovery_s']
     worst = 'never' if worst_s is None else f'{worst_s:.2f} s'
     return (f'{figures["trials_reported"]} of {figures["trials"]} reported once; '
@@ -53,6 +50,26 @@ def crash_summary(figures: Mapping[str, Any]) -> str:
             f'slowest: {worst}; {figures["wrong_publications"]} wrong publications among '
             f'{figures["checked_publications"]}, {figures["unverified_publications"]} of which '
             'preceded the discovery of a node by the observer')
+
+
+INTRUSION_HEAD = (
+    'intruder         served   recovered   others   reported by (log; diagnostics)')
+
+
+def intrusion_line(trial: IntrusionTrial) -> str:
+    """Return a trial as a row of the table, followed by its violations."""
+    row = f'{trial.intruder:15s} {trial.served:7d} {_columns(trial)}'
+    return '\n'.join([row, *(f'  VIOLATION: {text}' for text in trial.violations)])
+
+
+def _columns(trial: CrashTrial | IntrusionTrial) -> str:
+    """Return the columns that both kinds of trials have."""
+    loggers = sorted({line.partition(':')[0] for line in trial.logged})
+    reporters = f'{", ".join(loggers) or "-"}; {", ".join(trial.diagnosed) or "-"}'
+    others = 'running' if trial.others_running else 'ENDED'
+    marks = ('' if trial.recovered else '  NOT IN TIME') + (
+        '' if trial.reported else '  NOT REPORTED ONCE')
+    return f'{trial.recovery_s:7.2f} s   {others:7s}  {reporters}{marks}'
 
 
 def soak_figures(result: SoakResult, invariants: InvariantChecker) -> dict[str, Any]:

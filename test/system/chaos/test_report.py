@@ -23,7 +23,7 @@ def crash_trial(**fields):
 def figures_of(*trials, violations=()):
     checker = InvariantChecker(Scenario())
     checker.violations = list(violations)
-    return report.crash_figures(trials, checker)
+    return report.trial_figures(trials, checker)
 
 
 def test_trials_with_recovery_and_reports_pass():
@@ -32,7 +32,7 @@ def test_trials_with_recovery_and_reports_pass():
     assert (figures['trials'], figures['trials_recovered'], figures['trials_reported']) == (
         2, 2, 2)
     assert (figures['worst_recovery_s'], figures['wrong_publications']) == (2.5, 0)
-    assert '2 of 2 recovered' in report.crash_summary(figures)
+    assert '2 of 2 recovered' in report.trial_summary(figures)
     assert report.crash_line(crash_trial()).split() == [
         'rhs_controller', 'positioning', '1.00', 's', 'running', 'bs;', 'bs']
 

@@ -1,0 +1,160 @@
+"""Intrusion trials: start a second node of a role, and stop it again."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.ros.processes import Processes
+from system.chaos.crashes import PUBLISHES, RECOVERY_LIMIT_S, wait_for_service, warnings_since
+from system.observer import NetworkObserver
+
+# A channel of another scenario, a node with the number of user 1, and a second node of each role.
+SCENARIO, USER = 'scenario', 'user'
+INTRUDERS = (
+    'bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'optimizer', USER, SCENARIO)
+SECONDS = 6.0
+_PROCESS = 'intruder'
+_USER_NODE = 'user_1'
+_TIMEOUT_S = 30.0
+# Texts that name a conflict.
+_NAMES_OF_CONFLICTS = ('two nodes', 'another scenario', 'serves instead of', 'stands by for')
+
+
+@dataclasses.dataclass(frozen=True)
+class IntrusionTrial:
+    """Result of one trial.
+
+    Attributes
+    ----------
+    intruder
+        Which node was started in addition.
+    served
+        Number of cycles served while it was present.
+    recovery_s
+        Time from the end of the intruder to the end of the first cycle that was served after it,
+        for a user of one of its own cycles [s]; infinite if there was none.
+    others_running
+        Whether all other processes kept running.
+    logged
+        Warnings that name the conflict, each as ``<node>: <text>``.
+    diagnosed
+        Nodes whose diagnostics named the conflict.
+    violations
+        Results that violate an invariant.
+    """
+
+    intruder: str
+    served: int
+    recovery_s: float
+    others_running: bool
+    logged: tuple[str, ...]
+    diagnosed: tuple[str, ...]
+    violations: tuple[str, ...]
+
+    @property
+    def recovered(self) -> bool:
+        """Whether cycles were served in time and all other processes kept running."""
+        return self.recovery_s <= RECOVERY_LIMIT_S and self.others_running
+
+    @property
+    def reported(self) -> bool:
+        """Whether logs and diagnostics named the conflict, without repeated warnings."""
+        return bool(self.logged and self.diagnosed
+                    and len(set(self.logged)) == len(self.logged))
+
+
+def intrude_all(
+        observer: NetworkObserver, processes: Processes, intruders: Iterable[str],
+        seconds: float, folder: Path, parameters: dict[str, Any], scenario: Scenario,
+        codebook: Codebook, on_trial: Callable[[IntrusionTrial], None]) -> list[IntrusionTrial]:
+    """Add each intruder to a network for a time.
+
+    Parameters
+    ----------
+    processes
+        The network, with the users 1 and 2.
+    intruders
+        Some of `INTRUDERS`; one may be repeated.
+    seconds
+        Duration of each intrusion [s].
+    folder
+        Directory for the files of the intruders.
+    parameters
+        Parameters of all nodes of the network.
+    scenario, codebook
+        Scenario and codebook of the network.
+    on_trial
+        Called after each trial.
+
+    Raises
+    ------
+    ChaosError
+        If the network does not serve its users before a trial.
+    """
+    commands = _commands(folder, parameters, scenario, codebook)
+    trials = []
+    for intruder in intruders:
+        trials.append(_intrude(observer, processes, intruder, commands[intruder], seconds))
+        on_trial(trials[-1])
+    return trials
+
+
+def _commands(
+        folder: Path, parameters: dict[str, Any], scenario: Scenario, codebook: Codebook
+) -> dict[str, tuple[str, str, dict[str, Any]]]:
+    """Return executable, name of the node and parameters of each intruder."""
+    # A codebook of the same quality.
+    Codebook(codebook.analog, -codebook.digital).save(folder / 'codebook.yaml')
+    frequencies = [1.1 * frequency for frequency in scenario.center_frequencies_hz]
+    (folder / 'scenario.yaml').write_text(yaml.safe_dump(
+        {**scenario.changes(), 'center_frequencies_hz': frequencies}), encoding='utf-8')
+    commands: dict[str, tuple[str, str, dict[str, Any]]] = {
+        role: (role, '', parameters) for role in INTRUDERS if role in PUBLISHES}
+    commands['optimizer'] = (
+        'optimizer', '', {**parameters, 'codebook_file': folder / 'codebook.yaml'})
+    commands[USER] = (
+        'user', _USER_NODE, {**parameters, 'user_id': 1, 'seed': 99, 'mobility': 'random_walk',
+                             'speed_mps': scenario.max_user_speed_mps})
+    commands[SCENARIO] = (
+        'channel', '', {**parameters, 'scenario_file': folder / 'scenario.yaml'})
+    return commands
+
+
+def _intrude(
+        observer: NetworkObserver, processes: Processes, intruder: str,
+        command: tuple[str, str, dict[str, Any]], seconds: float) -> IntrusionTrial:
+    wait_for_service(observer)
+    executable, node, parameters = command
+    n_violations = len(observer.invariants.violations)
+    log_lengths = {name: len(processes.log(name)) for name in processes.names}
+    log_lengths[_PROCESS] = 0
+    observer.warnings.clear()
+    observer.invariants.expect_rediscovery(PUBLISHES[node or executable])
+    first = len(observer.log.ended)
+    processes.start(executable, node, _PROCESS, **parameters)
+    observer.spin_for(seconds)
+    served = sum(record.outcome == 'served' for record in observer.log.ended[first:])
+    processes.kill(_PROCESS)
+    # The older node creates its publishers again.
+    observer.invariants.expect_rediscovery(PUBLISHES[node or executable])
+    user, end_s = 1 if intruder == USER else None, time.monotonic()
+
+    def is_served() -> bool:
+        return any(record.outcome == 'served' and record.began_s > end_s
+                   and user in (None, record.user) for record in observer.log.ended[-20:])
+    recovered = observer.spin_until(is_served, _TIMEOUT_S)
+    recovery_s = time.monotonic() - end_s if recovered else float('inf')
+    logged = tuple(line for line in warnings_since(processes, log_lengths)
+                   if any(text in line for text in _NAMES_OF_CONFLICTS))
+    diagnosed = tuple(sorted(
+        name for name, summaries in observer.warnings.items()
+        if any(text in summary for text in _NAMES_OF_CONFLICTS for summary in summaries)))
+    return IntrusionTrial(
+        intruder, served, recovery_s, not processes.ended(), logged, diagnosed,
+        tuple(observer.invariants.violations[n_violations:]))
