@@ -387,7 +387,8 @@ class Network:
             case 'rhs_controller':
                 return RhsController()
             case 'channel':
-                return Channel(scenario, self.seed)
+                # Two channels differ in their multipath.
+                return Channel(scenario, self.seed + name.endswith('_twin'))
             case 'positioner':
                 return Positioner(scenario, lambda: self.now_s)
             case 'transmission':
@@ -402,7 +403,8 @@ class Network:
         """Report changes of the missing roles to the roles that need them."""
         for name in list(self._roles) if self._started else ():
             role = self._roles[name]
-            missing = tuple(p for p in PEERS.get(self._kind(name), ()) if p not in self._roles)
+            present = {self._kind(other) for other in self._roles}
+            missing = tuple(p for p in PEERS.get(self._kind(name), ()) if p not in present)
             if self._kind(name) in PEERS and self._reported.get(role) != missing:
                 self._reported[role] = missing
                 self.dispatch(name, PeersChanged(missing))

@@ -55,8 +55,8 @@ class Radio(PlainRole):
                 configuration = self._applied[pilot.band][pilot.frame]
                 feeds = self._measure(pilot.band, configuration, pilot)
                 answers.append(Send(m.FeedSignals(
-                    cycle_id=pilot.cycle_id, user=pilot.user, band=pilot.band, frame=pilot.frame,
-                    signals=feeds)))
+                    cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender,
+                    band=pilot.band, frame=pilot.frame, signals=feeds)))
             else:
                 # The queue is bounded, so the oldest pilots, those of unfinished cycles, are
                 # discarded.

@@ -39,7 +39,8 @@ class VisualizerNode(Node):
         self._publisher = self.create_publisher(MarkerArray, topics.MARKERS, qos.EXCHANGE)
         self._paths: dict[int, tuple[Publisher, Publisher]] = {}
         subscribe_messages(self, RECEIVES, self._scenario.sizes,
-                           lambda message: self._scene.add(message, time.monotonic()))
+                           lambda message: self._scene.add(message, time.monotonic()),
+                           scenario_id=self._scenario.id)
         steady_timer(self, values.period_s, self._show)
 
     def _show(self) -> None:

@@ -181,14 +181,34 @@ def read(
     Raises
     ------
     RecordingError
-        If mcap is not installed, or the file is not a recording.
+        If mcap is not installed, the file is not a recording, or the definition of a message has
+        changed since.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
+    checked: set[int] = set()
     with _opened(path) as reader:
         for found, channel, message in reader.iter_messages(topics=names):
             if found is not None and found.name in kinds:
+                if found.id not in checked:
+                    _check_schema(path, found, kinds[found.name])
+                    checked.add(found.id)
                 yield (channel.topic, deserialize_message(message.data, kinds[found.name]),
                        1e-9 * message.log_time)
+
+
+def _check_schema(path: str | Path, found: Any, kind: type) -> None:
+    """Raise RecordingError if a recorded message has other fields than the installed one."""
+    if found.encoding == 'ros2msg' and _fields(found.data.decode(errors='replace')) != _fields(
+            schema(kind)):
+        raise RecordingError(
+            f'{path}: {found.name}: recorded with other fields than the installed message has; '
+            'expected a recording of this version')
+
+
+def _fields(text: str) -> list[str]:
+    """Return the fields and constants of the first message in a schema."""
+    lines = (line.split('#')[0] for line in text.split(_SEPARATOR)[0].splitlines())
+    return [' '.join(line.split()) for line in lines if line.strip()]
 
 
 def read_scenario(path: str | Path) -> Scenario | None:

@@ -34,7 +34,8 @@ def subscribe(
 def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         on_message: Callable[[m.Message], None],
-        on_error: Callable[[m.MessageError], None] | None = None) -> None:
+        on_error: Callable[[m.MessageError], None] | None = None,
+        scenario_id: str = '') -> None:
     """Subscribe to messages of the protocol; malformed ones are dropped.
 
     Parameters
@@ -43,6 +44,8 @@ def subscribe_messages(
         Required array sizes by symbol, as in `Scenario.sizes`; None: any.
     on_error
         Called with the reason why a message was dropped; by default, the node logs it.
+    scenario_id
+        If given, messages of other scenarios are ignored.
     """
     def log(error: m.MessageError) -> None:
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
@@ -55,7 +58,8 @@ def subscribe_messages(
         except m.MessageError as error:
             (on_error or log)(error)
             return
-        on_message(plain)
+        if not scenario_id or plain.scenario_id in ('', scenario_id):
+            on_message(plain)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
                   functools.partial(receive, kind), qos.profile_for(kind), raw=True)

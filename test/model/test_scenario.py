@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -213,6 +214,16 @@ def test_an_unreadable_file_is_an_error(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(ScenarioError, match='cannot be read'):
         Scenario.from_yaml(path)
+
+
+def test_the_id_is_a_hash_of_the_content():
+    scenario = Scenario()
+    assert re.fullmatch('sc[0-9a-f]{16}', scenario.id)
+    assert scenario.id == Scenario(center_frequencies_hz=[2.5e9, 3000000000]).id
+    others = [Scenario(center_frequencies_hz=(2.6e9, 3.0e9)), Scenario(n_frames=5),
+              Scenario(user_gain=2.0), Scenario(feed_positions_m=[(0, 0, 0)] * 3)]
+    assert len({scenario.id, *(other.id for other in others)}) == 5
+    assert Scenario(**scenario.fields()) == scenario
 
 
 def test_positions_are_uniform_in_the_region():

@@ -149,6 +149,18 @@ def test_a_scenario_of_another_version_is_an_error(tmp_path):
         read_scenario(tmp_path / 'run.mcap')
 
 
+def test_a_recording_with_other_fields_is_an_error(recording, monkeypatch):
+    """Such as one from before the messages had headers: its bytes would be misread."""
+    path, _ = recording
+    assert list(read(path))
+    text, kind = schema(ros.ReceivedSignals), ros.ReceivedSignals
+    monkeypatch.setattr('rhs_isac_ros.ros.recording.schema', lambda found: (
+        text.replace('uint64 sender\n', '') if found is kind else schema(found)))
+    with pytest.raises(RecordingError, match='mcap: rhs_isac_msgs/msg/ReceivedSignals: recorded '
+                                             'with other fields'):
+        list(read(path))
+
+
 def test_the_error_names_a_missing_folder(tmp_path):
     with pytest.raises(RecordingError, match='none/run.mcap: cannot be written: No such file'):
         Recorder(tmp_path / 'none' / 'run.mcap', Scenario())

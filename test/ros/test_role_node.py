@@ -266,6 +266,34 @@ def test_deadlines_are_kept_while_messages_arrive(each_bench, start):
     assert len(role.ticks_s) >= 40
 
 
+def test_messages_carry_the_identity_of_their_sender(bench, start, probe):
+    node = start(bench, Scripted(sends=[m.Ack]))
+    received = bench.collect(probe, m.Ack)
+    bench.until(lambda: probe.count_publishers('/ack'), 'the publisher')
+    # A role may pass on a message of another node.
+    node.publish(m.Ack(cycle_id=1, user=1, sender=5, scenario_id='other'))
+    bench.until(lambda: received, 'the message')
+    assert (received[0].sender, received[0].scenario_id) == (node.instance, node.scenario.id)
+
+
+def test_messages_of_another_scenario_are_dropped_counted_and_logged_once_per_sender(
+        each_bench, start, capfd):
+    role = Scripted(receives=[m.Ack])
+    node = start(each_bench, role)
+    publisher = each_bench.publisher(each_bench.add(Node, 'probe'), m.Ack)
+    for sender in (5, 5, 6, *range(100, 140)):
+        publisher.publish(convert.to_ros(
+            m.Ack(cycle_id=1, user=1, sender=sender, scenario_id='other'), None))
+    for known in ('', node.scenario.id):
+        publisher.publish(convert.to_ros(m.Ack(cycle_id=2, user=1, scenario_id=known), None))
+    each_bench.until(lambda: len(role.events) == 2, 'the messages of this scenario')
+    assert {event.cycle_id for event, _ in role.events} == {2}
+    assert role.counters == {'wrong_scenario': 43}
+    log = capfd.readouterr().err
+    assert log.count('Ack dropped: sent with scenario other, expected sc') == 16
+    assert '[WARN]' in log
+
+
 def test_every_message_has_the_listed_topic(bench, start, probe):
     start(bench, Scripted(sends=topics.NAMES))
     for name in topics.NAMES.values():

@@ -44,11 +44,20 @@ def test_cycles_are_served_after_a_crash(small_files, tmp_path):
     assert trial['logged'] and 'bs' in trial['diagnosed']
 
 
+def test_the_elder_of_two_base_stations_resumes_when_the_newer_has_gone(small_files, tmp_path):
+    figures, output = chaos(small_files, tmp_path, '--intruders', 'bs', '--seconds', '2')
+    (trial,) = figures['table']
+    assert (trial['intruder'], trial['others_running']) == ('bs', True)
+    assert trial['recovery_s'] is not None, output
+    assert figures['trials_reported'] == 1, output
+    assert figures['wrong_publications'] == 0, output
+
+
 def test_mutations_crash_no_node_and_are_counted(small_files, tmp_path):
     figures, output = chaos(small_files, tmp_path, '--fuzz', '1500')
     assert figures['passed'], output
     assert figures['mutations'] == sum(figures['sent'].values()) == 1500
-    assert len(figures['sent']) == 21
+    assert len(figures['sent']) == 22
     assert sum(figures['counted'].values()) > 500
     assert figures['dropped']['malformed'] == sum(figures['malformed'].values())
 
@@ -66,7 +75,7 @@ def test_cycles_are_served_over_an_impaired_channel(small_files, tmp_path):
 
 @pytest.mark.parametrize('arguments', [
     ['--soak', '0'], ['--soak', 'inf'], ['--fuzz', '-3'], ['--soak', '1', '--fuzz', '1'],
-    ['--nodes', 'unknown'], ['--phases', 'unknown']])
+    ['--nodes', 'unknown'], ['--intruders', 'unknown'], ['--phases', 'unknown']])
 def test_invalid_arguments_are_rejected(arguments, capsys):
     with pytest.raises(SystemExit):
         main(arguments)

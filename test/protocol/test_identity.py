@@ -1,0 +1,190 @@
+"""Two nodes with one role or one number never lead to a wrong result or to a lasting outage."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.monitoring.invariants import RECEIVES, InvariantChecker
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.events import PeersChanged, Resumed, StoodBy
+
+
+def violations(net):
+    checker = InvariantChecker(net.scenario)
+    for codebook in net.codebooks.values():
+        checker.add_codebook(codebook)
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES):
+            checker.add(sent.message, 0.0)
+    checker.add(m.Grant(cycle_id=0, user=1), 1e9)
+    assert checker.checked
+    return checker.violations
+
+
+def grants(net, since=0):
+    return [grant.user_instance for grant in net.sent(m.Grant, since=since)]
+
+
+# Two users with one number
+
+
+def test_the_newer_of_two_users_with_one_number_is_served(network, places):
+    net = network()
+    net.run_cycles(2)
+    net.add_user(1, places[3], '_twin')
+    since = len(net.log)
+    net.run_cycles(20)
+    older, newer = (net.instances[name] for name in ('user1', 'user1_twin'))
+    # The cycle of the first beacon that the newer one receives may already be granted.
+    assert grants(net, since)[1:] == [newer] * len(grants(net, since)[1:])
+    assert net.served() == [1] * 22
+    net.verify()
+    assert violations(net) == []
+    assert net['bs'].counters['superseded'] >= 19
+    assert {pilot.sender for pilot in net.sent(m.Pilot)} == {older, newer}
+    for name, end in (('bs', 'is served'), ('user1', 'is served')):
+        (text,) = [text for text in net.logged(name) if 'two nodes have this number' in text]
+        assert text.startswith('user 1: ') and text.endswith(end)
+    assert not [text for text in net.logged('user1_twin') if 'two nodes' in text]
+    assert 'conflict.user_1' in net['bs'].status()
+    assert 'conflict.user' in net['user1'].status()
+
+
+def test_the_older_user_is_served_again_when_the_newer_one_has_gone(network, places):
+    net = network(2)
+    net.add_user(1, places[3], '_twin')
+    net.run_cycles(4)
+    net.remove('user1_twin')
+    net.run(lambda: grants(net)[-1] == net.instances['user1'], limit_s=10.0)
+    since = len(net.outcomes())
+    net.run_cycles(8)
+    assert net.served()[-8:].count(1) == 4
+    assert {outcome for _, _, outcome in net.outcomes()[since:]} == {'served'}
+    net.verify()
+    assert violations(net) == []
+    assert net['user1'].status() == {}
+    net.run(limit_s=6.0)
+    assert 'conflict.user_1' not in net['bs'].status()
+
+
+@pytest.mark.parametrize('state', [State.BEACONING, State.SOUNDING, State.ESTIMATING])
+def test_a_restarted_user_is_served_at_once(network, state):
+    net = network()
+    net.run_cycles(2)
+    net.run_to(state)
+    since = len(net.outcomes())
+    net.restart('user1')
+    net.run(lambda: net.outcomes()[since:] and net.outcomes()[-1][2] == 'served', limit_s=3.0)
+    assert len(net.outcomes()[since:]) <= 2
+    assert grants(net)[-1] == net.instances['user1']
+    assert not [text for text in net.logged('bs') if 'two nodes' in text]
+    net.verify()
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_results_of_two_users_with_one_number_are_never_mixed(network, places, noisy, seed):
+    net = network(2, transport=noisy(seed, loss=0.05, doubles=0.1, jitter_s=0.02), ordered=False,
+                  retries=2)
+    net.add_user(1, places[3], '_twin')
+    net.run_cycles(15)
+    net.restart('user1')
+    net.run_cycles(15)
+    assert 1 in net.served()
+    net.verify()
+    assert violations(net) == []
+
+
+def test_a_number_without_an_instance_remains_usable(network):
+    """A station without the field, or a message sent by hand, addresses every node."""
+    net = network(absent=('bs',))
+    net['user1'].handle(PeersChanged(()), 0.0)
+    beacon, grant = m.Beacon(cycle_id=5, attempt=0), m.Grant(cycle_id=5, user=1)
+    net['user1'].handle(beacon, 0.0)
+    (sent,) = net['user1'].handle(grant, 0.0)
+    assert isinstance(sent.message, m.GroundTruth)
+
+
+# Two nodes of the infrastructure
+
+
+def test_the_signals_of_a_cycle_come_from_one_channel(network):
+    net = network(2)
+    net.add('channel_twin')
+    net.run_cycles(10)
+    assert net.served()
+    assert net['bs'].counters['wrong_instance'] > 0
+    assert violations(net) == []
+    net.remove('channel')
+    net.run_cycles(4)
+    assert net.served()[-1:]
+    assert violations(net) == []
+
+
+def test_signals_of_several_channels_are_a_violation(network):
+    net = network()
+    net.run_cycles(1)
+    for number, sent in enumerate(net.log):
+        if isinstance(sent.message, m.FeedSignals) and sent.message.frame == 1:
+            net.log[number] = sent._replace(message=dataclasses.replace(sent.message, sender=77))
+    assert any('several channels' in text for text in violations(net))
+
+
+def test_signals_from_another_position_are_a_violation(network, places):
+    net = network()
+    net.run_cycles(1)
+    for number, sent in enumerate(net.log):
+        if isinstance(sent.message, m.GroundTruth):
+            net.log[number] = sent._replace(
+                message=dataclasses.replace(sent.message, position=np.array([0.3, 0.0, 0.0])))
+    assert any('do not match the true position' in text for text in violations(net))
+
+
+@pytest.mark.parametrize('twin', ['positioner', 'transmission', 'rhs_controller'])
+def test_two_nodes_of_another_role_do_no_harm_until_one_stands_by(network, twin):
+    net = network(2)
+    net.add(f'{twin}_twin')
+    net.run_cycles(10)
+    net.remove(twin)
+    net.run_cycles(4)
+    assert {outcome for _, _, outcome in net.outcomes()[-3:]} == {'served'}
+    net.verify()
+    assert violations(net) == []
+
+
+def test_the_older_of_two_base_stations_stands_by_and_resumes(network):
+    net = network(2)
+    net.run_cycles(3)
+    net.run_to(State.SOUNDING)
+    older = net['bs']
+    net.add('bs_twin')
+    net.dispatch('bs_twin', PeersChanged(()))
+    net.run(limit_s=0.05)
+    net.dispatch('bs', StoodBy())
+    assert (older.state, older.next_deadline()) == (State.WAITING, None)
+    since = len(net.log)
+    net.run_cycles(6)
+    assert net.instances['bs'] not in {beacon.sender for beacon in net.sent(m.Beacon, since)}
+    assert {outcome for _, _, outcome in net.outcomes()[-3:]} == {'served'}
+    net.remove('bs_twin')
+    last = max(beacon.cycle_id for beacon in net.sent(m.Beacon))
+    net.dispatch('bs', Resumed(last + 1000))
+    net.dispatch('bs', PeersChanged(()))
+    net.run_cycles(6)
+    assert {outcome for _, _, outcome in net.outcomes()[-5:]} == {'served'}
+    ids = [beacon.cycle_id for beacon in net.sent(m.Beacon, len(net.log) - 1)]
+    assert all(cycle_id > last for cycle_id in ids)
+    net.verify()
+    assert violations(net) == []
+
+
+def test_a_station_that_resumes_never_reuses_its_own_cycle_ids(network):
+    net = network()
+    net.run_cycles(5)
+    net.dispatch('bs', StoodBy())
+    used = max(beacon.cycle_id for beacon in net.sent(m.Beacon))
+    net.dispatch('bs', Resumed(1))
+    net.dispatch('bs', PeersChanged(()))
+    net.run_cycles(1)
+    assert net.sent(m.Beacon)[-1].cycle_id == used + 1
