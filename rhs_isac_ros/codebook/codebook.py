@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from rhs_isac_ros.codebook import provenance_text
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.shapes import check_shape
@@ -110,7 +111,7 @@ class Codebook:
             'codebook.id': self.id,
             'codebook.shape': list(self.shape),
             'codebook.average_crlb': float(self.average_crlb_m2),
-            'codebook.provenance': self.provenance,
+            'codebook.provenance': provenance_text.to_parameter(self.provenance),
             'codebook.analog': self.analog.ravel().tolist(),
             'codebook.digital_re': self.digital.real.ravel().tolist(),
             'codebook.digital_im': self.digital.imag.ravel().tolist(),
@@ -139,12 +140,10 @@ class Codebook:
         imag = _array(parameters, 'digital_im', digital_shape)
         digital = np.empty(digital_shape, complex)
         digital.real, digital.imag = real, imag
-        average = parameters.get('codebook.average_crlb', math.nan)
-        if not isinstance(average, int | float):
-            raise CodebookError(f'codebook.average_crlb: {average!r}, expected a number')
         codebook = cls(
             _array(parameters, 'analog', (n_bands, n_frames, n_elements)), digital,
-            float(average), str(parameters.get('codebook.provenance', '')))
+            _number(parameters, 'average_crlb'),
+            provenance_text.from_parameter(str(parameters.get('codebook.provenance', ''))))
         claimed_id = parameters.get('codebook.id', '')
         if claimed_id and claimed_id != codebook.id:
             raise CodebookError(
@@ -187,10 +186,26 @@ class Codebook:
         raise CodebookError(f'{path}: expected ros__parameters with a mapping named codebook')
 
 
+def _number(parameters: dict[str, Any], name: str) -> float:
+    """Return a parameter's number, NaN if it is missing, or raise CodebookError."""
+    value = parameters.get(f'codebook.{name}', math.nan)
+    try:
+        if not isinstance(value, bool):
+            # ``ros2 param load`` sends NaN as text.
+            return float(value)
+    except (TypeError, ValueError):
+        pass
+    raise CodebookError(f'codebook.{name}: {value!r}, expected a number')
+
+
 def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
     """Return a parameter's list as a float64 array of a shape, or raise CodebookError."""
+    values = parameters.get(f'codebook.{name}', ())
+    if isinstance(values, str):
+        # ``ros2 param load`` sends a list as text if it contains a number such as 1e-05.
+        values = values.strip('[]').split(',')
     try:
-        values = np.asarray(parameters.get(f'codebook.{name}', ()), dtype=float)
+        values = np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
         raise CodebookError(f'codebook.{name}: {error}, expected numbers') from None
     if values.size != math.prod(shape):

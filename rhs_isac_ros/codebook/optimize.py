@@ -147,7 +147,7 @@ def optimize(
     def result(reason: str) -> OptimizeResult:
         best = problem.unpack(search.best)
         bound = float(crlb(scenario, best, positions).mean())
-        text = provenance.to_yaml(search.history[-1], reason)
+        text = provenance.to_text(search.history[-1], reason)
         return OptimizeResult(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
             tuple(search.history), reason)

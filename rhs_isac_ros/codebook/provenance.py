@@ -3,9 +3,8 @@
 import dataclasses
 from typing import Any
 
-import yaml
-
 from rhs_isac_ros import __version__
+from rhs_isac_ros.codebook import provenance_text
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.search import Progress
 
@@ -42,13 +41,12 @@ class Provenance:
     value_m2: float = float('nan')
     reason: str = ''
 
-    def to_yaml(self, end: Progress, reason: str) -> str:
-        """Return one line of YAML that describes a result, for `Codebook.provenance`."""
+    def to_text(self, end: Progress, reason: str) -> str:
+        """Return one line that describes a result, for `Codebook.provenance`."""
         result = dataclasses.replace(
             self, steps=end.step, evaluations=end.evaluations, value_m2=float(end.value_m2),
             reason=reason)
-        return yaml.safe_dump(dataclasses.asdict(result), default_flow_style=True,
-                              sort_keys=False, width=10**9).strip()
+        return provenance_text.encode(dataclasses.asdict(result))
 
     def resumed(self, codebook: Codebook) -> 'Provenance':
         """Return the provenance of an earlier result, to resume it.
@@ -68,8 +66,8 @@ class Provenance:
 
     @classmethod
     def parse(cls, text: str) -> 'Provenance | None':
-        """Parse the text that `to_yaml` returns; return None for any other text."""
+        """Parse the text that `to_text` returns; return None for any other text."""
         try:
-            return cls(**yaml.safe_load(text))
-        except (yaml.YAMLError, TypeError, ValueError, RecursionError):
+            return cls(**provenance_text.decode(text))
+        except (TypeError, ValueError, RecursionError):
             return None

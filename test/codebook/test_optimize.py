@@ -284,7 +284,7 @@ def test_returns_the_best_point_of_a_method_that_ends_elsewhere(small, monkeypat
         float(small.vectors['average_crlb']), rel=1e-8)
     assert result.reason == 'drifted, of 7'
     assert len(result.history) == 4
-    assert 'method: drift' in result.codebook.provenance
+    assert 'method=drift' in result.codebook.provenance
     by_default = optimize(small.scenario, small.vectors['positions'], 'drift')
     assert by_default.reason == 'drifted, of 9'
 
