@@ -20,7 +20,9 @@ from rhs_isac_ros.codebook.command import run as run_command
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.parameters import CODEBOOK
+from rhs_isac_ros.ros.parameter_service import GroupParameterService
+from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
+from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
 from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
 from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.run import run
@@ -28,48 +30,80 @@ from rhs_isac_ros.ros.run import run
 PUSHER_NODE = 'codebook_pusher'
 
 
-class OptimizerNode(Node):
-    """Holds the codebook as parameters, checks each change as a whole, and publishes it latched.
+class OptimizerNode(ParameterizedNode):
+    """Holds the codebook as parameters, sets them as a whole only, and publishes it latched.
 
     The first codebook comes from a parameter file on the command line or from ``codebook_file``.
     While a newer optimizer is present, this one withdraws its announcement.
     """
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__(topics.OPTIMIZER_NODE, **node_options)
-        values = parameters.declare(self, 'optimizer')
-        self._scenario = parameters.scenario_of(values)
+        super().__init__(
+            topics.OPTIMIZER_NODE, start_parameter_services=False, **node_options)
+        self._scenario = parameters.scenario_of(self.values)
         self._instance = new_instance()
         # None while the node stands by.
         self._publisher: Publisher | None = None
-        defaults = Codebook.load(values.codebook_file or default_codebook_file()).to_parameters()
+        file = self.values.codebook_file or default_codebook_file()
+        defaults = Codebook.load(file).to_parameters()
         for name, text in CODEBOOK.items():
             self.declare_parameter(name, defaults[name], ParameterDescriptor(description=text))
         self._codebook_id, self._refused = '', 0
+        # A file of an earlier version contains another provenance, and may lack the id.
+        self.set_parameters_atomically(
+            [Parameter(name, value=value)
+             for name, value in self._declared_codebook().to_parameters().items()])
         self._announce(False)
         self._presence = PresenceClient(
             self, topics.OPTIMIZER_NODE, self._instance, self._scenario, self._announce)
         self._diagnostics = Diagnostics(self, self._report)
-        self.add_on_set_parameters_callback(self._check)
-        self.add_post_set_parameters_callback(self._on_set)
+        self.add_pre_set_parameters_callback(self._normalize)
+        self.add_on_set_parameters_callback(self._check_codebook)
+        self.add_post_set_parameters_callback(self._on_codebook_set)
+        # Last, so that no request arrives before the parameters are declared.
+        self._parameter_service = GroupParameterService(self, CODEBOOK_PREFIX)
 
-    def _assemble(self, changes: dict[str, Any]) -> Codebook:
-        present = {name: self.get_parameter(name).value for name in CODEBOOK}
-        codebook = Codebook.from_parameters(present | changes)
+    def _declared_codebook(self) -> Codebook:
+        return self._codebook_of({name: self.get_parameter(name).value for name in CODEBOOK})
+
+    def _codebook_of(self, values: dict[str, Any]) -> Codebook:
+        codebook = Codebook.from_parameters(values)
         codebook.check(self._scenario)
         return codebook
 
-    def _check(self, changes: list[Parameter]) -> SetParametersResult:
+    def _normalize(self, changes: list[Parameter]) -> list[Parameter]:
+        """Give a valid codebook the types and the id that the parameters have."""
+        given = _codebook_values(changes)
+        if given.keys() != CODEBOOK.keys():
+            return changes
         try:
-            self._assemble({p.name: p.value for p in changes if p.name in CODEBOOK})
+            normal = self._codebook_of(given).to_parameters()
+        except CodebookError:
+            # The check returns the reason.
+            return changes
+        return [Parameter(p.name, value=normal[p.name]) if p.name in normal else p
+                for p in changes]
+
+    def _check_codebook(self, changes: list[Parameter]) -> SetParametersResult:
+        given = _codebook_values(changes)
+        if all(same_value(self.get_parameter(p.name), p) for p in changes if p.name in given):
+            return SetParametersResult(successful=True)
+        try:
+            if missing := [name for name in CODEBOOK if name not in given]:
+                raise CodebookError(
+                    f'{", ".join(given)}: set without {", ".join(missing)}, expected the whole '
+                    'codebook in one request')
+            self._codebook_of(given)
         except CodebookError as error:
             self._refused += 1
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _on_set(self, changes: list[Parameter]) -> None:
-        if any(p.name in CODEBOOK for p in changes):
-            self._publish(self._assemble({}))
+    def _on_codebook_set(self, changes: list[Parameter]) -> None:
+        given = _codebook_values(changes)
+        # A request that repeats some of the values changes nothing.
+        if given.keys() == CODEBOOK.keys():
+            self._publish(self._codebook_of(given))
 
     def _report(self) -> Report:
         conflicts = self._presence.conflicts()
@@ -85,7 +119,7 @@ class OptimizerNode(Node):
         if not stands_by:
             self._publisher = self._publisher or self.create_publisher(
                 ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
-            self._publish(self._assemble({}))
+            self._publish(self._declared_codebook())
 
     def _publish(self, codebook: Codebook) -> None:
         self._codebook_id = codebook.id
@@ -96,6 +130,10 @@ class OptimizerNode(Node):
             codebook, stamp, self._instance, self._scenario.id))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
+
+
+def _codebook_values(changes: list[Parameter]) -> dict[str, Any]:
+    return {p.name: p.value for p in changes if p.name in CODEBOOK}
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -5,12 +5,21 @@ import types
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.parameter import ParameterError
+
+_FLOATING = (Parameter.Type.DOUBLE, Parameter.Type.DOUBLE_ARRAY)
+
+
+def same_value(one: Parameter, other: Parameter) -> bool:
+    """Return whether two parameters have the same type and value; NaN equals NaN."""
+    return one.type_ == other.type_ and bool(np.array_equal(
+        one.value, other.value, equal_nan=one.type_ in _FLOATING))
 
 
 class ParameterizedNode(Node):
@@ -77,13 +86,23 @@ class ParameterizedNode(Node):
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters together, as the parameter services do.
 
-        Unlike that of rclpy, the reason for a rejection states the value and the valid range.
+        Unlike that of rclpy, the reason for a rejection states the value and the valid range, and
+        read-only parameters may be given if they keep their values, as in a dump of the node.
         """
+        parameter_list = [p for p in parameter_list if not self._is_kept(p)]
+        if not parameter_list:
+            return SetParametersResult(successful=True)
         try:
             self._check_each(parameter_list)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return super().set_parameters_atomically(parameter_list)
+
+    def _is_kept(self, parameter: Parameter) -> bool:
+        """Return whether a parameter is read-only and keeps its value."""
+        name = parameter.name
+        return (self.has_parameter(name) and self.describe_parameter(name).read_only
+                and same_value(self.get_parameter(name), parameter))
 
     def _dynamic_values(self, changes: Iterable[Parameter]) -> dict[str, Any]:
         return {p.name: p.value for p in changes if p.name in self._dynamic}

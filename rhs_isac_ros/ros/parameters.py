@@ -95,6 +95,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     ),
 }
 
+CODEBOOK_PREFIX = 'codebook.'
 # The parameters that hold the codebook, with their descriptions; only the optimizer has them.
 CODEBOOK: Mapping[str, str] = {
     'codebook.id': 'Hash of the content, which must match.',

@@ -11,7 +11,11 @@ from typing import Any
 
 import yaml
 from rcl_interfaces.msg import Parameter, ParameterType
-from rclpy.parameter import get_parameter_value, parameter_value_to_python
+from rclpy.parameter import (
+    get_parameter_value,
+    parameter_dict_from_yaml_file,
+    parameter_value_to_python,
+)
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
@@ -130,6 +134,36 @@ def dump(session: Session, options: argparse.Namespace) -> None:
     print_now(yaml.dump({node: {'ros__parameters': tree}}, default_flow_style=False))
 
 
+def load(session: Session, options: argparse.Namespace) -> None:
+    """Set the parameters that a parameter file contains.
+
+    Raises
+    ------
+    ToolError
+        If the file is invalid, the node does not exist, or it rejects a value.
+    """
+    try:
+        names = list(parameter_dict_from_yaml_file(
+            options.parameter_file, not options.no_use_wildcard))
+    except (OSError, ValueError, AttributeError, AssertionError, TypeError, RuntimeError,
+            yaml.YAMLError) as error:
+        reason = ' '.join(str(error).split())
+        raise ToolError(f'{options.parameter_file}: {reason}, expected a parameter file') from None
+    node = _find(session, options)
+    response = _call(session, node, lambda client: client.load_parameter_file(
+        options.parameter_file, not options.no_use_wildcard))
+    failed = 0
+    for name, result in zip(names, response.results, strict=True):
+        reason = f': {result.reason}' if result.reason else ''
+        if result.successful:
+            print_now(f'Set parameter {name} successful{reason}')
+        else:
+            failed += 1
+            print(f'Set parameter {name} failed{reason}', file=sys.stderr)
+    if failed:
+        raise ToolError(f'{failed} of {len(names)} parameters not set')
+
+
 def _get_values(session: Session, node: str, names: list[str]) -> list[Any]:
     return list(_call(session, node, lambda client: client.get_parameters(names)).values)
 
@@ -164,13 +198,14 @@ def _call(session: Session, node: str, request: Callable[[AsyncParameterClient],
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='param', description='Read and set the parameters of running nodes.')
-    verbs = parser.add_subparsers(required=True, metavar='list | get | set | dump')
+    verbs = parser.add_subparsers(required=True, metavar='list | get | set | dump | load')
     subparsers = {}
     for name, verb, text in (
             ('list', show_list, 'Print the names of the parameters of one node or of all nodes.'),
             ('get', get, 'Print the value of a parameter.'),
             ('set', set_value, 'Set a parameter.'),
-            ('dump', dump, 'Print the parameters of a node as a parameter file.')):
+            ('dump', dump, 'Print the parameters of a node as a parameter file.'),
+            ('load', load, 'Set the parameters that a parameter file contains.')):
         subparser = subparsers[name] = verbs.add_parser(name, help=text)
         subparser.set_defaults(verb=verb)
         subparser.add_argument('node_name', nargs='?' if verb is show_list else None)
@@ -180,6 +215,9 @@ def _parser() -> argparse.ArgumentParser:
                                help='include hidden nodes')
         subparser.add_argument('--timeout', type=float, default=3.0, metavar='S',
                                help='maximum time to discover the node (default: 3 s)')
+    subparsers['load'].add_argument('parameter_file', help='parameter file')
+    subparsers['load'].add_argument('--no-use-wildcard', action='store_true',
+                                    help="ignore the parameters of the node '/**'")
     subparsers['set'].add_argument('value', help='value in YAML')
     subparsers['get'].add_argument('--hide-type', action='store_true',
                                    help='print the value without its type')

@@ -5,8 +5,9 @@ import yaml
 
 from rhs_isac_ros.codebook import provenance_text as text
 
-WORDS = ['done', 'max_steps reached', 'null', 'true', 'NaN', '0.1.0', '1e3', '', ' ends ', 'a, b=c',
-         'a: b, {c} [d] #e', '"quoted" and \'quoted\'', 'é ∞', 'line\nline', '\x07', '%s & *x !tag']
+WORDS = ['done', 'max_steps reached', 'null', 'true', 'NaN', '0.1.0', '1e3', '', ' ends ',
+         'a, b=c', 'a: b, {c} [d] #e', '"quoted" and \'quoted\'', 'é ∞', 'line\nline', '\x07',
+         '%s & *x !tag']
 
 
 @pytest.mark.parametrize('value', [
@@ -38,5 +39,6 @@ def test_plain_text_is_its_own_parameter():
 
 
 def test_the_yaml_of_earlier_versions_is_converted():
-    assert text.from_parameter('{method: lbfgs, scenario: {n_feeds: 2}, reason: max_steps reached}'
-                               ) == 'method=lbfgs, scenario={"n_feeds":2}, reason=max_steps reached'
+    legacy = '{method: lbfgs, scenario: {n_feeds: 2}, reason: max_steps reached}'
+    assert text.from_parameter(legacy) == (
+        'method=lbfgs, scenario={"n_feeds":2}, reason=max_steps reached')

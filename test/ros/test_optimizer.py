@@ -6,9 +6,10 @@ import re
 
 import numpy as np
 import pytest
+import yaml
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 import rhs_isac_msgs.msg as ros
@@ -105,6 +106,7 @@ def test_a_change_without_an_id_receives_one(bench, optimizer, client, probe, ot
     assert answer.result.successful, answer.result.reason
     bench.until(lambda: len(received) == 2, 'the new codebook')
     assert received[1].codebook_id == other.id
+    assert optimizer.get_parameter('codebook.id').value == other.id
 
 
 def test_the_same_codebook_is_accepted_again(bench, client, shipped):
@@ -143,15 +145,16 @@ def test_a_change_to_an_invalid_codebook_is_rejected_as_a_whole(
     changes, text = wrong_sets()[name]
     wrong = [Parameter(f'codebook.{k}', value=v) if isinstance(v, list | str) else
              Parameter(f'codebook.{k}', v, []) for k, v in changes.items()]
-    answer = bench.result(client.set_parameters_atomically(wrong))
-    assert not answer.result.successful
-    assert re.search(text, answer.result.reason), answer.result.reason
+    whole = [p for p in as_parameters(shipped) if p.name not in {p.name for p in wrong}] + wrong
+    result = bench.result(client.set_parameters_atomically(whole)).result
+    assert not result.successful
+    assert re.search(text, result.reason), result.reason
+    assert bench.result(client.set_parameters(whole)).results == [result] * 7
     # No parameter is accepted alone either: the node keeps its codebook.
     for parameter in wrong:
         result, = bench.result(client.set_parameters([parameter])).results
-        if parameter.value != '':
-            assert not result.successful
-            assert result.reason
+        assert not result.successful
+        assert result.reason
     assert held(optimizer).id == shipped.id
     bench.result(client.set_parameters_atomically(as_parameters(other)))
     bench.until(lambda: received[-1].codebook_id == other.id, 'the next good codebook')
@@ -189,12 +192,84 @@ def test_a_codebook_file_is_a_parameter_file(bench, other, tmp_path, shipped, na
         bench.remove(node)
 
 
-def test_a_codebook_file_can_be_loaded_at_run_time(bench, optimizer, client, other, tmp_path):
+@pytest.mark.parametrize('changes', [
+    {'average_crlb_m2': 0.2, 'provenance': 'a test'}, {'provenance': 'a: {test}'}])
+def test_a_codebook_file_can_be_loaded_at_run_time(
+        bench, optimizer, client, other, tmp_path, changes):
+    """``ros2 param load`` sends the values as text, where NaN and 1e-05 become strings."""
     path = tmp_path / 'other.yaml'
-    dataclasses.replace(other, average_crlb_m2=0.2, provenance='a test').save(path)
-    answer = bench.result(client.load_parameter_file_atomically(str(path), use_wildcard=True))
-    assert answer.result.successful
+    analog = other.analog.copy()
+    analog[0, 0, :2] = 1e-5, 1.0
+    new = dataclasses.replace(other, analog=analog, **changes)
+    new.save(path)
+    response = bench.result(client.load_parameter_file(str(path), use_wildcard=True))
+    assert [result.successful for result in response.results] == [True] * 7, response
+    assert held(optimizer).id == new.id
+    assert held(optimizer).average_crlb_m2 == pytest.approx(new.average_crlb_m2, nan_ok=True)
+    assert held(optimizer).provenance == new.provenance
+
+
+def test_a_shipped_codebook_file_can_be_loaded_at_run_time(bench, optimizer, client):
+    path = default_codebook_file().with_name('codebook_crlb.yaml')
+    response = bench.result(client.load_parameter_file(str(path), use_wildcard=True))
+    assert all(result.successful for result in response.results), response
+    assert held(optimizer).id == Codebook.load(path).id
+
+
+def test_a_dump_can_be_loaded_again(bench, optimizer, client, probe, shipped, other, tmp_path):
+    """It also contains read-only parameters, which keep their values."""
+    names = bench.result(client.list_parameters()).result.names
+    values = bench.result(client.get_parameters(names)).values
+    assert {'scenario_file', 'codebook_file', 'use_sim_time'} <= set(names)
+    path = tmp_path / 'dump.yaml'
+    path.write_text(yaml.dump({'/optimizer': {'ros__parameters': {
+        name: parameter_value_to_python(value)
+        for name, value in zip(names, values, strict=True)}}}), encoding='utf-8')
+    received = latched(bench, probe)
+    bench.result(client.set_parameters_atomically(as_parameters(other)))
+    response = bench.result(client.load_parameter_file(str(path)))
+    assert all(result.successful for result in response.results), response
+    bench.until(lambda: received[-1].codebook_id == shipped.id, 'the codebook of the dump')
+    assert held(optimizer).provenance == shipped.provenance
+
+
+def test_a_part_of_a_codebook_is_refused_with_the_names_of_what_is_missing(
+        bench, optimizer, client, shipped):
+    average, provenance = (Parameter('codebook.average_crlb', value=1.0),
+                           Parameter('codebook.provenance', value='by hand'))
+    alone, = bench.result(client.set_parameters([average])).results
+    assert not alone.successful
+    assert alone.reason == (
+        'codebook.average_crlb: set without codebook.id, codebook.shape, codebook.provenance, '
+        'codebook.analog, codebook.digital_re, codebook.digital_im, expected the whole codebook '
+        'in one request')
+    two = bench.result(client.set_parameters([average, provenance])).results
+    assert 'codebook.average_crlb, codebook.provenance: set without' in two[0].reason
+    assert two[0] == two[1]
+    assert held(optimizer).average_crlb_m2 == shipped.average_crlb_m2
+
+
+def test_the_other_parameters_of_a_request_are_set_one_by_one(bench, optimizer, client, other):
+    request = [Parameter('scenario_file', value='/x'), *as_parameters(other),
+               Parameter('codebook_file', value=''), Parameter('nothing', value=1)]
+    results = bench.result(client.set_parameters(request)).results
+    assert [result.successful for result in results] == [False, *[True] * 8, False]
     assert held(optimizer).id == other.id
+    undeclared = [*as_parameters(other), Parameter('codebook.name', value='x')]
+    results = bench.result(client.set_parameters(undeclared)).results
+    assert not any(result.successful for result in results)
+
+
+def test_a_file_of_an_earlier_version_is_converted_at_the_start(bench, other, tmp_path):
+    path = tmp_path / 'other.yaml'
+    dataclasses.replace(other, provenance='old').save(path)
+    text = path.read_text(encoding='utf-8').replace('provenance: old', "provenance: '{seed: 0}'")
+    path.write_text(re.sub('^ *id: .*\n', '', text, flags=re.MULTILINE), encoding='utf-8')
+    node = bench.add(
+        OptimizerNode, use_global_arguments=False,
+        cli_args=['--ros-args', '--params-file', str(path), '-p', 'codebook.id:=""'])
+    assert node.get_parameter('codebook.provenance').value == 'seed=0'
+    assert node.get_parameter('codebook.id').value == other.id
 
 
 def test_scenario_and_codebook_come_from_the_given_files(bench, small, small_files):

@@ -37,9 +37,8 @@ def test_dump_is_a_parameter_file(output_of):
 
 def test_set_changes_the_parameter_or_prints_the_reason(output_of, call):
     out, err, code = call(main, 'set', 'optimizer', 'codebook.provenance', 'by hand')
-    assert (out, err, code) == ('Set parameter successful\n', '', 0)
-    assert output_of(main, 'get', 'optimizer', 'codebook.provenance') == (
-        'String value is: by hand\n')
+    assert (out, code) == ('', 1)
+    assert 'codebook.provenance: set without codebook.id' in err
     out, err, code = call(main, 'set', 'bs', 'seed', '1')
     assert (out, code) == ('', 1)
     assert err.startswith('Setting parameter failed: ')
@@ -51,6 +50,22 @@ def test_set_changes_the_parameter_or_prints_the_reason(output_of, call):
     assert err == ("Setting parameter failed: policy: 'nonsense', expected one of round_robin, "
                    'first, random\n')
     assert output_of(main, 'get', '/bs', 'policy') == 'String value is: random\n'
+
+
+def test_load_sets_the_parameters_of_a_dump(output_of, call, tmp_path):
+    path = tmp_path / 'dump.yaml'
+    path.write_text(output_of(main, 'dump', 'optimizer'), encoding='utf-8')
+    out = output_of(main, 'load', 'optimizer', str(path))
+    assert 'Set parameter codebook.analog successful\n' in out
+    assert 'Set parameter scenario_file successful\n' in out
+    path.write_text('/**: {ros__parameters: {policy: first, seed: 9}}', encoding='utf-8')
+    out, err, code = call(main, 'load', 'bs', str(path))
+    assert (out, code) == ('Set parameter policy successful\n', 1)
+    assert 'Set parameter seed failed: ' in err and '1 of 2 parameters not set' in err
+    path.write_text('[]', encoding='utf-8')
+    out, err, code = call(main, 'load', 'bs', str(path))
+    assert (out, code) == ('', 1)
+    assert 'expected a parameter file' in err
 
 
 def test_missing_nodes_and_parameters_are_errors(call):
