@@ -119,13 +119,32 @@ class SceneState:
 
     @property
     def complete(self) -> bool:
-        """Whether surface, beam and users are known, and every user has an estimate."""
-        return (self.configuration is not None and self.beam is not None and bool(self.users)
+        """Whether the surface, the users and the beam of a known estimate are known.
+
+        Every user has an estimate.
+        """
+        return (self.configuration is not None and self.shown_beam is not None
                 and all(state.estimate for state in self.users.values()))
 
     @property
-    def latest_user(self) -> UserState | None:
-        """The user of the latest cycle that yielded an estimate; None if there is none."""
+    def shown_user(self) -> UserState | None:
+        """The user of the latest cycle with an estimate and a beam, or else with an estimate.
+
+        None if there is no estimate.
+        """
+        if self.beam is not None:
+            state = self.users.get(self.beam.user)
+            if state and state.estimate and state.estimate.cycle_id == self.beam.cycle_id:
+                return state
         cycles = [(state.estimate.cycle_id, user) for user, state in self.users.items()
                   if state.estimate]
         return self.users[max(cycles)[1]] if cycles else None
+
+    @property
+    def shown_beam(self) -> m.Beam | None:
+        """The beam of the cycle in which the shown user was estimated; None if it is unknown."""
+        shown = self.shown_user
+        if shown is None or shown.estimate is None or self.beam is None:
+            return None
+        same = (shown.user, shown.estimate.cycle_id) == (self.beam.user, self.beam.cycle_id)
+        return self.beam if same else None

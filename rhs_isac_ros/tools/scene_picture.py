@@ -51,7 +51,7 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
     limits_m = [_limit_m(scenario, axis) for axis in (1, 2)]
     grid = figure.add_gridspec(3, 2, width_ratios=(1.9, 1),
                                height_ratios=[*limits_m, _LEGEND_ROW * sum(limits_m)])
-    pattern = _pattern(scene.beam, scenario)
+    pattern = _pattern(scene.shown_beam, scenario)
     above, side = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     _draw_view(above, [0, 1], scene, scenario, pattern)
     _draw_view(side, [0, 2], scene, scenario, pattern)
@@ -59,7 +59,7 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
     side.set_title('from the side', loc='left')
     right = grid[:2, 1].subgridspec(2, 1, height_ratios=(1.5, 1))
     _draw_surface(figure.add_subplot(right[0]), scene, scenario)
-    _draw_pattern(figure.add_subplot(right[1], projection='polar'), scene.beam, pattern)
+    _draw_pattern(figure.add_subplot(right[1], projection='polar'), scene.shown_beam, pattern)
     figure.suptitle(_title(scene), fontsize='x-large')
     # A legend of the figure gets room from the layout only since Matplotlib 3.7.
     below = figure.add_subplot(grid[2, :])
@@ -69,11 +69,11 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
 
 
 def _title(scene: SceneState) -> str:
-    latest = scene.latest_user
-    if latest is None or latest.estimate is None:
+    shown = scene.shown_user
+    if shown is None or shown.estimate is None:
         return 'no estimate yet'
-    error = f', error {latest.error_m:.2f} m' if not math.isnan(latest.error_m) else ''
-    return f'cycle {latest.estimate.cycle_id}, user {latest.user}{error}'
+    error = f', error {shown.error_m:.2f} m' if not math.isnan(shown.error_m) else ''
+    return f'cycle {shown.estimate.cycle_id}, user {shown.user}{error}'
 
 
 def _pattern(beam: BeamMessage | None, scenario: Scenario) -> BeamPattern | None:
@@ -101,11 +101,11 @@ def _draw_view(
     low, high = (bound[plane] for bound in scenario.roi_bounds_m)
     axes.add_patch(Rectangle(low, *(high - low), facecolor='0.95', edgecolor='0.4',
                              linestyle='--', zorder=0))
-    if pattern is not None and scene.beam is not None:
+    if pattern is not None and scene.shown_beam is not None:
         row, column = pattern.peak
         lobe = lobe_m(pattern)
         cut = lobe[row] if plane == [0, 1] else lobe[:, column]
-        colour = _colour(scene.beam.user)
+        colour = _colour(scene.shown_beam.user)
         axes.fill(*cut[:, plane].T, facecolor=colour, alpha=0.13, zorder=1)
         axes.plot(*cut[:, plane].T, color=colour, alpha=0.5, linewidth=0.8, zorder=1)
     half_m = element_interval_m(scenario) * scenario.elements_per_side / 2
@@ -198,7 +198,7 @@ def _legend(scene: SceneState) -> list[Any]:
         marker('x', 'earlier estimates', markersize=4),
         Patch(facecolor='0.8', edgecolor='0.4', label='95 % of the posterior'),
         marker('D', 'feed', markerfacecolor='white', markeredgecolor='black')]
-    if scene.beam:
+    if scene.shown_beam:
         handles.append(Patch(facecolor='0.92', label=f'data beam, {MIN_LEVEL_DB:g} to 0 dB'))
     users = sorted(scene.users)
     handles += [Patch(color=_colour(user), label=f'user {user}') for user in users[:_MAX_LABELS]]

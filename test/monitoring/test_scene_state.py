@@ -20,9 +20,9 @@ def estimate(user, position, cycle_id):
         covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01)
 
 
-def beam(user):
+def beam(user, cycle_id=1):
     return m.Beam(
-        cycle_id=1, user=user, codebook_id='cb', band=0, analog=np.ones(4),
+        cycle_id=cycle_id, user=user, codebook_id='cb', band=0, analog=np.ones(4),
         digital=np.ones((2, 2), complex), expected_bps=1e6)
 
 
@@ -37,7 +37,13 @@ def test_the_scene_is_complete_once_every_user_has_an_estimate():
     assert not scene.complete
     scene.add(estimate(2, [8, 1, 0], 2), 1.0)
     assert scene.complete
-    assert scene.latest_user.user == 2
+    # User and beam belong to the same cycle, although the other user has a later estimate.
+    assert (scene.shown_user.user, scene.shown_beam.user) == (1, 1)
+    scene.add(estimate(1, [9, 1, 0], 3), 1.0)
+    assert (scene.shown_user.user, scene.shown_beam) == (1, None)
+    assert not scene.complete
+    scene.add(beam(1, 3), 1.0)
+    assert scene.complete
 
 
 def test_the_messages_of_a_network_complete_it(network):
@@ -48,7 +54,7 @@ def test_the_messages_of_a_network_complete_it(network):
         if isinstance(sent.message, RECEIVES):
             scene.add(sent.message, sent.time_s)
     assert scene.complete
-    assert scene.latest_user.estimate.cycle_id == 3
+    assert scene.shown_user.estimate.cycle_id == 3
     assert len(scene.users[1].estimated_path) == 3
     assert scene.beam.cycle_id == 3
 
