@@ -27,6 +27,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
     PeersChanged,
+    Reply,
     RevertSettings,
     Send,
     SettingsOffered,
@@ -155,6 +156,8 @@ class Network:
         self.log: list[Sent] = []
         self.logs: list[Logged] = []
         self.kept: list[Any] = []
+        # Replies to operators.
+        self.replies: list[Reply] = []
         self._ends: list[tuple[int, int, str]] = []
         self.codebooks = {} if codebook is None else {codebook.id: codebook}
         self._roles: dict[str, Any] = {}
@@ -231,6 +234,8 @@ class Network:
                 self._make_estimator(name, action)
             elif isinstance(action, RevertSettings):
                 self.kept.append(action.settings)
+            elif isinstance(action, Reply):
+                self.replies.append(action)
             else:
                 self.logs.append(Logged(self.now_s, name, action))
 
@@ -320,6 +325,10 @@ class Network:
         return {name: dict(role.counters) for name, role in self._roles.items() if role.counters}
 
     def logged(self, name: str) -> list[str]:
+        """Return the texts that a role logged, without those that say that it serves."""
+        return [text for text in self.logged_texts(name) if not text.startswith('serving: ')]
+
+    def logged_texts(self, name: str) -> list[str]:
         return [logged.message.text for logged in self.logs if logged.role == name]
 
     def verify(self) -> None:

@@ -167,7 +167,8 @@ class Watch:
 
     def call(self, client, request, processes=()):
         """Return the response to a request of a client; lost requests are repeated."""
-        self.until(client.services_are_ready, 'the services', processes)
+        ready = getattr(client, 'services_are_ready', None) or client.service_is_ready
+        self.until(ready, 'the services', processes)
         futures, requested_s = [], -math.inf
 
         def response():

@@ -1,18 +1,31 @@
 """The executable ``bs``: the base station."""
 
+import functools
 import sys
 import time
 import types
 from typing import Any
 
 import numpy as np
+from std_srvs.srv import Trigger
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import streams
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, Resumed, StoodBy
+from rhs_isac_ros.protocol.events import (
+    Action,
+    CodebookOffered,
+    PauseRequested,
+    PeersChanged,
+    Reply,
+    Resumed,
+    ResumeRequested,
+    StepRequested,
+    StoodBy,
+)
 from rhs_isac_ros.protocol.settings import BaseStationSettings
+from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.peer_monitor import REQUIRED_BY_BASE_STATION, PeerMonitor
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -32,6 +45,10 @@ class BsNode(RoleNode[BaseStation]):
         self.start(BaseStation(
             self.scenario, self.make_settings(values), rng, self._receive,
             values.first_cycle or _cycle_from_clock()))
+        self._reply = Reply(False, '')
+        for name, event in ((topics.PAUSE, PauseRequested()), (topics.RESUME, ResumeRequested()),
+                            (topics.STEP, StepRequested())):
+            self.create_service(Trigger, name, functools.partial(self._on_request, event))
         self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
     def stand_by(self) -> None:
@@ -53,6 +70,26 @@ class BsNode(RoleNode[BaseStation]):
             If ``allowed_users`` is not a list of users.
         """
         return settings_of(BaseStationSettings, values)
+
+    def execute(self, action: Action) -> None:
+        """Store a reply for the service that requested it.
+
+        Raises
+        ------
+        TypeError
+            If the action is not a `Reply`.
+        """
+        if isinstance(action, Reply):
+            self._reply = action
+        else:
+            super().execute(action)
+
+    def _on_request(
+            self, event: PauseRequested | ResumeRequested | StepRequested, _: Trigger.Request,
+            response: Trigger.Response) -> Trigger.Response:
+        self.dispatch(event)
+        response.success, response.message = self._reply.success, self._reply.text
+        return response
 
     def _receive(
             self, codebook: Codebook, feeds: np.ndarray, user: int, cycle_id: int,

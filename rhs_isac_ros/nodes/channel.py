@@ -21,6 +21,8 @@ class ChannelNode(RoleNode[ImpairedChannel]):
         rng = streams.generator(values.seed, streams.AIR)
         self.start(ImpairedChannel(
             Channel(self.scenario, values.seed), self.make_settings(values), rng))
+        self.get_logger().info(  # type: ignore[no-untyped-call]
+            f'serving: {self.scenario.n_bands} bands, {self.scenario.n_elements} elements')
 
     def make_settings(self, values: types.SimpleNamespace) -> Impairments:
         """Return the impairments for parameter values."""

@@ -38,6 +38,7 @@ from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.ros.user_topics import UserTopics
 
 
 class PositionerNode(RoleNode[Positioner]):
@@ -49,6 +50,7 @@ class PositionerNode(RoleNode[Positioner]):
         self._worker = BackgroundWorker(self)
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
+        self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped})
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
         self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
@@ -117,10 +119,12 @@ class PositionerNode(RoleNode[Positioner]):
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
-        """Publish a message, and a pose for an estimate; return False if it is invalid."""
+        """Publish a message, and poses for an estimate; return False if it is invalid."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
-            self._pose.publish(convert.pose(message, self.get_clock().now().to_msg()))
+            pose = convert.pose(message, self.get_clock().now().to_msg())
+            for publisher in (self._pose, *self._user_poses.publishers(message.user)):
+                publisher.publish(pose)
         return is_published
 
     def destroy_node(self) -> None:

@@ -8,24 +8,21 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Path
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rhs_isac_ros.link import Beam, beam_pattern
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import markers, parameters, qos, topics
+from rhs_isac_ros.ros import markers, parameters, qos, topics, transforms
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.subscriptions import subscribe_messages
 from rhs_isac_ros.ros.timers import steady_timer
-
-# Maximum number of users with published paths. Each path has its own topic, and too many would
-# flood the graph.
-_MAX_PATHS = 64
+from rhs_isac_ros.ros.transforms import TransformPublisher
+from rhs_isac_ros.ros.user_topics import UserTopics
 
 
 class VisualizerNode(Node):
-    """Publishes surface, region, users, estimates and beam as markers, and the paths of users."""
+    """Publishes surface, region, users, estimates and beam as markers, paths and transforms."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('visualizer', **node_options)
@@ -37,17 +34,27 @@ class VisualizerNode(Node):
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
         self._publisher = self.create_publisher(MarkerArray, topics.MARKERS, qos.EXCHANGE)
-        self._paths: dict[int, tuple[Publisher, Publisher]] = {}
-        subscribe_messages(self, RECEIVES, self._scenario.sizes,
-                           lambda message: self._scene.add(message, time.monotonic()),
+        self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path})
+        self._transforms = TransformPublisher(self)
+        subscribe_messages(self, RECEIVES, self._scenario.sizes, self._on_message,
                            scenario_id=self._scenario.id)
         steady_timer(self, values.period_s, self._show)
+        self.get_logger().info(  # type: ignore[no-untyped-call]
+            'serving: markers, paths' + (
+                ' and transforms' if self._transforms.available
+                else '; no transforms, because tf2_msgs is not installed'))
+
+    def _on_message(self, message: m.Message) -> None:
+        self._scene.add(message, time.monotonic())
+        # As for the topics, the number of frames is bounded: tf2 keeps every frame.
+        if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
+            self._transforms.publish(transforms.user(
+                message.user, message.position, self.get_clock().now().to_msg()))
 
     def _show(self) -> None:
         """Publish the whole scene, so that late joiners receive it."""
         for user in self._scene.discard_stale(time.monotonic() - self._forget_s):
-            for publisher in self._paths.pop(user, ()):
-                self.destroy_publisher(publisher)
+            self._paths.remove(user)
         stamp = self.get_clock().now().to_msg()
         for state in self._scene.users.values():
             self._show_paths(state, stamp)
@@ -55,15 +62,9 @@ class VisualizerNode(Node):
             self._show_markers(stamp)
 
     def _show_paths(self, user: UserState, stamp: Time) -> None:
-        if user.user not in self._paths:
-            if len(self._paths) == _MAX_PATHS:
-                return
-            estimated, true = (
-                self.create_publisher(Path, name.format(user=user.user), qos.EXCHANGE)
-                for name in (topics.PATH, topics.TRUE_PATH))
-            self._paths[user.user] = estimated, true
         paths = user.estimated_path, user.true_path
-        for publisher, path in zip(self._paths[user.user], paths, strict=True):
+        # Without publishers, the zip is empty.
+        for publisher, path in zip(self._paths.publishers(user.user), paths, strict=False):
             if path and publisher.get_subscription_count():
                 publisher.publish(markers.path(path, stamp))
 

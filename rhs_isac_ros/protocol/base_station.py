@@ -6,9 +6,12 @@ from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.base_station_steps import BaseStationSteps
 from rhs_isac_ros.protocol.events import (
     CodebookOffered,
+    PauseRequested,
     PeersChanged,
     Resumed,
+    ResumeRequested,
     SettingsOffered,
+    StepRequested,
     StoodBy,
     Timeout,
 )
@@ -38,6 +41,7 @@ class BaseStation(BaseStationSteps):
     TABLE = base_station_table.TABLE
     EVENT_NAMES = {
         CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
+        PauseRequested: 'pause', ResumeRequested: 'resume', StepRequested: 'step',
         StoodBy: 'stood_by', Resumed: 'resumed', Timeout: 'timeout', m.Ack: 'ack',
         m.RhsConfiguration: 'configured', m.FeedSignals: 'frame', m.PositionEstimate: 'estimate',
         m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}

@@ -9,7 +9,14 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.ack_filter import AckFilter, parse_users
 from rhs_isac_ros.protocol.base_station_states import Cycle, State, timeouts
-from rhs_isac_ros.protocol.events import CodebookOffered, PeersChanged, Timeout
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    PeersChanged,
+    ResumeRequested,
+    StepRequested,
+    StoodBy,
+    Timeout,
+)
 from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
 from rhs_isac_ros.protocol.outage_log import OutageLog
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
@@ -32,6 +39,8 @@ class BaseStationGuards(StateMachine[State]):
         self._users = UserScheduler(settings.policy, rng)
         self._instances = UserInstances()
         self._settings = PendingSettings(settings)
+        # Whether an operator has requested a pause, which begins after the current cycle.
+        self._pausing = False
         self._use(settings)
         # The codebook of the current cycle, and the one for the next.
         self._codebook: Codebook | None = None
@@ -44,7 +53,7 @@ class BaseStationGuards(StateMachine[State]):
     def _use(self, settings: BaseStationSettings) -> None:
         self._users.set_policy(settings.policy)
         self._ack_filter = AckFilter(parse_users(settings.allowed_users), settings.ack_rate_hz)
-        self._timeouts_s = timeouts(settings)
+        self._timeouts_s = timeouts(settings, self._pausing)
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use, pending settings and conflicts."""
@@ -57,9 +66,16 @@ class BaseStationGuards(StateMachine[State]):
 
     # Guards: readiness and timeouts
 
-    def not_ready(self, event: Timeout, now_s: float) -> bool:
+    def not_ready(
+            self, event: Timeout | ResumeRequested | StepRequested, now_s: float) -> bool:
         """Whether a role or the codebook is missing."""
-        return bool(self._missing) or not self._offered
+        return self._missing != () or not self._offered
+
+    def pausing(
+            self, event: Timeout | ResumeRequested | StepRequested | StoodBy, now_s: float,
+    ) -> bool:
+        """Whether an operator has requested a pause."""
+        return self._pausing
 
     def peers_present(self, event: CodebookOffered, now_s: float) -> bool:
         """Whether all roles are present."""

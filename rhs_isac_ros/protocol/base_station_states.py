@@ -12,7 +12,8 @@ class State(enum.Enum):
     """States of the base station."""
 
     WAITING = 'waiting'            # waits for a codebook and the other roles
-    RESTING = 'resting'            # pauses between cycles
+    PAUSED = 'paused'              # waits for an operator to resume or step the cycles
+    RESTING = 'resting'            # waits between cycles
     BEACONING = 'beaconing'        # waits for acks
     CONFIGURING = 'configuring'    # waits for the RHS to apply a band's configurations
     SOUNDING = 'sounding'          # waits for the feed signals of a band
@@ -26,11 +27,14 @@ STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, St
 NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
 
 
-def timeouts(settings: BaseStationSettings) -> dict[State, float]:
-    """Return the timeouts by state [s]; that of a step is divided equally among its attempts."""
+def timeouts(settings: BaseStationSettings, pausing: bool) -> dict[State, float]:
+    """Return the timeouts by state [s]; that of a step is divided equally among its attempts.
+
+    There is no rest before a pause.
+    """
     attempt_s = settings.step_timeout_s / (settings.retries + 1)
-    return {State.RESTING: settings.rest_s, State.BEACONING: settings.ack_timeout_s,
-            **dict.fromkeys(STEPS, attempt_s)}
+    return {State.RESTING: 0.0 if pausing else settings.rest_s,
+            State.BEACONING: settings.ack_timeout_s, **dict.fromkeys(STEPS, attempt_s)}
 
 
 @dataclasses.dataclass

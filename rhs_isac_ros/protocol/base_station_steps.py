@@ -2,15 +2,20 @@
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_guards import BaseStationGuards
-from rhs_isac_ros.protocol.base_station_states import Cycle
+from rhs_isac_ros.protocol.base_station_states import Cycle, timeouts
 from rhs_isac_ros.protocol.events import (
     Action,
     CodebookOffered,
     Event,
+    LogMessage,
+    PauseRequested,
     PeersChanged,
+    Reply,
     Resumed,
+    ResumeRequested,
     Send,
     SettingsOffered,
+    StepRequested,
     StoodBy,
     Timeout,
 )
@@ -51,15 +56,80 @@ class BaseStationSteps(BaseStationGuards):
     def _apply_settings(self) -> list[Action]:
         messages = self._settings.apply()
         if messages:
-            self._use(self._settings.in_use)
+            settings = self._settings.in_use
+            self._use(settings)
+            removed = self._users.remove_all_except(self._ack_filter.allows)
+            messages += self._outages.log_removed_users(removed, settings.allowed_users)
         return [*messages]
 
     def log_not_ready(self, event: Event, now_s: float) -> list[Action]:
         """Log what is missing, once the presence of the other roles is known."""
         if self._missing is None:
             return []
-        codebook = () if self._offered else ('codebook',)
-        return [*self._outages.log_waiting((*self._missing, *codebook))]
+        return [*self._outages.log_waiting(self._lacking())]
+
+    def _lacking(self) -> tuple[str, ...]:
+        roles = ('the other roles',) if self._missing is None else self._missing
+        return roles if self._offered else (*roles, 'codebook')
+
+    # Pause
+
+    def pause(self, event: PauseRequested, now_s: float) -> None:
+        """Store that a pause was requested."""
+        self._set_pausing(True)
+
+    def resume(self, event: ResumeRequested, now_s: float) -> list[Action]:
+        """Store that no pause is requested any more, and log that cycles resume."""
+        self._set_pausing(False)
+        return [LogMessage('resumed')]
+
+    def _set_pausing(self, pausing: bool) -> None:
+        self._pausing = pausing
+        self._timeouts_s = timeouts(self._settings.in_use, pausing)
+
+    def log_paused(self, event: PauseRequested | Timeout, now_s: float) -> list[Action]:
+        """Log that the pause begins."""
+        return [LogMessage(f'paused after cycle {self._cycle.id}')]
+
+    def log_unanswered(self, event: Timeout, now_s: float) -> list[Action]:
+        """Log that the pause begins because no user answered the beacon."""
+        return [LogMessage(f'paused: no user answered the beacon of cycle {self._cycle.id}')]
+
+    def reply_paused(self, event: PauseRequested, now_s: float) -> list[Action]:
+        """Reply that the pause has begun."""
+        return [Reply(True, 'paused')]
+
+    def reply_already_paused(self, event: PauseRequested, now_s: float) -> list[Action]:
+        """Reply that nothing changes."""
+        return [Reply(True, 'already paused')]
+
+    def reply_pausing(self, event: PauseRequested, now_s: float) -> list[Action]:
+        """Reply that the pause begins later."""
+        return [Reply(True, f'the pause begins after cycle {self._cycle.id}')]
+
+    def reply_resumed(self, event: ResumeRequested, now_s: float) -> list[Action]:
+        """Reply that cycles resume, and what they wait for."""
+        lacking = ', '.join(self._lacking())
+        return [Reply(True, f'resumed; waiting for {lacking}' if lacking else 'resumed')]
+
+    def reply_not_paused(
+            self, event: ResumeRequested | StepRequested, now_s: float) -> list[Action]:
+        """Reply that there is no pause; without one, a step is refused."""
+        if isinstance(event, StepRequested):
+            return [Reply(False, 'not paused; a step requires a pause')]
+        return [Reply(True, 'not paused')]
+
+    def reply_stepping(self, event: StepRequested, now_s: float) -> list[Action]:
+        """Reply that one cycle begins."""
+        return [Reply(True, f'cycle {self._cycle.id} begins')]
+
+    def reply_busy(self, event: StepRequested, now_s: float) -> list[Action]:
+        """Reply that a step is refused during a cycle."""
+        return [Reply(False, f'cycle {self._cycle.id} has not ended')]
+
+    def reply_not_ready(self, event: StepRequested, now_s: float) -> list[Action]:
+        """Reply that a step is refused because something is missing."""
+        return [Reply(False, f'waiting for {", ".join(self._lacking())}')]
 
     # Beaconing
 
@@ -201,7 +271,8 @@ class BaseStationSteps(BaseStationGuards):
         """End the cycle: the user was served."""
         cycle = self._cycle
         return [Send(self._times.end_cycle('served', cycle.id, cycle.user, now_s)),
-                *self._outages.log_served_cycle(cycle.id, cycle.user),
+                *self._outages.log_served_cycle(
+                    cycle.id, cycle.user, self._codebook_id, self._users.n_users),
                 *self._apply_settings()]
 
     def _announce(self, phase: m.Phase, now_s: float) -> list[Action]:

@@ -9,9 +9,12 @@ from rhs_isac_ros.protocol.base_station_steps import BaseStationSteps as Steps
 from rhs_isac_ros.protocol.events import (
     Action,
     CodebookOffered,
+    PauseRequested,
     PeersChanged,
     Resumed,
+    ResumeRequested,
     SettingsOffered,
+    StepRequested,
     StoodBy,
     Timeout,
 )
@@ -50,17 +53,40 @@ TABLE = (
         actions=(Steps.store_peers, Steps.log_not_ready)),
     Row(event=PeersChanged, actions=(Steps.store_peers,)),
 
-    Row(source=(State.WAITING,), event=SettingsOffered,
+    Row(source=(State.WAITING, State.PAUSED), event=SettingsOffered,
         actions=(Steps.store_settings, Steps.apply_settings)),
     Row(source=(State.RESTING,), event=SettingsOffered,
         actions=(Steps.store_settings, Steps.apply_settings), restart_timeout=True),
     Row(event=SettingsOffered, actions=(Steps.store_settings,)),
 
-    # A newer base station serves, or has gone.
+    # A newer base station serves, or has gone. A pause outlasts both.
+    Row(event=StoodBy, guard=Steps.pausing, actions=(Steps.forget_peers,), target=State.PAUSED),
     Row(event=StoodBy, actions=(Steps.forget_peers,), target=State.WAITING),
-    Row(source=(State.WAITING,), event=Resumed, actions=(Steps.skip_cycles,)),
+    Row(source=(State.WAITING, State.PAUSED), event=Resumed, actions=(Steps.skip_cycles,)),
+
+    # Requests of an operator. A pause begins between two cycles; a step runs one cycle of a pause.
+    Row(source=(State.PAUSED,), event=PauseRequested, actions=(Steps.reply_already_paused,)),
+    Row(source=(State.WAITING, State.RESTING), event=PauseRequested,
+        actions=(Steps.pause, Steps.log_paused, Steps.reply_paused), target=State.PAUSED),
+    Row(event=PauseRequested, actions=(Steps.pause, Steps.reply_pausing)),
+
+    Row(source=(State.PAUSED,), event=ResumeRequested, guard=Steps.not_ready,
+        actions=(Steps.resume, Steps.log_not_ready, Steps.reply_resumed), target=State.WAITING),
+    Row(source=(State.PAUSED,), event=ResumeRequested,
+        actions=(Steps.resume, Steps.begin_cycle, Steps.reply_resumed), target=State.BEACONING),
+    Row(event=ResumeRequested, guard=Steps.pausing, actions=(Steps.resume, Steps.reply_resumed)),
+    Row(event=ResumeRequested, actions=(Steps.reply_not_paused,)),
+
+    Row(source=(State.PAUSED,), event=StepRequested, guard=Steps.not_ready,
+        actions=(Steps.reply_not_ready,)),
+    Row(source=(State.PAUSED,), event=StepRequested,
+        actions=(Steps.begin_cycle, Steps.reply_stepping), target=State.BEACONING),
+    Row(event=StepRequested, guard=Steps.pausing, actions=(Steps.reply_busy,)),
+    Row(event=StepRequested, actions=(Steps.reply_not_paused,)),
 
     # Timeouts.
+    Row(source=(State.RESTING,), event=Timeout, guard=Steps.pausing,
+        actions=(Steps.log_paused,), target=State.PAUSED),
     Row(source=(State.RESTING,), event=Timeout, guard=Steps.not_ready,
         actions=(Steps.log_not_ready,), target=State.WAITING),
     Row(source=(State.RESTING,), event=Timeout, actions=(Steps.begin_cycle,),
@@ -69,6 +95,8 @@ TABLE = (
     Row(source=(State.BEACONING,), event=Timeout, guard=Steps.some_acks,
         actions=(Steps.grant, Steps.command_next_band, Steps.announce_positioning),
         target=State.CONFIGURING),
+    Row(source=(State.BEACONING,), event=Timeout, guard=Steps.pausing,
+        actions=(Steps.apply_settings, Steps.log_unanswered), target=State.PAUSED),
     Row(source=(State.BEACONING,), event=Timeout, guard=Steps.not_ready,
         actions=(Steps.log_not_ready,), target=State.WAITING),
     Row(source=(State.BEACONING,), event=Timeout,
@@ -185,5 +213,5 @@ TABLE = (
     Row(event=m.Data, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
     Row(source=(State.TRANSMITTING,), event=m.Data, actions=(Steps.finish,),
         target=State.RESTING),
-    Row(source=(State.RESTING,), event=m.Data, outcome=Outcome.DUPLICATE),
+    Row(source=(State.PAUSED, State.RESTING), event=m.Data, outcome=Outcome.DUPLICATE),
 )

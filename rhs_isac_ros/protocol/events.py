@@ -47,6 +47,21 @@ class Resumed:
     first_cycle_id: int = 0
 
 
+@dataclasses.dataclass(frozen=True)
+class PauseRequested:
+    """An operator requests that no cycle begins after the current one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ResumeRequested:
+    """An operator requests that cycles follow each other again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StepRequested:
+    """An operator requests one cycle of a paused base station."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class EstimatorReady:
     """The estimator requested by `BuildEstimator` was built in `elapsed_s` seconds."""
@@ -65,7 +80,7 @@ class EstimatorFailed:
 
 
 Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | StoodBy | Resumed
-         | EstimatorReady | EstimatorFailed)
+         | PauseRequested | ResumeRequested | StepRequested | EstimatorReady | EstimatorFailed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +98,14 @@ class LogMessage:
     warning: bool = False
 
 
+@dataclasses.dataclass(frozen=True)
+class Reply:
+    """Answer the request of an operator."""
+
+    success: bool
+    text: str
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class BuildEstimator:
     """Build an estimator in the background; reply with `EstimatorReady` or `EstimatorFailed`."""
@@ -98,4 +121,4 @@ class RevertSettings:
     settings: Any
 
 
-Action = Send | LogMessage | BuildEstimator | RevertSettings
+Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings

@@ -1,4 +1,4 @@
-"""Log messages about outages, one at the beginning of each and one at its end."""
+"""Log messages about service and its outages, one at the beginning and one at the end of each."""
 
 from collections.abc import Iterable
 
@@ -21,10 +21,13 @@ class OutageLog:
         # Reason and user of each outage; user 0 for the whole network.
         self._open: set[tuple[str, int]] = set()
         self._waiting_for: tuple[str, ...] = ()
+        # Whether a cycle was served since something was missing.
+        self._serving = False
 
     def log_waiting(self, missing: Iterable[str]) -> list[LogMessage]:
         """Return a warning about what is missing, unless the last one had the same text."""
         previous, self._waiting_for = self._waiting_for, tuple(missing)
+        self._serving = False
         if self._waiting_for == previous:
             return []
         return [LogMessage(f'waiting for {", ".join(self._waiting_for)}', warning=True)]
@@ -46,11 +49,23 @@ class OutageLog:
         self._open.add(key)
         return [LogMessage(f'cycle {cycle_id} of user {user} given up: {reason}', warning=True)]
 
-    def log_served_cycle(self, cycle_id: int, user: int) -> list[LogMessage]:
-        """Return a message about the outages that a served cycle ends, if any."""
-        ended = {key for key in self._open if key[1] in (0, user)}
-        if not ended:
-            return []
-        self._open -= ended
-        reasons = ', '.join(sorted(reason for reason, _ in ended))
-        return [LogMessage(f'cycle {cycle_id}: user {user} served again after: {reasons}')]
+    @staticmethod
+    def log_removed_users(users: Iterable[int], allowed: str) -> list[LogMessage]:
+        """Return a message for each user that is not in the new list of allowed users."""
+        return [LogMessage(f'user {user} removed: not in allowed_users {allowed!r}')
+                for user in users]
+
+    def log_served_cycle(
+            self, cycle_id: int, user: int, codebook_id: str, n_users: int) -> list[LogMessage]:
+        """Return messages that service begins, and about the outages that a cycle ends, if any."""
+        messages = []
+        if not self._serving:
+            self._serving = True
+            messages.append(LogMessage(
+                f'serving: codebook {codebook_id}, {n_users} user{"s" * (n_users != 1)}'))
+        if ended := {key for key in self._open if key[1] in (0, user)}:
+            self._open -= ended
+            reasons = ', '.join(sorted(reason for reason, _ in ended))
+            messages.append(LogMessage(
+                f'cycle {cycle_id}: user {user} served again after: {reasons}'))
+        return messages

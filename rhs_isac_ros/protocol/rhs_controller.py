@@ -83,6 +83,10 @@ class RhsControllerSteps(StateMachine[State]):
         """Store a codebook."""
         self._codebooks.put(event.codebook.id, event.codebook)
 
+    def log_codebook(self, event: CodebookOffered, now_s: float) -> list[Action]:
+        """Log that commands with the codebook can be executed."""
+        return [LogMessage(f'serving: codebook {event.codebook.id}')]
+
     def store_grant(self, event: m.Grant, now_s: float) -> None:
         """Store the user of a cycle."""
         self._granted.put(event.cycle_id, event.user)
@@ -125,7 +129,7 @@ class Row(Transition[State, RhsControllerSteps, EventT]):
 Steps = RhsControllerSteps
 
 TABLE = (
-    Row(event=CodebookOffered, actions=(Steps.store_codebook,)),
+    Row(event=CodebookOffered, actions=(Steps.store_codebook, Steps.log_codebook)),
     Row(event=m.Grant, actions=(Steps.store_grant,)),
 
     Row(event=m.RhsCommand, guard=Steps.unknown_codebook, actions=(Steps.log_unknown_codebook,),

@@ -18,7 +18,14 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import outcomes
 from rhs_isac_ros.protocol.codebook_cache import CodebookCache
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send, SettingsOffered
+from rhs_isac_ros.protocol.events import (
+    Action,
+    CodebookOffered,
+    Event,
+    LogMessage,
+    Send,
+    SettingsOffered,
+)
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.role import PlainRole
@@ -70,6 +77,7 @@ class Transmission(PlainRole):
         match event:
             case CodebookOffered(codebook):
                 self._codebooks.put(codebook.id, None)
+                return [LogMessage(f'serving: codebook {codebook.id}')]
             case SettingsOffered(settings):
                 # A cycle that has a beam keeps its bands.
                 self._settings.latest = settings

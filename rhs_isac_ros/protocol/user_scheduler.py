@@ -1,5 +1,7 @@
 """The users that a base station waits for, and the order in which it serves them."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 POLICIES = ('round_robin', 'first', 'random')
@@ -77,6 +79,18 @@ class UserScheduler:
         """Stop waiting for a user until it answers again."""
         self._missed.pop(user, None)
         self._served.pop(user, None)
+
+    @property
+    def n_users(self) -> int:
+        """Number of registered users."""
+        return len(self._missed)
+
+    def remove_all_except(self, is_allowed: Callable[[int], bool]) -> list[int]:
+        """Remove and return the users that are not allowed."""
+        removed = [user for user in sorted(self._missed) if not is_allowed(user)]
+        for user in removed:
+            self.remove(user)
+        return removed
 
     def is_complete_with(self, user: int) -> bool:
         """Return whether no further answers are needed once `user` has answered."""

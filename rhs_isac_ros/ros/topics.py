@@ -30,11 +30,25 @@ DIAGNOSTICS = 'diagnostics'
 MARKERS = 'markers'
 PRESENCE = 'presence'
 
-# Estimated and true path of a user.
+# Pose, estimated path and true path of a user.
+POSE = 'users/user_{user}/pose'
 PATH = 'users/user_{user}/path'
 TRUE_PATH = 'users/user_{user}/true_path'
+
+# Transforms. The names are absolute, as those of tf2.
+TF = '/tf'
+TF_STATIC = '/tf_static'
+
+# Services of the base station.
+PAUSE = '~/pause'
+RESUME = '~/resume'
+STEP = '~/step'
 
 # Node whose parameters are the codebook.
 OPTIMIZER_NODE = 'optimizer'
 # Frame of all positions: the origin is the centre of the surface, x points outward, z up.
 MAP_FRAME = 'map'
+# Frame of the surface, with the same origin and axes.
+RHS_FRAME = 'rhs_link'
+# Frame at the estimated position of a user, with the axes of the map.
+USER_FRAME = 'user_{user}'

@@ -31,6 +31,7 @@ _PARAMETER_SERVICES = (
     'set_parameters', 'set_parameters_atomically')
 _OFFERED_SERVICES = tuple(
     f'~/{service}' for service in (*_PARAMETER_SERVICES, 'get_type_description'))
+_CYCLE_SERVICES = (topics.PAUSE, topics.RESUME, topics.STEP)
 _GET_CODEBOOK = f'{topics.OPTIMIZER_NODE}/get_parameters'
 _VERSION = '0.2.0'
 
@@ -66,21 +67,24 @@ def permissions(users: int) -> dict[str, Permissions]:
     -------
     dict
         Permissions by node. ``operator`` stands for the command-line tools, which may read all
-        topics and set parameters.
+        topics, set parameters and pause cycles.
     """
     diagnostics = (topics.DIAGNOSTICS,)
     nodes = {
-        'bs': _with_codebook(_unique(
-            BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)),
+        'bs': _with_codebook(_unique(BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)
+                             )._replace(reply=(*_OFFERED_SERVICES, *_CYCLE_SERVICES)),
         'channel': _unique(Channel.SENDS, Channel.RECEIVES, diagnostics),
         'optimizer': _unique((), (), (*diagnostics, topics.CODEBOOK)),
         'positioner': _with_codebook(_unique(
-            Positioner.SENDS, Positioner.RECEIVES, (*diagnostics, topics.POSITION))),
+            Positioner.SENDS, Positioner.RECEIVES, (
+                *diagnostics, topics.POSITION, *_of_users(users, topics.POSE)))),
         'rhs_controller': _with_codebook(_unique(
             RhsController.SENDS, RhsController.RECEIVES, diagnostics)),
         'transmission': _with_codebook(_unique(
             Transmission.SENDS, Transmission.RECEIVES, diagnostics)),
-        'visualizer': _of_messages((), SCENE_RECEIVES, (topics.MARKERS, *_paths(users))),
+        'visualizer': _of_messages((), SCENE_RECEIVES, (
+            topics.MARKERS, topics.TF, topics.TF_STATIC,
+            *_of_users(users, topics.PATH, topics.TRUE_PATH))),
         **{f'user_{number}': _of_messages(User.SENDS, User.RECEIVES, diagnostics)
            for number in range(1, users + 1)},
     }
@@ -112,10 +116,9 @@ def _with_codebook(permissions: Permissions) -> Permissions:
         request=(_GET_CODEBOOK,))
 
 
-def _paths(users: int) -> tuple[str, ...]:
-    """Return the names of the topics of the users' paths."""
-    return tuple(name.format(user=number) for number in range(1, users + 1)
-                 for name in (topics.PATH, topics.TRUE_PATH))
+def _of_users(users: int, *names: str) -> tuple[str, ...]:
+    """Return the names of topics of each user."""
+    return tuple(name.format(user=number) for number in range(1, users + 1) for name in names)
 
 
 def _operator(nodes: Iterable[str], users: int) -> Permissions:
@@ -124,12 +127,14 @@ def _operator(nodes: Iterable[str], users: int) -> Permissions:
     The node names of the command-line tools are fixed; those of ``ros2`` end in a number.
     """
     readable = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
-                topics.POSITION, topics.PRESENCE, *_paths(users)}
+                topics.POSITION, topics.PRESENCE, topics.TF, topics.TF_STATIC,
+                *_of_users(users, topics.POSE, topics.PATH, topics.TRUE_PATH)}
     return Permissions(
         publish=_RCLPY_TOPICS, subscribe=(*sorted(readable), *_RCLPY_TOPICS),
         reply=(*(service.replace('~', PUSHER_NODE) for service in _OFFERED_SERVICES),
                '/_ros2cli_*/get_type_description'),
-        request=tuple(f'{node}/{service}' for node in nodes for service in _PARAMETER_SERVICES))
+        request=(*(f'{node}/{service}' for node in nodes for service in _PARAMETER_SERVICES),
+                 *(service.replace('~', 'bs') for service in _CYCLE_SERVICES)))
 
 
 def policy(namespace: str = '/', users: int = 2) -> str:

@@ -6,6 +6,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from std_srvs.srv import Trigger
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -172,3 +173,27 @@ def test_the_codebook_in_use_is_reported(running, small_files):
     assert running.set('optimizer', **second.to_parameters()).successful
     running.until_reported('optimizer', 'bs', 'rhs_controller', 'positioner', 'transmission',
                        codebook_id=second.id, pending__codebook_id=None)
+
+
+def test_the_base_station_can_be_paused_stepped_and_resumed(running):
+    watch = running.watch
+    clients = {name: watch.node.create_client(Trigger, f'bs/{name}')
+               for name in ('pause', 'resume', 'step')}
+
+    def request(name):
+        response = watch.call(clients[name], lambda client: client.call_async(Trigger.Request()))
+        return response.success, response.message
+    assert request('step') == (False, 'not paused; a step requires a pause')
+    success, message = request('pause')
+    assert success
+    assert message == 'paused' or message.startswith('the pause begins after cycle ')
+    running.until_reported('bs', phase='paused')
+    assert request('pause') == (True, 'already paused')
+    served = len(watch.served)
+    success, message = request('step')
+    assert success
+    watch.until(lambda: len(watch.served) > served, 'the cycle', [running.process])
+    running.until_reported('bs', phase='paused')
+    assert len(watch.served) == served + 1
+    assert request('resume') == (True, 'resumed')
+    watch.until_served(2, processes=[running.process])

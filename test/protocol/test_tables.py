@@ -16,10 +16,14 @@ from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
+    PauseRequested,
     PeersChanged,
+    Reply,
     Resumed,
+    ResumeRequested,
     Send,
     SettingsOffered,
+    StepRequested,
     StoodBy,
     Timeout,
 )
@@ -33,8 +37,9 @@ from rhs_isac_ros.protocol.user_scheduler import POLICIES
 ROLES = {
     'bs': types.SimpleNamespace(
         machine=bs.BaseStation, initial=State.WAITING, final=State.BEACONING,
-        endless={State.WAITING},
-        events={Timeout, CodebookOffered, PeersChanged, SettingsOffered, StoodBy, Resumed}),
+        endless={State.WAITING, State.PAUSED},
+        events={Timeout, CodebookOffered, PeersChanged, SettingsOffered, StoodBy, Resumed,
+                PauseRequested, ResumeRequested, StepRequested}),
     'user': types.SimpleNamespace(
         machine=user.User, initial=user.State.DISCONNECTED, final=user.State.NO_BEACON,
         endless={user.State.DISCONNECTED, user.State.NO_BEACON}, events={Timeout, PeersChanged}),
@@ -290,8 +295,11 @@ def random_event(rng, subject, example, codebooks):
     """Return an event of a machine that fits its current cycle more often than not."""
     events = list(subject.EVENT_NAMES)
     kind = events[rng.integers(len(events))]
-    if kind is Timeout:
-        return Timeout()
+    if kind in (Timeout, ResumeRequested, StepRequested):
+        return kind()
+    if kind is PauseRequested:
+        # Rare, so that most cycles follow each other.
+        return PauseRequested() if rng.random() < 0.05 else Timeout()
     if kind is CodebookOffered:
         return CodebookOffered(codebooks[rng.integers(3)])
     if kind is PeersChanged:
@@ -344,7 +352,7 @@ def test_machines_take_the_first_row_that_matches(
             assert subject.counters - counters == {
                 f'unexpected_{subject.EVENT_NAMES[type(event)]}': 1}
         for action in actions:
-            assert isinstance(action, Send | LogMessage)
+            assert isinstance(action, Send | LogMessage | Reply)
             if isinstance(action, Send):
                 m.check(action.message, scenario.sizes)
                 sent.add(type(action.message))
@@ -353,7 +361,9 @@ def test_machines_take_the_first_row_that_matches(
         # The first deadline is set by the first change of state.
         assert (deadline_s is None) == (subject.state in role.endless)
         if subject.state is not state and deadline_s is not None:
-            assert deadline_s == now_s + 1.0
+            # There is no rest before a pause.
+            pauses = subject.state is State.RESTING and subject._pausing
+            assert deadline_s == now_s + (0.0 if pauses else 1.0)
     assert len(visited) >= 3
     assert sent
     # An idle RHS controller rejects all beams but one without a codebook.

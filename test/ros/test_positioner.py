@@ -5,6 +5,7 @@ import types
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -15,7 +16,7 @@ from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
-from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.parameter import ParameterError
 
 PLACE = np.array([10.0, 0.5, 0.2])
@@ -69,6 +70,22 @@ def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, t
     np.testing.assert_array_equal(estimate.position, expected.mean)
     np.testing.assert_array_equal(estimate.covariance_m2, expected.covariance)
     assert len(list((tmp_path / 'tables').iterdir())) == 1
+
+
+def test_each_user_has_a_pose(bench, node, send, codebooks):
+    receiver, poses = bench.add(Node, 'receiver'), []
+    estimates = bench.collect(receiver, m.PositionEstimate)
+    subscription = receiver.create_subscription(
+        PoseWithCovarianceStamped, 'users/user_1/pose', poses.append, qos.EXCHANGE)
+    node.dispatch(CodebookOffered(codebooks[0]))
+    # The first estimate creates the topic.
+    send(3)
+    bench.until(subscription.get_publisher_count, 'the topic')
+    send(4)
+    bench.until(lambda: poses and len(estimates) == 2, 'the pose')
+    assert poses[-1].header.frame_id == 'map'
+    assert poses[-1].pose.pose.position.x == estimates[-1].position[0]
+    assert poses[-1].pose.covariance[0] == estimates[-1].covariance_m2[0, 0]
 
 
 def test_signals_are_answered_while_another_estimator_is_built(
