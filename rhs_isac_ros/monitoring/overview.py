@@ -10,6 +10,7 @@ from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_states import State
 
 # Messages that the overview needs.
 RECEIVES = cycle_log.RECEIVES
@@ -140,6 +141,13 @@ class Overview:
     def fixes(self) -> list[Fix]:
         """The fixes of all users that have one, the latest first."""
         return sorted(filter(None, self.users.values()), key=lambda fix: -fix.received_s)
+
+    @property
+    def paused(self) -> bool:
+        """Whether a base station has reported a pause since the current phase began."""
+        return any(status.report.values.get('phase') == State.PAUSED.value
+                   and not status.received_s < self.phase_began_s
+                   for status in self.nodes.values())
 
     def _set_phase(self, phase: str, cycle_id: int, user: int, now_s: float) -> None:
         if (phase, cycle_id) != (self.phase, self.cycle_id):

@@ -8,12 +8,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, PeersChanged, Send
 from rhs_isac_ros.protocol.outcomes import Outcome, kind_of
 
 # Percentiles are computed over this number of latest durations.
 _MAX_DURATIONS = 512
 _PERCENTS = (50, 95, 99)
+# Counters of what occurs without a fault.
+_NO_FAULTS = {Outcome.UNANSWERED.value}
+# Maximum number of reasons in a summary.
+_MAX_REASONS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +30,7 @@ class Report:
     fault
         Whether something is missing, or something was dropped or given up since the last report.
     summary
-        One line that describes the fault.
+        One line that describes the fault: what is missing, or the most frequent new faults.
     values
         Settings: ``parameter.<name>`` (in use), ``pending.<name>`` (not in use yet) and
         ``failed.<name>`` (why a change failed). Counts: ``cycles.<outcome>``,
@@ -51,7 +56,7 @@ class RoleStatistics:
         self._unavailable: set[str] = set()
         self._cycle_began_s: float | None = None
         self._durations_s: dict[str, collections.deque[float]] = {}
-        self._faults = 0
+        self._faults: collections.Counter[str] = collections.Counter()
 
     def set_available(self, node: str, available: bool) -> None:
         """Record whether a node is available that the role can do without for a while."""
@@ -127,9 +132,9 @@ class RoleStatistics:
         for section, counts in (('received', self._received), ('sent', self._sent)):
             values |= {f'{section}.{name}': str(count) for name, count in sorted(counts.items())}
         values |= self._percentiles()
-        total = sum(count for reason, count in counters.items()
-                    if reason != Outcome.UNANSWERED.value)
-        new_faults, self._faults = total - self._faults, total
+        faults = collections.Counter(
+            {reason: count for reason, count in counters.items() if reason not in _NO_FAULTS})
+        new_faults, self._faults = faults - self._faults, faults
         if self._missing_roles:
             return Report(True, f'waiting for {", ".join(self._missing_roles)}', values)
         if self._unavailable:
@@ -137,8 +142,8 @@ class RoleStatistics:
         if blocked:
             return Report(True, f'blocked: {phase}', values)
         if new_faults:
-            return Report(True, f'{new_faults} new faults', values)
-        return Report(False, 'no fault', values)
+            return Report(True, _summary(new_faults), values)
+        return Report(False, 'paused' if phase == State.PAUSED.value else 'no fault', values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
         """Return the ids of the codebook in use (at first, the offered one) and a pending one."""
@@ -154,3 +159,12 @@ class RoleStatistics:
                 for name, durations_s in self._durations_s.items()
                 for percent, value in zip(
                     _PERCENTS, np.percentile(durations_s, _PERCENTS), strict=True)}
+
+
+def _summary(faults: collections.Counter[str]) -> str:
+    """Return a line with the most frequent faults, such as ``new faults: late_ack 9, stale 1``."""
+    # Sorted, so that faults of equal number have a fixed order.
+    ordered = sorted(faults.items(), key=lambda item: (-item[1], item[0]))
+    shown = [f'{reason} {count}' for reason, count in ordered[:_MAX_REASONS]]
+    others = sum(count for _, count in ordered[_MAX_REASONS:])
+    return f'new faults: {", ".join([*shown, f"others {others}"] if others else shown)}'

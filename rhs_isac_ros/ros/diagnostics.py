@@ -1,5 +1,6 @@
 """The diagnostics of the nodes, published as `diagnostic_msgs/DiagnosticArray`."""
 
+import socket
 from collections.abc import Callable, Iterator
 
 from builtin_interfaces.msg import Time
@@ -17,6 +18,8 @@ _PERIOD_S = 1.0
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
     """Convert the report of a node to one status, OK or WARN.
 
+    The hardware id consists of the name of this host and the name of the node.
+
     Parameters
     ----------
     name
@@ -25,7 +28,8 @@ def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
     status = DiagnosticStatus(
-        level=level, name=name.lstrip('/'), message=report.summary, values=values)
+        level=level, name=name.lstrip('/'), message=report.summary,
+        hardware_id=f'{socket.gethostname()}:{name}', values=values)
     return DiagnosticArray(header=Header(stamp=stamp), status=[status])
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from rhs_isac_ros.monitoring.overview import Fix, NodeStatus, Overview
+from rhs_isac_ros.protocol.base_station_states import State
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -31,11 +32,12 @@ def render(overview: Overview, now_s: float) -> 'RenderableType':
 def _header(overview: Overview, now_s: float) -> 'RenderableType':
     from rich.text import Text
 
+    phase = State.PAUSED.value if overview.paused else overview.phase
     if not overview.phase:
-        return Text('waiting for a base station', style='yellow')
+        return Text(phase or 'waiting for a base station', style='yellow')
     user = f' of user {overview.user}' if overview.user else ''
     text = Text.assemble(
-        (overview.phase, 'bold cyan'), f' for {now_s - overview.phase_began_s:.2f} s, cycle '
+        (phase, 'bold cyan'), f' for {now_s - overview.phase_began_s:.2f} s, cycle '
         f'{overview.cycle_id}{user}\n{overview.rate_hz(now_s):.1f} cycles/s, ',
         f'{overview.served} served, {overview.given_up} given up; ',
         f'codebook {_printable(overview.codebook_id) or "not known yet"}')
@@ -61,14 +63,11 @@ def _users(overview: Overview, now_s: float) -> 'RenderableType':
         'Users', ('user', 'right'), ('position\n[m]', 'right'), ('error\n[m]', 'right'),
         ('sigma\n[m]', 'right'), ('capacity\n[Mbit/s]', 'right'), ('loss\n[%]', 'right'),
         ('age\n[s]', 'right'))
-    fixes = overview.fixes
-    for fix in fixes[:_MAX_USERS]:
-        table.add_row(*_user_row(fix, now_s))
-    if len(fixes) > _MAX_USERS:
-        table.caption = f'and {len(fixes) - _MAX_USERS} more'
-    waiting = sorted(user for user, fix in overview.users.items() if fix is None)
-    for user in waiting[:max(_MAX_USERS - len(fixes), 0)]:
-        table.add_row(str(user), 'no fix yet', *[''] * 5)
+    # In order of their numbers, so that each user keeps its row.
+    for user, fix in sorted(overview.users.items())[:_MAX_USERS]:
+        table.add_row(*(_user_row(fix, now_s) if fix else (str(user), 'no fix yet', *[''] * 5)))
+    if len(overview.users) > _MAX_USERS:
+        table.caption = f'and {len(overview.users) - _MAX_USERS} more'
     return table
 
 

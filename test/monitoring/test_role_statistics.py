@@ -82,13 +82,29 @@ def test_a_fault_is_reported_once_and_a_missing_role_until_it_is_present():
     counters = {'wrong_user': 2, 'unanswered': 5}
     first, second = (statistics.report('', counters) for _ in range(2))
     assert (first.fault, second.fault) == (True, False)
-    assert first.summary == '2 new faults'
+    assert first.summary == 'new faults: wrong_user 2'
     statistics.record(PeersChanged(('channel', 'bs')), [], 0.0, 0.0)
     for _ in range(2):
         report = statistics.report('', counters)
         assert (report.fault, report.summary) == (True, 'waiting for channel, bs')
     statistics.record(PeersChanged(()), [], 0.0, 0.0)
     assert not statistics.report('', counters | {'unanswered': 9}).fault
+
+
+def test_the_summary_names_the_most_frequent_new_faults():
+    statistics = RoleStatistics()
+    statistics.report('', {'late_ack': 50, 'user_gone': 1})
+    report = statistics.report('', {
+        'late_ack': 51, 'user_gone': 4, 'stale': 2, 'wrong_cycle': 2, 'retry_rhs': 1,
+        'unanswered': 9})
+    assert report.summary == 'new faults: user_gone 3, stale 2, wrong_cycle 2, others 2'
+
+
+def test_a_pause_is_no_fault():
+    statistics = RoleStatistics()
+    assert statistics.report('paused', {'late_ack': 1}).fault
+    report = statistics.report('paused', {'late_ack': 1})
+    assert (report.fault, report.summary) == (False, 'paused')
 
 
 def test_statistics_of_a_base_station_match_its_messages(network):

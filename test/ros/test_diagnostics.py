@@ -1,5 +1,7 @@
 """The diagnostics of the nodes."""
 
+import socket
+
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -17,6 +19,7 @@ def test_a_report_becomes_one_status(fault, level):
     (status,) = message.status
     assert message.header.stamp.sec == 4
     assert (status.level, status.name, status.message) == (level, 'a/bs', 'a summary')
+    assert status.hardware_id == f'{socket.gethostname()}:/a/bs'
     assert {pair.key: pair.value for pair in status.values} == values
 
 

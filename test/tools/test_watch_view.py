@@ -21,6 +21,12 @@ def text_of(overview, now_s, width=80):
     return page.export_text()
 
 
+def ended(cycle_id):
+    return m.ProtocolState(
+        cycle_id=cycle_id, user=1, phase=m.Phase.BEACONING, outcome='served',
+        began_s=np.zeros(4), elapsed_s=0.0)
+
+
 def test_the_view_of_an_empty_overview():
     assert 'waiting for a base station' in text_of(Overview(), 1.0)
 
@@ -41,6 +47,30 @@ def test_the_view_shows_faults_and_silent_nodes_within_80_columns():
     assert re.search(r'lab/bs +waiting +silent for 4 s +2 no_fix +3 late_ack', text)
     assert re.search(r'lab/channel +no fault +0 +0', text)
     assert '…' not in text
+
+
+def test_users_keep_their_rows(network_class, scenario, codebooks, places):
+    net = network_class(scenario, codebooks[0], {user: places[user - 1] for user in (1, 2, 3)})
+    net.run_cycles(5)
+    overview, rows = Overview(), []
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES):
+            overview.add(sent.message, sent.time_s)
+            rows.append(re.findall(r'^ +(\d+) ', text_of(overview, sent.time_s), re.MULTILINE))
+    assert rows[-1] == ['1', '2', '3']
+    assert all(row == sorted(row) for row in rows)
+
+
+def test_the_view_shows_a_pause():
+    overview = Overview()
+    paused = Report(False, 'paused', {'phase': 'paused'})
+    overview.add_report('bs', paused, 1.0)
+    assert text_of(overview, 2.0).startswith('paused')
+    overview.add(m.Beacon(cycle_id=1, attempt=0), 3.0)
+    assert text_of(overview, 4.0).startswith('beaconing for 1.00 s')
+    overview.add(ended(1), 5.0)
+    overview.add_report('bs', paused, 6.0)
+    assert text_of(overview, 7.0).startswith('paused for 2.00 s, cycle 1')
 
 
 def test_received_strings_are_neither_markup_nor_control_sequences():
