@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring.overview import Overview
+from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.watch_view import render
