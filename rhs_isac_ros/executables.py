@@ -5,6 +5,7 @@ traceback; the handlers set here end the process with exit code 0 instead, as a 
 """
 
 import importlib
+import importlib.util
 import os
 import signal
 import sys
@@ -51,11 +52,26 @@ def __getattr__(name: str) -> Callable[[], int]:
         try:
             module = importlib.import_module(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
         except ModuleNotFoundError as error:
-            # pip also installs the executables on systems without ROS.
-            print(f'error: {name} needs ROS 2 Jazzy and rhs_isac_msgs: {error}', file=sys.stderr)
+            missing = str(error.name).partition('.')[0]
+            if missing == 'rhs_isac_ros':
+                raise
+            print(f'error: {name} needs {_what_provides(missing)}', file=sys.stderr)
             return 1
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         code: int = module.main()
         return code
     return main
+
+
+def _what_provides(missing: str) -> str:
+    """Return what to install or build so that a missing top-level module is found."""
+    # pip also installs the executables on systems without ROS.
+    if importlib.util.find_spec('rclpy') is None:
+        return 'ROS 2 Jazzy, which is not sourced or not installed (no module rclpy)'
+    # colcon does not search for packages inside a package.
+    if missing == 'rhs_isac_msgs':
+        return ('the package rhs_isac_msgs: in the src folder of the workspace, run '
+                '`ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`, then repeat colcon build '
+                'and source install/setup.bash')
+    return f'{missing}, which is not installed'

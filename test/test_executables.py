@@ -61,6 +61,32 @@ def test_an_entry_point_runs_its_module_and_returns_the_exit_code(
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+def without(module, monkeypatch):
+    def import_module(_):
+        raise ModuleNotFoundError(f'No module named {module!r}', name=module)
+    monkeypatch.setattr(importlib, 'import_module', import_module)
+
+
+@pytest.mark.parametrize(('module', 'present', 'expected'), [
+    ('rclpy', False, 'error: bs needs ROS 2 Jazzy, '),
+    ('rhs_isac_msgs', False, 'error: bs needs ROS 2 Jazzy, '),
+    ('rhs_isac_msgs.msg', True, 'run `ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`'),
+    ('scipy.linalg', True, 'error: bs needs scipy, which is not installed')])
+def test_a_missing_package_is_named_in_one_line(
+        module, present, expected, monkeypatch, signal_handlers, capsys):
+    without(module, monkeypatch)
+    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: present or None)
+    assert executables.bs() == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert expected in line
+
+
+def test_a_missing_module_of_the_package_itself_is_not_hidden(monkeypatch, signal_handlers):
+    without('rhs_isac_ros.nodes.bs', monkeypatch)
+    with pytest.raises(ModuleNotFoundError):
+        executables.bs()
+
+
 @pytest.mark.parametrize('name', ['nonsense', '_private', 'topic', 'BS', 'bs_', '__path__'])
 def test_any_other_name_is_an_attribute_error(name):
     with pytest.raises(AttributeError, match=f'no attribute {name!r}'):
