@@ -26,8 +26,12 @@ _rhs_load() { # root shell
       # shellcheck source=/dev/null
       . "$1/install/setup.$2"
       ;;
-    wheels:* | system:*)
-      echo "env.sh: ROS 2 $ROS_DISTRO is sourced, but the build uses another ROS: run scripts/setup" >&2
+    wheels:*)
+      echo "env.sh: this clone was built with the wheels, but ROS 2 $ROS_DISTRO is sourced: use a shell without ROS" >&2
+      return 1
+      ;;
+    system:*)
+      echo "env.sh: this clone was built on ROS 2 Jazzy, but ROS 2 $ROS_DISTRO is sourced: source Jazzy" >&2
       return 1
       ;;
     *)
