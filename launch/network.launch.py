@@ -3,16 +3,19 @@
 ``--show-args`` lists the arguments. ``network.launch.xml`` starts the network in one process.
 """
 
+import functools
+from pathlib import Path
+from typing import Any
+
 from ament_index_python.packages import (
     PackageNotFoundError,
     get_package_prefix,
     get_package_share_directory,
 )
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, OrSubstitution
+from launch.events.process import ProcessExited
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.parameter_descriptions import Parameter, ParameterFile
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 
@@ -25,17 +28,29 @@ ARGUMENTS = {
     'codebook': ('', 'Codebook file that fits the scenario; empty: the default codebook.'),
     'seed': ('0', 'Seed of all random numbers.'),
     'estimator': ('bayes', 'Position estimator.'),
+    'params_file': ('', 'ROS parameter file for all nodes, which takes precedence over the other '
+                        'arguments; empty: none.'),
     'visualizer': ('false', 'Whether to publish markers for RViz and Foxglove.'),
     'rviz': ('false', 'Whether to start the visualizer and RViz.'),
     'record': ('', 'Recording to write (MCAP file); empty: none.'),
     'namespace': ('', 'Namespace of all nodes and topics, which separates several networks.'),
+    'log_level': ('info', 'Minimum severity of logged messages.'),
+    'respawn': ('false', 'Whether to restart a process that ends; otherwise a failure ends the '
+                         'launch.'),
+    'composed': ('false', 'Whether to run all nodes but the visualizer in one process.'),
 }
+CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']} | {
+    name: ['true', 'false'] for name in ('visualizer', 'rviz', 'respawn', 'composed')}
+RESPAWN_DELAY_S = 1.0
+# Exit code for invalid parameters, arguments or files: a restart would fail again.
+INVALID = 2
 
 
 def generate_launch_description() -> LaunchDescription:
     """Return the arguments of the launch and the function that starts the nodes."""
     return LaunchDescription([
-        *(DeclareLaunchArgument(name, default_value=default, description=text)
+        *(DeclareLaunchArgument(name, default_value=default, description=text,
+                                choices=CHOICES.get(name))
           for name, (default, text) in ARGUMENTS.items()),
         OpaqueFunction(function=start_nodes),
     ])
@@ -47,66 +62,93 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     Raises
     ------
     ValueError
-        If the number of users is not a positive integer.
+        If the number of users or the seed is not an integer in its range, or if the parameter
+        file does not exist.
     """
-    text = LaunchConfiguration('users').perform(context)
-    if not text.isdecimal() or not int(text):
-        raise ValueError(f'users: {text!r}, expected a positive integer')
-    seed = {'seed': _typed('seed', int)}
-    shown = IfCondition(
-        OrSubstitution(LaunchConfiguration('visualizer'), LaunchConfiguration('rviz')))
-    return [
-        *_recorder(context),
-        _node('rhs_controller'),
-        _node('positioner', estimator=_typed('estimator', str)),
-        _node('transmission'),
-        _node('optimizer', codebook_file=_typed('codebook', str)),
-        _node('channel', **seed),
-        *(_node('user', f'user_{number}', user_id=number, **seed)
-          for number in range(1, int(text) + 1)),
-        _node('bs', **seed),
-        _node('visualizer', condition=shown),
-        *_rviz(),
-    ]
+    given = {name: context.launch_configurations[name] for name in ARGUMENTS}
+    users, seed = _integer('users', given, 1), {'seed': _integer('seed', given, 0)}
+    file = given['params_file']
+    if file and not Path(file).is_file():
+        raise ValueError(f'params_file: {file!r}, expected an existing file')
+    codebook, estimator = {'codebook_file': given['codebook']}, {'estimator': given['estimator']}
+    if given['composed'] == 'true':
+        # Without a name, the parameters apply to every node of the process.
+        nodes = [_node(given, 'network', None, users=users, **seed, **codebook, **estimator)]
+    else:
+        nodes = [
+            _node(given, 'rhs_controller', 'rhs_controller'),
+            _node(given, 'positioner', 'positioner', **estimator),
+            _node(given, 'transmission', 'transmission'),
+            _node(given, 'optimizer', 'optimizer', **codebook),
+            _node(given, 'channel', 'channel', **seed),
+            *(_node(given, 'user', f'user_{number}', user_id=number, **seed)
+              for number in range(1, users + 1)),
+            _node(given, 'bs', 'bs', **seed),
+        ]
+    if 'true' in (given['visualizer'], given['rviz']):
+        nodes.append(_node(given, 'visualizer', 'visualizer'))
+    # The recorder misses messages that precede its start and are not latched.
+    return [*_recorder(given), *nodes, *_rviz(given)]
 
 
-def _recorder(context: LaunchContext) -> list[Node]:
-    """Return the recorder, which starts first because it misses earlier unlatched messages."""
-    file = LaunchConfiguration('record').perform(context)
-    if not file:
+def _integer(name: str, given: dict[str, str], low: int) -> int:
+    text = given[name]
+    if not (text.isascii() and text.isdecimal()) or int(text) < low:
+        raise ValueError(f'{name}: {text!r}, expected an integer of at least {low}')
+    return int(text)
+
+
+def _node(given: dict[str, str], executable: str, name: str | None, **values: int | str) -> Node:
+    # rcl gives precedence to the parameters that it reads last.
+    file = [ParameterFile(given['params_file'])] if given['params_file'] else []
+    values['scenario_file'] = given['config']
+    return Node(
+        executable=executable, name=name,
+        parameters=[*(Parameter(key, value) for key, value in values.items()), *file],
+        **_common(given, name or executable, given['respawn'] == 'true'))
+
+
+def _recorder(given: dict[str, str]) -> list[Node]:
+    if not given['record']:
         return []
-    return [Node(
-        package=PACKAGE, executable='record', name='recorder', exec_name='record',
-        output='screen', namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
-        arguments=[file, '--config', LaunchConfiguration('config')])]
+    # Not restarted, because a second process would replace the recording.
+    return [Node(executable='record', name='recorder',
+                 arguments=[given['record'], '--config', given['config']],
+                 **_common(given, 'record', False))]
 
 
-def _rviz() -> list[LaunchDescriptionEntity]:
-    wanted = IfCondition(LaunchConfiguration('rviz'))
+def _common(given: dict[str, str], exec_name: str, respawn: bool) -> dict[str, Any]:
+    """Return the arguments of `Node` that all processes of the package share."""
+    return {
+        'package': PACKAGE, 'exec_name': exec_name, 'output': 'screen', 'prefix': END_WITH_LAUNCH,
+        'namespace': given['namespace'], 'ros_arguments': ['--log-level', given['log_level']],
+        'respawn': respawn, 'respawn_delay': RESPAWN_DELAY_S,
+        'on_exit': functools.partial(_end_if_failed, respawn),
+    }
+
+
+def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
+    if given['rviz'] != 'true':
+        return []
     try:
         get_package_prefix('rviz2')
     except PackageNotFoundError:
-        return [LogInfo(msg='rviz2 is not installed: apt install ros-jazzy-rviz2',
-                        condition=wanted)]
+        return [LogInfo(msg='rviz2 is not installed: apt install ros-jazzy-rviz2')]
     file = f'{get_package_share_directory(PACKAGE)}/config/rviz/network.rviz'
     return [Node(
         package='rviz2', executable='rviz2', name='rviz', exec_name='rviz', output='screen',
         # The topic names in the file are relative.
-        namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
-        arguments=['-d', file], condition=wanted)]
+        namespace=given['namespace'], prefix=END_WITH_LAUNCH, arguments=['-d', file])]
 
 
-def _typed(argument: str, kind: type) -> ParameterValue:
-    """Return an argument as a parameter with a type, which YAML would infer otherwise."""
-    return ParameterValue(LaunchConfiguration(argument), value_type=kind)
+def _end_if_failed(respawn: bool, event: ProcessExited, context: LaunchContext) -> None:
+    """End the launch, with exit code 1, if a process failed and is not restarted.
 
-
-def _node(
-        executable: str, name: str = '', condition: IfCondition | None = None,
-        **parameters: ParameterValue | int) -> Node:
-    name = name or executable
-    return Node(
-        package=PACKAGE, executable=executable, name=name, exec_name=name, output='screen',
-        namespace=LaunchConfiguration('namespace'), prefix=END_WITH_LAUNCH,
-        condition=condition,
-        parameters=[{'scenario_file': _typed('config', str), **parameters}])
+    Raises
+    ------
+    RuntimeError
+        ``launch`` logs it and ends; its action ``Shutdown`` would result in exit code 0.
+    """
+    restarted = respawn and event.returncode != INVALID
+    if event.returncode and not restarted and not context.is_shutdown:
+        raise RuntimeError(f'{event.process_name} ended with exit code {event.returncode}')

@@ -1,8 +1,10 @@
 """The launch files: their arguments, the service of all users, and a clean end."""
 
+import ast
+import functools
 import importlib.util
+import itertools
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -38,10 +40,24 @@ needs_launch = pytest.mark.skipif(
     reason='launch_ros is not installed: it is part of a full ROS 2, not a wheel')
 
 
-def arguments_of_xml():
-    root = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
-    return {arg.get('name'): (arg.get('default'), arg.get('description'))
-            for arg in root.iter('arg')}
+def load_python_file():
+    spec = importlib.util.spec_from_file_location(
+        'network_launch', ROOT / 'launch' / 'network.launch.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def started(**values):
+    """Entities that the Python file starts, by executable or class, for values of arguments."""
+    from launch_ros.actions import Node
+
+    from launch import LaunchContext
+    module, context = load_python_file(), LaunchContext()
+    context.launch_configurations.update(
+        {name: default for name, (default, _) in module.ARGUMENTS.items()} | values)
+    return [(entity.node_executable if isinstance(entity, Node) else type(entity).__name__, entity)
+            for entity in module.start_nodes(context)]
 
 
 def test_the_files_are_installed_and_their_dependencies_declared():
@@ -53,28 +69,106 @@ def test_the_files_are_installed_and_their_dependencies_declared():
     assert {'launch', 'launch_ros', 'launch_xml'} <= depends
 
 
-def test_the_xml_file_sets_declared_parameters_and_uses_all_arguments():
-    parameters = pytest.importorskip('rhs_isac_ros.ros.parameters')
-    declared = {parameter.name for own in parameters.NODES.values() for parameter in own}
+def test_the_python_file_uses_all_arguments():
+    text = (ROOT / 'launch' / 'network.launch.py').read_text(encoding='utf-8')
+    (arguments,) = [node.value for node in ast.parse(text).body if isinstance(node, ast.Assign)
+                    and node.targets[0].id == 'ARGUMENTS']
+    unused = [name for name in ast.literal_eval(arguments)
+              if f"given['{name}']" not in text and f"_integer('{name}'" not in text]
+    assert not unused
+
+
+def test_the_xml_file_includes_the_python_file_composed():
     root = ElementTree.parse(ROOT / 'launch' / 'network.launch.xml').getroot()
-    values = {param.get('name'): param.get('value') for param in root.iter('param')}
-    assert values.keys() <= declared
-    used = {name for node in root.iter() for text in node.attrib.values()
-            for name in re.findall(r'\$\(var (\w+)\)', text)}
-    assert used == arguments_of_xml().keys()
-    assert {node.get('namespace') for node in root.iter('node')} == {'$(var namespace)'}
+    (include,) = root
+    assert include.get('file') == '$(find-pkg-share rhs_isac_ros)/launch/network.launch.py'
+    assert [arg.attrib for arg in include] == [{'name': 'composed', 'value': 'true'}]
 
 
 @needs_launch
-def test_both_files_have_the_same_arguments():
+@pytest.mark.parametrize(('file', 'own'), zip(FILES, ((), ('composed',)), strict=True))
+def test_show_args_lists_all_arguments(file, own):
     from launch.launch_description_sources import (
-        get_launch_description_from_python_launch_file as load,
+        get_launch_description_from_any_launch_file as load,
     )
-    description = load(str(ROOT / 'launch' / 'network.launch.py'))
-    assert arguments_of_xml() == {
-        argument.name: (argument.default_value[0].text, argument.description)
-        if argument.default_value else ('', argument.description)
-        for argument in description.get_launch_arguments()}
+    listed = load(str(ROOT / 'launch' / file)).get_launch_arguments()
+    assert {argument.name for argument in listed} == (
+        load_python_file().ARGUMENTS.keys() - set(own))
+    assert all(argument.description and argument.default_value is not None for argument in listed)
+
+
+ONE_EACH = ['rhs_controller', 'positioner', 'transmission', 'optimizer', 'channel']
+
+
+@needs_launch
+@pytest.mark.parametrize(('values', 'expected'), [
+    ({}, [*ONE_EACH, 'user', 'user', 'bs']),
+    ({'users': '1', 'record': 'run.mcap'}, ['record', *ONE_EACH, 'user', 'bs']),
+    ({'composed': 'true'}, ['network']),
+    ({'composed': 'true', 'visualizer': 'true'}, ['network', 'visualizer'])])
+def test_the_started_executables(values, expected):
+    assert [name for name, _ in started(**values)] == expected
+
+
+@needs_launch
+@pytest.mark.parametrize('composed', ['false', 'true'])
+def test_parameters_are_declared(composed):
+    parameters = pytest.importorskip('rhs_isac_ros.ros.parameters')
+    everything = {parameter.name for own in parameters.NODES.values() for parameter in own}
+    from launch import LaunchContext
+    for executable, node in started(composed=composed):
+        declared = everything if executable == 'network' else {
+            parameter.name for parameter in parameters.NODES[executable]}
+        node._perform_substitutions(LaunchContext())
+        words = [''.join(part.text for part in word if hasattr(part, 'text')) for word in node.cmd]
+        names = {word.partition(':=')[0] for flag, word in itertools.pairwise(words)
+                 if flag == '-p'}
+        assert 'scenario_file' in names and names <= declared
+
+
+@needs_launch
+@pytest.mark.parametrize(('name', 'value'), [
+    ('users', '0'), ('users', 'x'), ('users', '-1'), ('seed', 'abc'), ('seed', '1.5'),
+    ('params_file', '/no/such.yaml')])
+def test_an_invalid_argument_is_named(name, value):
+    with pytest.raises(ValueError, match=f"^{name}: '{value}', expected "):
+        started(**{name: value})
+
+
+@needs_launch
+@pytest.mark.parametrize(('respawn', 'code', 'ends'), [
+    (False, 0, False), (False, 1, True), (False, -9, True), (True, -9, False), (True, 2, True)])
+def test_a_failure_ends_the_launch_unless_the_process_is_restarted(respawn, code, ends):
+    from launch.events.process import ProcessExited
+
+    from launch import LaunchContext
+    event = ProcessExited(action=None, name='bs-8', cmd=[], cwd=None, env=None, pid=1,
+                          returncode=code)
+    check = functools.partial(load_python_file()._end_if_failed, respawn, event, LaunchContext())
+    if ends:
+        with pytest.raises(RuntimeError, match=f'^bs-8 ended with exit code {code}$'):
+            check()
+    else:
+        check()
+
+
+@needs_launch
+@pytest.mark.parametrize(('file', 'arguments', 'expected'), [
+    ('network.launch.py', ['users:=none'], ["users: 'none', expected an integer"]),
+    ('network.launch.xml', ['log_level:=loud'], ['"log_level"', 'loud', 'debug', 'warn']),
+    ('network.launch.py', [f'config:={ROOT}/config/quick.yaml'],
+     ['config/codebook.yaml', 'config/quick.yaml', 'codebook:=', 'optimizer-4 ended']),
+    ('network.launch.xml', [f'config:={ROOT}/config/quick.yaml'],
+     ['config/codebook.yaml', 'config/quick.yaml', 'codebook:=', 'network-1 ended'])])
+def test_an_error_ends_the_launch_and_is_named(file, arguments, expected, monkeypatch, tmp_path):
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    done = subprocess.run(
+        [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, *arguments], check=False,
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TIMEOUT_S,
+        env={**os.environ, 'ROS_LOG_DIR': str(tmp_path)})
+    text = done.stdout + done.stderr
+    assert done.returncode == 1 and 'Traceback' not in text, text
+    assert all(part in text for part in expected), text
 
 
 def exists(group):
@@ -107,23 +201,40 @@ def observer(monkeypatch):
     rclpy.shutdown(context=context)
 
 
+ALL = ('users:=3', 'seed:=4', f'config:={ROOT}/config/quick.yaml',
+       f'codebook:={ROOT}/config/codebook_quick.yaml', 'visualizer:=true', 'record:={}/run.mcap')
+# All arguments except the file have their default values.
+DEFAULT = ('params_file:={}/parameters.yaml',)
+PARAMETERS = f'''
+/**:
+  ros__parameters:
+    users: 3
+    scenario_file: {ROOT}/config/quick.yaml
+    codebook_file: {ROOT}/config/codebook_quick.yaml
+'''
+
+
 @needs_launch
-@pytest.mark.parametrize('file, number', zip(FILES, (signal.SIGINT, signal.SIGTERM), strict=True))
-def test_all_users_are_served_and_no_process_remains(file, number, observer, tmp_path):
+@pytest.mark.parametrize(('file', 'arguments', 'number'), [
+    ('network.launch.py', ALL, signal.SIGINT), ('network.launch.xml', DEFAULT, signal.SIGTERM)])
+def test_all_users_are_served_and_no_process_remains(
+        file, arguments, number, observer, tmp_path):
     node, executor = observer
-    with open(tmp_path / 'log', 'w+', encoding='utf-8') as log, subprocess.Popen(
-            [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, 'users:=3', 'seed:=4',
-             f'config:={ROOT}/config/quick.yaml', f'codebook:={ROOT}/config/codebook_quick.yaml',
-             'namespace:=launched', 'visualizer:=true', f'record:={tmp_path}/run.mcap'],
-            stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True,
+    (tmp_path / 'parameters.yaml').write_text(PARAMETERS, encoding='utf-8')
+    log = tmp_path / 'log'
+    with open(log, 'wb') as stream, subprocess.Popen(
+            [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, 'namespace:=launched',
+             *(argument.format(tmp_path) for argument in arguments)],
+            stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, 'ROS_LOG_DIR': str(tmp_path)}) as process:
         try:
             end_s = time.monotonic() + TIMEOUT_S
             while ({record.user for record in node.log.complete} != {1, 2, 3}
-                   or not node.count_publishers('/launched/markers')):
+                   or 'visualizer:=true' in arguments
+                   and not node.count_publishers('/launched/markers')):
                 executor.spin_once(timeout_sec=0.1)
                 assert process.poll() is None and time.monotonic() < end_s, (
-                    tmp_path / 'log').read_text(encoding='utf-8')
+                    log.read_text(encoding='utf-8'))
             process.send_signal(number)
             assert process.wait(TIMEOUT_S) in (0, 1, -number)
             end_s = time.monotonic() + TIMEOUT_S
@@ -132,10 +243,12 @@ def test_all_users_are_served_and_no_process_remains(file, number, observer, tmp
         finally:
             if exists(process.pid):
                 os.killpg(process.pid, signal.SIGKILL)
-    text = (tmp_path / 'log').read_text(encoding='utf-8')
+    text = log.read_text(encoding='utf-8')
     assert 'Traceback' not in text, text
     assert 'process has died' not in text, text
-    assert_complete(tmp_path / 'run.mcap', node.log.complete)
+    assert 'record' not in text or arguments is ALL
+    if arguments is ALL:
+        assert_complete(tmp_path / 'run.mcap', node.log.complete)
 
 
 def assert_complete(path, cycles):
@@ -150,23 +263,9 @@ def assert_complete(path, cycles):
 
 @needs_launch
 def test_without_rviz_the_launch_logs_that_and_starts_the_nodes(monkeypatch):
-    from launch.actions import LogInfo
-    from launch_ros.actions import Node
-
-    from launch import LaunchContext
     monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(
         path for path in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep)
         if not (Path(path) / 'share' / 'rviz2').exists()))
-    spec = importlib.util.spec_from_file_location(
-        'network_launch', ROOT / 'launch' / 'network.launch.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    context = LaunchContext()
-    context.launch_configurations.update(
-        {name: default for name, (default, _) in module.ARGUMENTS.items()} | {'rviz': 'true'})
-    *nodes, log = module.start_nodes(context)
-    assert all(isinstance(node, Node) for node in nodes)
-    assert isinstance(log, LogInfo) and log.condition.evaluate(context)
-    assert nodes[-1].condition.evaluate(context)
-    context.launch_configurations['rviz'] = 'false'
-    assert not log.condition.evaluate(context) and not nodes[-1].condition.evaluate(context)
+    names = [name for name, _ in started(rviz='true')]
+    assert names[-2:] == ['visualizer', 'LogInfo']
+    assert 'LogInfo' not in [name for name, _ in started()]

@@ -52,7 +52,7 @@ class OptimizerNode(ParameterizedNode):
         # A file of an earlier version contains another provenance, and may lack the id.
         self.set_parameters_atomically(
             [Parameter(name, value=value)
-             for name, value in self._declared_codebook().to_parameters().items()])
+             for name, value in self._first_codebook(file).to_parameters().items()])
         self._announce(False)
         self._presence = PresenceClient(
             self, topics.OPTIMIZER_NODE, self._instance, self._scenario, self._announce)
@@ -63,8 +63,19 @@ class OptimizerNode(ParameterizedNode):
         # Last, so that no request arrives before the parameters are declared.
         self._parameter_service = GroupParameterService(self, CODEBOOK_PREFIX)
 
-    def _declared_codebook(self) -> Codebook:
-        return self._codebook_of({name: self.get_parameter(name).value for name in CODEBOOK})
+    def _first_codebook(self, file: Path | str) -> Codebook:
+        codebook = Codebook.from_parameters(self._codebook_values())
+        try:
+            codebook.check(self._scenario)
+        except CodebookError as error:
+            raise CodebookError(
+                f'codebook_file: {str(file)!r} does not fit scenario_file '
+                f'{self.values.scenario_file or "Table I"!r}: {error}; set codebook_file '
+                '(codebook:= of a launch) to a codebook of this scenario') from None
+        return codebook
+
+    def _codebook_values(self) -> dict[str, Any]:
+        return {name: self.get_parameter(name).value for name in CODEBOOK}
 
     def _codebook_of(self, values: dict[str, Any]) -> Codebook:
         codebook = Codebook.from_parameters(values)
@@ -73,7 +84,7 @@ class OptimizerNode(ParameterizedNode):
 
     def _normalize(self, changes: list[Parameter]) -> list[Parameter]:
         """Give a valid codebook the types and the id that the parameters have."""
-        given = _codebook_values(changes)
+        given = _given_codebook_values(changes)
         if given.keys() != CODEBOOK.keys():
             return changes
         try:
@@ -85,7 +96,7 @@ class OptimizerNode(ParameterizedNode):
                 for p in changes]
 
     def _check_codebook(self, changes: list[Parameter]) -> SetParametersResult:
-        given = _codebook_values(changes)
+        given = _given_codebook_values(changes)
         if all(same_value(self.get_parameter(p.name), p) for p in changes if p.name in given):
             return SetParametersResult(successful=True)
         try:
@@ -100,7 +111,7 @@ class OptimizerNode(ParameterizedNode):
         return SetParametersResult(successful=True)
 
     def _on_codebook_set(self, changes: list[Parameter]) -> None:
-        given = _codebook_values(changes)
+        given = _given_codebook_values(changes)
         # A request that repeats some of the values changes nothing.
         if given.keys() == CODEBOOK.keys():
             self._publish(self._codebook_of(given))
@@ -119,7 +130,7 @@ class OptimizerNode(ParameterizedNode):
         if not stands_by:
             self._publisher = self._publisher or self.create_publisher(
                 ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
-            self._publish(self._declared_codebook())
+            self._publish(self._codebook_of(self._codebook_values()))
 
     def _publish(self, codebook: Codebook) -> None:
         self._codebook_id = codebook.id
@@ -132,7 +143,7 @@ class OptimizerNode(ParameterizedNode):
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 
 
-def _codebook_values(changes: list[Parameter]) -> dict[str, Any]:
+def _given_codebook_values(changes: list[Parameter]) -> dict[str, Any]:
     return {p.name: p.value for p in changes if p.name in CODEBOOK}
 
 

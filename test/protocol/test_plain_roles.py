@@ -7,6 +7,7 @@ from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.events import (
+    BuildEstimator,
     CodebookOffered,
     EstimatorReady,
     Send,
