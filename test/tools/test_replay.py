@@ -133,7 +133,7 @@ def content(message):
 
 
 @pytest.fixture
-def positioner(shared_session):
+def positioner(built_scripts, shared_session):
     """A running positioner, alone in its namespace."""
     with subprocess.Popen(
             [SCRIPTS / 'run', 'positioner', '--ros-args', '-r', '__ns:=/again', '-p',
@@ -165,7 +165,7 @@ def test_a_running_positioner_reproduces_the_recorded_estimates(run, shared_sess
     assert {cycle: received[cycle] for cycle in both} == {cycle: recorded[cycle] for cycle in both}
 
 
-def test_topics_of_a_running_network_are_not_published(run, shared_session):
+def test_topics_of_a_running_network_are_not_published(built_scripts, run, shared_session):
     done = subprocess.run(
         [SCRIPTS / 'replay', run.path, '--publish'], capture_output=True, text=True, timeout=60,
         check=False)
@@ -192,7 +192,8 @@ def test_options_that_exclude_publishing_are_named(run, capsys, arguments):
     assert any(reason in text for reason in ('not allowed', 'expected', 'invalid choice'))
 
 
-def test_record_writes_all_topics_until_it_is_interrupted(shared_session, tmp_path):
+def test_record_writes_all_topics_until_it_is_interrupted(
+        built_scripts, shared_session, tmp_path):
     path = tmp_path / 'all.mcap'
     wanted = {'codebook', 'capacity', 'pilot', 'ground_truth', 'position'}
     with subprocess.Popen(

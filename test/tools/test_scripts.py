@@ -25,7 +25,7 @@ def test_another_name_is_rejected(tmp_path):
     assert done.stderr.startswith('permissions: not a tool')
 
 
-def test_a_link_in_another_directory_finds_the_package(tmp_path):
+def test_a_link_in_another_directory_finds_the_package(built_scripts, tmp_path):
     (tmp_path / 'param').symlink_to(SCRIPTS / 'param')
     done = subprocess.run([tmp_path / 'param', '--help'], cwd=tmp_path, capture_output=True,
                           text=True, check=False)

@@ -16,7 +16,7 @@ SCRIPT = ROOT / 'scripts' / 'snapshot'
 
 
 @pytest.fixture
-def snapshot(tmp_path):
+def snapshot(built_scripts, tmp_path):
     """Function that runs the script in an empty directory."""
     def call(*arguments):
         return subprocess.run([SCRIPT, *arguments], cwd=tmp_path, capture_output=True, text=True,

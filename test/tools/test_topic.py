@@ -80,7 +80,7 @@ def test_echo_exits_after_its_timeout(call):
     assert call(main, 'echo', 'no_fix', '--timeout', '0.2')[2] == 0
 
 
-def test_hz_reports_until_it_is_interrupted(shared_session):
+def test_hz_reports_until_it_is_interrupted(built_scripts, shared_session):
     with subprocess.Popen([SCRIPT, 'hz', 'ground_truth'], stdout=subprocess.PIPE, text=True,
                           env=os.environ) as process:
         report = process.stdout.readline() + process.stdout.readline()

@@ -29,7 +29,7 @@ def test_once_prints_a_cycle_and_every_node(network, run_script):
         assert re.search(f'^ {node} .*(no fault|new faults) ', text, re.MULTILINE), text
 
 
-def test_watch_refreshes_the_terminal_until_it_is_interrupted(network):
+def test_watch_refreshes_the_terminal_until_it_is_interrupted(built_scripts, network):
     parent, child = pty.openpty()
     with subprocess.Popen([SCRIPT], stdin=child, stdout=child, stderr=child) as process:
         os.close(child)
@@ -53,7 +53,7 @@ def test_watch_exits_when_the_reader_closes_the_pipe(network, run_script):
     assert run_script(f'{{ {SCRIPT}; echo $? >&3; }} 3>&1 >&1 | head -n 1; true')
 
 
-def test_once_without_a_network_is_an_error():
+def test_once_without_a_network_is_an_error(built_scripts):
     done = subprocess.run(
         [SCRIPT, '--once', '--timeout', '0.3', '--ros-args', '-r', '__ns:=/nobody'],
         capture_output=True, text=True, timeout=30, check=False)
