@@ -11,6 +11,9 @@ import signal
 import sys
 from collections.abc import Callable
 
+# Environment variable with the process id of a parent that its children must not outlive.
+PARENT_ID = 'RHS_ISAC_ROS_PARENT_ID'
+_PR_SET_PDEATHSIG = 1
 # Subpackage of each executable.
 EXECUTABLES = {
     'bs': 'nodes',
@@ -49,6 +52,7 @@ def __getattr__(name: str) -> Callable[[], int]:
     def main() -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: os._exit(0))
+        _end_with_parent()
         try:
             module = importlib.import_module(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
         except ModuleNotFoundError as error:
@@ -59,8 +63,7 @@ def __getattr__(name: str) -> Callable[[], int]:
             return 1
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        code: int = module.main()
-        return code
+        return exit_code_of(module.main)
     return main
 
 
@@ -75,3 +78,70 @@ def _what_provides(missing: str) -> str:
                 '`ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`, then repeat colcon build '
                 'and source install/setup.bash')
     return f'{missing}, which is not installed'
+
+
+def _end_with_parent() -> None:
+    """Have the kernel send SIGTERM to this process when the parent that asked for it dies.
+
+    The child does so itself, because no Python code may run safely between fork and exec if the
+    parent has several threads.
+    """
+    parent = os.environ.pop(PARENT_ID, '')
+    if parent:
+        # Imported here, because most processes do not need it.
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        # The parent may have died before.
+        if os.getppid() != int(parent):
+            os._exit(0)
+
+
+def exit_code_of(
+        main: Callable[[], int | None], errors: tuple[type[Exception], ...] = ()) -> int:
+    """Run a main function, and handle the standard streams of the process.
+
+    Parameters
+    ----------
+    main
+        Returns an exit code; None is 0.
+    errors
+        Exceptions whose messages are errors of the user.
+
+    Returns
+    -------
+    int
+        Exit code of `main`; 0 if the reader of the output closes it early, as ``head`` does; 1 if
+        the output cannot be written; 2 after one of the `errors`.
+    """
+    # If a standard stream is closed, Python has none, and the next file would take its place.
+    for name in ('stdin', 'stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, 'r' if name == 'stdin' else 'w',
+                                    encoding='utf-8'))
+    try:
+        try:
+            return main() or 0
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        discard_stdout()
+        return 0
+    except errors as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    except OSError as error:
+        # The errors of files name one.
+        if error.filename is not None:
+            raise
+        discard_stdout()
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+
+
+def discard_stdout() -> None:
+    """Redirect the standard output to `os.devnull` after its reader has closed it.
+
+    Otherwise the flush at the exit of Python would fail.
+    """
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -25,6 +25,7 @@ from rclpy.type_support import check_for_type_support
 from ros_domain import claim_domain
 
 import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
@@ -53,7 +54,8 @@ class Process:
             self._popen = subprocess.Popen(
                 [EXECUTABLES / executable, *options, '--ros-args', *arguments],
                 stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
-                env={**os.environ, 'ROS_LOG_DIR': str(log.parent)})
+                env={**os.environ, 'ROS_LOG_DIR': str(log.parent),
+                     PARENT_ID: str(os.getpid())})
 
     @property
     def log(self):

@@ -82,7 +82,7 @@ def carry(data):
     raise NotImplementedError('no radio yet')
 
 
-main = entry(lambda: [RadioNode(measure, carry)])
+main = entry('channel', lambda: [RadioNode(measure, carry)])
 
 if __name__ == '__main__':
     sys.exit(main())

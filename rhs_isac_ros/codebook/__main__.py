@@ -4,17 +4,21 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from rhs_isac_ros.codebook.command import ERRORS, add_options, run
+from rhs_isac_ros.codebook.command import ERRORS, add_options, check, run
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model.arguments import ArgumentParser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, also after Ctrl-C, or 2 if an argument or a file is invalid."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='python -m rhs_isac_ros.codebook', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add_options(parser)
+    options = parser.parse_args(arguments)
+    check(parser, options)
     try:
-        run(parser.parse_args(arguments))
+        run(options)
     except ERRORS as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
@@ -22,4 +26,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
+import importlib.util
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,22 +24,33 @@ from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.codebook.start import STARTS
 from rhs_isac_ros.model import Scenario, ScenarioError, streams
-from rhs_isac_ros.model.files import check_writable
+from rhs_isac_ros.model.arguments import (
+    check_distinct,
+    input_file,
+    integer,
+    output_file,
+    picture_file,
+    positive_int,
+    seed,
+)
 from rhs_isac_ros.model.optional import MissingLibraryError
 
-__all__ = ['ERRORS', 'HELD_OUT_POSITIONS', 'INTERRUPTED', 'add_options', 'run']
+__all__ = ['ERRORS', 'HELD_OUT_POSITIONS', 'INTERRUPTED', 'add_options', 'check', 'run']
 # Positions for the average bound of the result, drawn independently of the samples.
 HELD_OUT_POSITIONS = 2000
+# Beyond this, the samples would fill the memory.
+_MAX_POSITIONS = 10**5
 # Errors that the user can correct; their messages state the expected values.
-ERRORS = (ScenarioError, CodebookError, MissingLibraryError, ValueError, OSError)
+ERRORS = (
+    ScenarioError, CodebookError, MissingLibraryError, ValueError, OSError, MemoryError)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of an optimisation to a parser."""
     add = parser.add_argument
-    add('--output', type=Path, default=Path('codebook.yaml'),
+    add('--output', type=output_file, default='codebook.yaml',
         help='file to write; an existing file is replaced at the end')
-    add('--scenario', type=Path,
+    add('--scenario', type=input_file,
         help="YAML file of the scenario; the paper's Table I if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES), default='crlb',
@@ -46,18 +58,34 @@ def add_options(parser: argparse.ArgumentParser) -> None:
              'bound ignores')
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
-    add('--positions', type=int, default=DEFAULT_POSITIONS, help='number of samples')
-    add('--steps', type=int,
+    add('--positions', type=integer(1, _MAX_POSITIONS), default=DEFAULT_POSITIONS,
+        help='number of samples')
+    add('--steps', type=positive_int,
         help='maximum number of update steps; the default of the method if omitted')
-    add('--evaluations', type=int,
+    add('--evaluations', type=positive_int,
         help='maximum number of evaluations; unlimited if omitted')
-    add('--seed', type=int, default=0, help='seed of the samples, the start and the method')
-    add('--start', help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
+    add('--seed', type=seed, default=0, help='seed of the samples, the start and the method')
+    add('--start', type=_start_name, metavar='START',
+        help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
     add('--resume', action='store_true',
         help='continue from OUTPUT.part, which an unfinished run leaves, or from OUTPUT')
-    add('--plot', type=Path,
-        help='file for a plot of convergence, bound and beam patterns')
+    add('--plot', type=picture_file,
+        help='file for a plot of convergence, bound and beam patterns: PNG, PDF or SVG')
     add('--quiet', action='store_true', help='show no progress')
+
+
+def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Exit with a usage error if options contradict each other or a library is missing."""
+    check_distinct(parser, {'--scenario': options.scenario},
+                   {'--output': options.output, '--plot': options.plot})
+    if options.resume and options.start:
+        parser.error('argument --start: not allowed with --resume, which continues from a file')
+    partial = _partial(options.output)
+    if options.resume and not (partial.exists() or options.output.exists()):
+        parser.error(f'argument --resume: expected {partial} or {options.output}')
+    if options.plot and not importlib.util.find_spec('matplotlib'):
+        parser.error('argument --plot: expected matplotlib, which is not installed '
+                     "(pip install 'rhs_isac_ros[plot]')")
 
 
 def run(options: argparse.Namespace) -> tuple[Codebook, str]:
@@ -78,18 +106,18 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
         If an option or a file is invalid, or a library is missing; an existing output file is
         kept.
     """
-    output, partial = options.output, options.output.with_name(options.output.name + '.part')
-    for path in filter(None, (output, options.plot)):
-        check_writable(path)
+    output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+    start = _start(options.start, scenario, options.seed)
+    resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
+    for codebook in filter(None, (start, resumed)):
+        codebook.check(scenario)
     with _progress_bar(options) as show:
         result = optimize(
             scenario, method=options.method, objective=options.objective,
             sampling=options.sampling, n_positions=options.positions, seed=options.seed,
-            start=_start(options.start, scenario, options.seed),
-            resume=Codebook.load(partial if partial.exists() else output)
-            if options.resume else None,
-            max_steps=options.steps, max_evaluations=options.evaluations, progress=show,
+            start=start, resume=resumed, max_steps=options.steps,
+            max_evaluations=options.evaluations, progress=show,
             keep=lambda result: _save_partial(result, partial))
     held_out = scenario.sample_positions(
         HELD_OUT_POSITIONS, streams.generator(options.seed, streams.HELD_OUT))
@@ -103,6 +131,16 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     if options.plot:
         plot_optimization(scenario, codebook, result.history, options.plot)
     return codebook, result.reason
+
+
+def _partial(output: Path) -> Path:
+    """Return the file in which an unfinished search is kept."""
+    return output.with_name(output.name + '.part')
+
+
+def _start_name(text: str) -> str:
+    """Parse the name of a start or the path of a codebook, for argparse."""
+    return text if text in STARTS else str(input_file(text))
 
 
 def _start(name: str | None, scenario: Scenario, seed: int) -> Codebook | None:

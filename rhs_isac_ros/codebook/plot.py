@@ -10,6 +10,7 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.files import write_picture
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.model.surface import radiation_matrix
@@ -49,7 +50,7 @@ def plot_optimization(
         axis.set_visible(False)
     for band, axis in zip(range(scenario.n_bands), axes.flat, strict=False):
         _draw_beams(axis, scenario, codebook, band)
-    figure.savefig(path, dpi=120)
+    write_picture(path, figure)
 
 
 def beam_powers(

@@ -3,10 +3,9 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
-from rhs_isac_ros.experiments.arguments import positive_int
 from rhs_isac_ros.experiments.jobs import JobError
+from rhs_isac_ros.model.arguments import ArgumentParser, integer, output_folder
 from rhs_isac_ros.model.optional import MissingLibraryError
 
 # Exit code that shells report after Ctrl-C.
@@ -33,22 +32,22 @@ def parse_options(
     argparse.Namespace
         ``trials``, ``quick``, ``jobs``, ``dask``, ``output``, and the experiment's own options.
     """
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog=f'scripts/reproduce {name}', description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     count = parser.add_mutually_exclusive_group()
     count.add_argument('--quick', action='store_true', help=f'run only {quick_trials} trials')
-    count.add_argument('--trials', type=positive_int, metavar='N',
+    count.add_argument('--trials', type=integer(1, 10**5), metavar='N',
                        help=f'number of trials (default: {trials})')
     if add:
         add(parser)
-    parser.add_argument('--jobs', type=positive_int, default=-1, metavar='N',
+    parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
                         help='number of parallel jobs (default: one per core)')
     parser.add_argument('--dask', metavar='ADDRESS',
                         help='scheduler of a Dask cluster to use instead of this machine; '
                              'its workers need this package, and one thread each for '
                              'accurate timing')
-    parser.add_argument('--output', type=Path, default=Path('results', name), metavar='DIR',
+    parser.add_argument('--output', type=output_folder, default=f'results/{name}', metavar='DIR',
                         help='folder of the results (default: %(default)s); jobs that have '
                              'results there are not repeated')
     options = parser.parse_args(arguments)

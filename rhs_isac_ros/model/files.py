@@ -1,10 +1,14 @@
 """Atomic writing of files."""
 
+import contextlib
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+# Suffixes of pictures.
+PICTURE_FORMATS = ('png', 'pdf', 'svg')
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
@@ -32,7 +36,36 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
         raise
 
 
+def write_picture(path: str | Path, figure: Any, dpi: int = 120) -> None:
+    """Write a figure of Matplotlib atomically, in the format that the suffix of `path` names.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an existing file is left as it was.
+    ValueError
+        If Matplotlib does not support the format.
+    """
+    kind = Path(path).suffix.lower().removeprefix('.')
+    write_whole(path, lambda stream: figure.savefig(stream, dpi=dpi, format=kind))
+
+
 def check_writable(path: Path) -> None:
-    """Raise OSError unless the directory of a file exists and can be written."""
-    if not os.access(path.parent, os.W_OK):
-        raise OSError(f'{path}: expected a file in a directory that can be written')
+    """Raise OSError unless a file can be written, without writing it.
+
+    Devices are refused because `write_whole` would replace them by a file.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f'{path}: a directory, expected a file')
+    if path.exists() and not path.is_file():
+        raise OSError(f'{path}: expected a regular file')
+    try:
+        # Permissions do not show whether the file system is read-only.
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError:
+        raise OSError(f'{path}: expected a file in a directory that exists and can be '
+                      'written') from None
+    # The name of the temporary file is longer and may exceed the limit of the file system.
+    with contextlib.suppress(FileNotFoundError):
+        os.lstat(path.parent / f'.{path.name}.{"x" * 8}')

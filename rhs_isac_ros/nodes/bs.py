@@ -105,7 +105,7 @@ def _cycle_from_clock() -> int:
     return time.time_ns() // 1_000_000
 
 
-main = entry(lambda: [BsNode()])
+main = entry('bs', lambda: [BsNode()])
 
 
 if __name__ == '__main__':

@@ -29,7 +29,7 @@ class ChannelNode(RoleNode[ImpairedChannel]):
         return settings_of(Impairments, values)
 
 
-main = entry(lambda: [ChannelNode()])
+main = entry('channel', lambda: [ChannelNode()])
 
 
 if __name__ == '__main__':

@@ -36,7 +36,7 @@ def make_network() -> list[Node]:
     return nodes
 
 
-main = entry(make_network)
+main = entry('network', make_network)
 
 
 if __name__ == '__main__':

@@ -15,10 +15,12 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options
+from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options, check
 from rhs_isac_ros.codebook.command import run as run_command
+from rhs_isac_ros.model.arguments import ArgumentParser, HelpFormatter, input_file
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
+from rhs_isac_ros.ros.command_line import parameter_help, parse
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.parameter_service import GroupParameterService
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
@@ -166,10 +168,13 @@ def main(args: Sequence[str] | None = None) -> int:
         an argument or a file is invalid.
     """
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
-    arguments = remove_ros_args(args)[1:]
-    if not arguments:
+    parser = _parser()
+    options = parse(parser, args[1:])
+    if not remove_ros_args(args)[1:]:
         return run(lambda: [OptimizerNode()], args)
-    options = _parser().parse_args(arguments)
+    if options.push_file and options.push:
+        parser.error('argument --push-file: not allowed with --push, which optimises')
+    check(parser, options)
     try:
         if options.push_file:
             return _push(Codebook.load(options.push_file), args)
@@ -187,15 +192,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='optimizer', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        description='Without options, hold a codebook as parameters. With options, optimise one '
+    parser = ArgumentParser(
+        prog='optimizer', formatter_class=HelpFormatter,
+        epilog=parameter_help(topics.OPTIMIZER_NODE),
+        description='Without options, hold a codebook as parameters. With options, optimise one\n'
                     'offline, write it to a file and hold it.')
     add_options(parser)
     parser.add_argument('--push', action='store_true',
                         help='send the codebook to the optimizer of a running network '
                               'and exit')
-    parser.add_argument('--push-file', type=Path, metavar='FILE',
+    parser.add_argument('--push-file', type=input_file, metavar='FILE',
                         help='send this codebook to a running network without '
                               'optimising, and exit')
     return parser

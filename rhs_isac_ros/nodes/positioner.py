@@ -133,7 +133,7 @@ class PositionerNode(RoleNode[Positioner]):
         super().destroy_node()  # type: ignore[no-untyped-call]
 
 
-main = entry(lambda: [PositionerNode()])
+main = entry('positioner', lambda: [PositionerNode()])
 
 
 if __name__ == '__main__':

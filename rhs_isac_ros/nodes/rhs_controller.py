@@ -23,7 +23,7 @@ class RhsControllerNode(RoleNode[RhsController]):
         self.subscribe()
 
 
-main = entry(lambda: [RhsControllerNode()])
+main = entry('rhs_controller', lambda: [RhsControllerNode()])
 
 
 if __name__ == '__main__':

@@ -43,7 +43,7 @@ class TransmissionNode(RoleNode[Transmission]):
         self.subscribe()
 
 
-main = entry(lambda: [TransmissionNode()])
+main = entry('transmission', lambda: [TransmissionNode()])
 
 
 if __name__ == '__main__':

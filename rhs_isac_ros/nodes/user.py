@@ -77,7 +77,7 @@ class UserNode(RoleNode[User]):
         self.publish(self.role.ground_truth(self.now_s()))
 
 
-main = entry(lambda: [UserNode()])
+main = entry('user', lambda: [UserNode()])
 
 
 if __name__ == '__main__':

@@ -95,7 +95,7 @@ class VisualizerNode(Node):
         return self._drawn[1]
 
 
-main = entry(lambda: [VisualizerNode()])
+main = entry('visualizer', lambda: [VisualizerNode()])
 
 
 if __name__ == '__main__':

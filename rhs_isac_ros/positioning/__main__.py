@@ -2,13 +2,21 @@
 
 import argparse
 import contextlib
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    integer,
+    output_file,
+    positive_int,
+    seed,
+)
 from rhs_isac_ros.model.optional import MissingLibraryError
 from rhs_isac_ros.positioning.training import (
     DEFAULT_EPOCHS,
@@ -33,29 +41,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0; 2 if an argument or a file is invalid; 130 after Ctrl-C, with no file
         written.
     """
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='python -m rhs_isac_ros.positioning', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
-    add('--codebook', type=Path, required=True, help='codebook file')
-    add('--scenario', type=Path,
+    add('--codebook', type=input_file, required=True, help='codebook file')
+    add('--scenario', type=input_file,
         help="YAML file of the scenario; the paper's Table I if omitted")
-    add('--pairs', type=int, default=DEFAULT_PAIRS,
+    add('--pairs', type=integer(20, 10**7), default=DEFAULT_PAIRS,
         help='simulated pairs for training, validation and test, 7 : 1.5 : 1.5')
-    add('--hidden', type=int, default=DEFAULT_HIDDEN, help='units of the hidden layer')
-    add('--epochs', type=int, default=DEFAULT_EPOCHS,
+    add('--hidden', type=integer(1, 10**5), default=DEFAULT_HIDDEN,
+        help='units of the hidden layer')
+    add('--epochs', type=positive_int, default=DEFAULT_EPOCHS,
         help='maximum number of passes through the pairs')
-    add('--seed', type=int, default=0,
+    add('--seed', type=seed, default=0,
         help='seed of the pairs, the initial weights and the order of the pairs')
-    add('--output', type=Path, default=Path('model.npz'),
+    add('--output', type=output_file, default='model.npz',
         help='file to write; an existing file is replaced at the end')
     add('--quiet', action='store_true', help='show no progress')
+    options = parser.parse_args(arguments)
+    check_distinct(parser, {'--scenario': options.scenario, '--codebook': options.codebook},
+                   {'--output': options.output})
     try:
-        _run(parser.parse_args(arguments))
+        _run(options)
     except KeyboardInterrupt:
         return 130
     # Errors of scenario and codebook are ValueErrors.
-    except (ValueError, OSError, MissingLibraryError) as error:
+    except (ValueError, OSError, MemoryError, MissingLibraryError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
     return 0
@@ -63,10 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> None:
     output = options.output
-    if not os.access(output.parent, os.W_OK):
-        raise OSError(f'{output}: expected a file in a writable directory')
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     codebook = Codebook.load(options.codebook)
+    codebook.check(scenario)
     with _progress(options) as show:
         network = train(scenario, codebook, options.pairs, options.seed, options.hidden,
                         options.epochs, show)
@@ -100,4 +111,4 @@ def _describe(epoch: Epoch) -> str:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

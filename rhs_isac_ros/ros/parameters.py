@@ -7,11 +7,13 @@ the settings of a role are declared there.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import types
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from rhs_isac_ros.model import Scenario, mobility, plugins
+from rhs_isac_ros.model.arguments import ArgumentParser
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
@@ -120,6 +122,27 @@ def declare(node: Node, executable: str) -> types.SimpleNamespace:
         **{parameter.name: _declare_one(node, parameter) for parameter in NODES[executable]})
 
 
+def check_overrides(node: Node) -> None:
+    """Check that the values given to a node at its start belong to known parameters.
+
+    Values of parameters that only other executables declare are permitted, because several nodes
+    may share a parameter file.
+
+    Raises
+    ------
+    ParameterError
+        If neither the node nor any executable declares a parameter.
+    """
+    known = {parameter.name for parameters in NODES.values() for parameter in parameters}
+    known.update(CODEBOOK)
+    # rclpy has no public access to all overrides. Publishers declare qos_overrides when created.
+    for name in node._parameter_overrides:
+        if not (name in known or node.has_parameter(name) or name.startswith('qos_overrides.')):
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f'; the closest is {close[0]}' if close else ''
+            raise ParameterError(f'{name}: unknown parameter{hint}; see --help')
+
+
 def _declare_one(node: Node, parameter: Parameter) -> Any:
     # Imported here, so that the table can be read without ROS.
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -197,4 +220,6 @@ def table() -> str:
 
 
 if __name__ == '__main__':
+    ArgumentParser(prog='python -m rhs_isac_ros.ros.parameters',
+                   description='Print the table of all ROS parameters.').parse_args()
     print(table())

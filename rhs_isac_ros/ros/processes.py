@@ -1,6 +1,5 @@
 """Executables of the package as child processes, which never outlive their parent."""
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -12,9 +11,11 @@ from typing import Any
 
 from ament_index_python.packages import get_package_prefix
 
-_PR_SET_PDEATHSIG = 1
-# Loaded here, because no library may be loaded between fork and exec.
-_PRCTL = ctypes.CDLL(None).prctl
+from rhs_isac_ros.executables import PARENT_ID
+
+# Memory of the process of a node [bytes], and the number of nodes that a core can run.
+_MEMORY_BYTES = 67_000_000
+_PROCESSES_PER_CORE = 40
 # Signals sent in order to end a process, each with the time to wait for its exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 
@@ -35,6 +36,15 @@ def private_domain() -> dict[str, str]:
     }
 
 
+def max_processes() -> int:
+    """Return the number of nodes that this machine can run as processes of their own."""
+    fields = dict(line.split(':') for line in
+                  Path('/proc/meminfo').read_text(encoding='ascii').splitlines())
+    available_bytes = 1024 * int(fields['MemAvailable'].split()[0])
+    return min(available_bytes // _MEMORY_BYTES,
+               _PROCESSES_PER_CORE * len(os.sched_getaffinity(0)))
+
+
 class Processes:
     """A context manager that runs executables of this package and ends them on exit.
 
@@ -53,7 +63,7 @@ class Processes:
             self, logs: Path, environment: Mapping[str, str],
             command_prefix: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
         self._logs, self._command_prefix = logs, command_prefix
-        self._environment = {**os.environ, **environment}
+        self._environment = {**os.environ, **environment, PARENT_ID: str(os.getpid())}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._commands: dict[str, list[str]] = {}
 
@@ -108,7 +118,7 @@ class Processes:
         with open(self._logs / f'{name}.log', mode) as log:
             self._running[name] = subprocess.Popen(
                 self._commands[name], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                env=self._environment, start_new_session=True, preexec_fn=_end_with_parent)
+                env=self._environment, start_new_session=True)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -150,8 +160,3 @@ class Processes:
             self.stop()
         finally:
             signal.signal(signal.SIGINT, before)
-
-
-def _end_with_parent() -> None:
-    """Have the kernel send SIGTERM to this process when its parent dies for any reason."""
-    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)

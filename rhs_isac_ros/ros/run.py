@@ -15,6 +15,7 @@ from rclpy.utilities import ok, try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import ScenarioError
+from rhs_isac_ros.ros import command_line, parameters
 from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.resources import discovery_profile_file
 
@@ -75,6 +76,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         nodes = make()
         executor = EventsExecutor()
         for node in nodes:
+            parameters.check_overrides(node)
             executor.add_node(node)
         while ok() and not signals and not done():
             executor.spin_once(timeout_sec=_POLL_S)
@@ -96,8 +98,15 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     return 0
 
 
-def entry(make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
-    """Return the main function of an executable whose nodes `make` creates.
+def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
+    """Return the main function of an executable whose arguments are all ROS arguments.
+
+    Parameters
+    ----------
+    executable
+        Name of the executable, a key of `parameters.NODES`.
+    make
+        Creates the nodes; the docstring of its module describes the executable.
 
     Returns
     -------
@@ -105,5 +114,8 @@ def entry(make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
         Takes a command line, by default that of the process, and returns the exit code of `run`.
     """
     def main(args: Sequence[str] | None = None) -> int:
-        return run(make, args)
+        arguments = sys.argv[1:] if args is None else list(args)
+        first_line = (sys.modules[make.__module__].__doc__ or '').partition('\n')[0]
+        command_line.parse(command_line.node_parser(executable, first_line), arguments)
+        return run(make, [executable, *arguments])
     return main

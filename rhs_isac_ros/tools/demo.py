@@ -15,17 +15,29 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.experiments.arguments import check_directory, nonnegative_int, positive_int
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    output_file,
+    picture_file,
+    positive_int,
+    seed,
+)
 from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.processes import Processes, max_processes, private_domain
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo_report import draw, summary, table
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
+# Processes that are not users.
+_N_OTHERS = 6
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,11 +56,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    check_directory(parser, '--picture', options.picture)
+    check_domain(parser)
+    check_users(parser, options.users)
+    check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
+                   {'--record': options.record, '--picture': options.picture})
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
-    except (ScenarioError, CodebookError) as error:
-        print(f'error: {error}\nTo create a codebook for a scenario: python -m '
+    except ScenarioError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    except CodebookError as error:
+        print(f'error: {error}; to create a codebook for a scenario: python -m '
               'rhs_isac_ros.codebook --scenario FILE --output FILE', file=sys.stderr)
         return 2
     try:
@@ -78,6 +96,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report(observer, scenario, options, problem)
     except KeyboardInterrupt:
         return 0
+
+
+def check_users(parser: argparse.ArgumentParser, users: int) -> None:
+    """Exit with a usage error if a process for each user would overload this machine."""
+    limit = max_processes() - _N_OTHERS
+    if users > limit:
+        parser.error(
+            f'argument --users: {users}, expected at most {limit} on this machine, because each '
+            'user is a process; run more in one process: scripts/run network --ros-args '
+            f'-p users:={users}')
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
@@ -177,19 +205,21 @@ def watch(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='demo', description='Start a network, every node as a process, and report on its '
         'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--users', type=positive_int, default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=20, help='cycles to wait for')
-    parser.add_argument('--seed', type=nonnegative_int, default=0,
+    parser.add_argument('--seed', type=seed, default=0,
                         help='seed of all random numbers')
-    parser.add_argument('--config', type=Path,
+    parser.add_argument('--config', type=input_file, metavar='FILE',
                         help="scenario file; by default the paper's Table I")
-    parser.add_argument('--codebook', type=Path,
+    parser.add_argument('--codebook', type=input_file, metavar='FILE',
                         help='codebook file; by default that of the package')
-    parser.add_argument('--record', type=Path, metavar='FILE', help='recording to write (MCAP)')
-    parser.add_argument('--picture', type=Path, default=Path('demo.png'), help='file to draw')
+    parser.add_argument('--record', type=output_file, metavar='FILE',
+                        help='recording to write (MCAP)')
+    parser.add_argument('--picture', type=picture_file, default='demo.png', metavar='FILE',
+                        help='file to draw: PNG, PDF or SVG')
     return parser
 
 
@@ -221,4 +251,4 @@ def _report(
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.files import write_picture
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleRecord
 from rhs_isac_ros.protocol.messages import Phase
@@ -58,7 +59,7 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
 
 
 def draw(cycles: Sequence[CompleteCycle], scenario: Scenario, path: Path) -> None:
-    """Draw the region of interest from above, with true positions and estimates, as PNG.
+    """Draw the region of interest from above, with true positions and estimates.
 
     Raises
     ------
@@ -96,5 +97,5 @@ def draw(cycles: Sequence[CompleteCycle], scenario: Scenario, path: Path) -> Non
              title=f'{len(cycles)} cycles from above; ellipses contain 95 % of the posterior')
     axes.set_xlim(left=min(-1.0, low[0] - 1))
     axes.legend(loc='upper left', fontsize='small')
-    figure.savefig(path, dpi=120)
+    write_picture(path, figure)
     plt.close(figure)

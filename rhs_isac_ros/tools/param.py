@@ -19,6 +19,8 @@ from rclpy.parameter import (
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.session import Session, ToolError, print_now, run_tool
 
 # Maximum time to discover a node's services, and for a response [s].
@@ -100,7 +102,7 @@ def show_list(session: Session, options: argparse.Namespace) -> None:
         response = _call(
             session, node, lambda client: client.list_parameters(options.param_prefixes))
         names = sorted(name for name in response.result.names
-                       if not options.filter or re.match(options.filter, name))
+                       if not options.filter or options.filter.match(name))
         if names and not options.node_name:
             print_now(f'{node}:')
         for line in _with_types(session, node, names) if options.param_type else names:
@@ -196,8 +198,8 @@ def _call(session: Session, node: str, request: Callable[[AsyncParameterClient],
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='param', description='Read and set the parameters of running nodes.')
+    parser = ArgumentParser(
+        prog='scripts/param', description='Read and set the parameters of running nodes.')
     verbs = parser.add_subparsers(required=True, metavar='list | get | set | dump | load')
     subparsers = {}
     for name, verb, text in (
@@ -213,7 +215,7 @@ def _parser() -> argparse.ArgumentParser:
             subparser.add_argument('parameter_name')
         subparser.add_argument('--include-hidden-nodes', action='store_true',
                                help='include hidden nodes')
-        subparser.add_argument('--timeout', type=float, default=3.0, metavar='S',
+        subparser.add_argument('--timeout', type=nonnegative_float, default=3.0, metavar='S',
                                help='maximum time to discover the node (default: 3 s)')
     subparsers['load'].add_argument('parameter_file', help='parameter file')
     subparsers['load'].add_argument('--no-use-wildcard', action='store_true',
@@ -222,12 +224,22 @@ def _parser() -> argparse.ArgumentParser:
     subparsers['get'].add_argument('--hide-type', action='store_true',
                                    help='print the value without its type')
     subparser = subparsers['list']
-    subparser.add_argument('--filter', metavar='REGEX', help='only names that match')
+    subparser.add_argument('--filter', type=_pattern, metavar='REGEX',
+                           help='only names that match')
     subparser.add_argument('--param-prefixes', nargs='+', default=[], metavar='PREFIX',
                            help='only names with one of these prefixes')
     subparser.add_argument('--param-type', action='store_true', help='print the types')
     return parser
 
 
+def _pattern(text: str) -> re.Pattern[str]:
+    """Compile a regular expression, for argparse."""
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise argparse.ArgumentTypeError(
+            f'{text!r}: {error}, expected a regular expression') from None
+
+
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -13,6 +13,8 @@ from typing import NamedTuple
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model.arguments import ArgumentParser, integer
 from rhs_isac_ros.monitoring.scene_state import RECEIVES as SCENE_RECEIVES
 from rhs_isac_ros.nodes.optimizer import PUSHER_NODE
 from rhs_isac_ros.protocol import messages as m
@@ -167,12 +169,12 @@ def policy(namespace: str = '/', users: int = 2) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the policy, and return the exit code 0."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='python -m rhs_isac_ros.tools.permissions', description='Print the SROS2 policy of a '
         'network.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
-    parser.add_argument('--users', type=_user_count, default=2, help='number of users')
+    parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')
     options = parser.parse_args(arguments)
     print(policy(options.namespace, options.users), end='')
     return 0
@@ -186,11 +188,5 @@ def _namespace(text: str) -> str:
     return text
 
 
-def _user_count(text: str) -> int:
-    if not 0 <= int(text) <= 1000:
-        raise argparse.ArgumentTypeError(f'{text}, expected 0 to 1000')
-    return int(text)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rclpy.node import Node
-from rclpy.utilities import remove_ros_args
 
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import ArgumentParser, check_distinct, input_file, output_file
+from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.run import run
 
@@ -49,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0 after a signal; 2 if an argument or a file is invalid.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = _parser().parse_args(remove_ros_args(['record', *arguments])[1:])
+    parser = _parser()
+    options = parse(parser, arguments)
+    check_distinct(parser, {'--config': options.config}, {'file': options.file})
     try:
         scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
         recorder = Recorder(options.file, scenario)
@@ -65,15 +69,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='record', description='Record a network as MCAP until Ctrl-C. ROS arguments select '
         'the namespace: --ros-args -r __ns:=/lab')
-    parser.add_argument('file', type=Path, help='recording to write')
+    parser.add_argument('file', type=output_file, help='recording to write')
     # Launch files pass an empty name by default.
-    parser.add_argument('--config', metavar='FILE',
+    parser.add_argument('--config', type=_optional_file, metavar='FILE',
                         help="scenario file of the network; the paper's Table I if empty")
     return parser
 
 
+def _optional_file(text: str) -> Path | None:
+    """Parse the path of a file, or an empty one, for argparse."""
+    return input_file(text) if text else None
+
+
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

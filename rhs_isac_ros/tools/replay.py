@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from rclpy.utilities import remove_ros_args
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.experiments.arguments import positive_float
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError, plugins
+from rhs_isac_ros.model.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
@@ -28,12 +28,17 @@ from rhs_isac_ros.positioning import (
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.tools.republish import RepublishError, republish, topic_prefix
 
 # Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
 # and announcements of nodes would contradict those of the running nodes.
 _TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
+
+# Defaults of the options for running nodes.
+_RATE = 1.0
+_TIMEOUT_S = 60.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,10 +129,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
-    options = parser.parse_args(remove_ros_args(['replay', *arguments])[1:])
+    options = parse(parser, arguments)
     if options.publish and (options.estimator or options.model):
         parser.error('argument --publish: not allowed with --estimator or --model, because '
                      'running nodes estimate')
+    if not options.publish and (options.topic, options.rate, options.timeout) != (
+            None, _RATE, _TIMEOUT_S):
+        parser.error('arguments --topic, --rate and --timeout: expected together with --publish')
+    if options.model and 'neural' not in (options.estimator or ()):
+        parser.error('argument --model: expected together with --estimator neural')
     try:
         if options.publish:
             return republish(options, ['replay', *arguments])
@@ -188,18 +198,19 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='replay', description='Feed the received signals of a recording to estimators, and '
         'compare their errors with those of the recorded network.')
-    parser.add_argument('file', type=Path, help='recording')
+    parser.add_argument('file', type=input_file, help='recording')
     parser.add_argument('--estimator', action='append',
                         choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
                         help='may be repeated (default: bayes)')
-    parser.add_argument('--codebook', type=Path, metavar='FILE',
+    parser.add_argument('--codebook', type=input_file, metavar='FILE',
                         help='codebook to assume; by default the recorded one')
-    parser.add_argument('--config', type=Path, metavar='FILE',
+    parser.add_argument('--config', type=input_file, metavar='FILE',
                         help='scenario file; by default the recorded scenario')
-    parser.add_argument('--model', type=Path, metavar='FILE', help='model of the estimator neural')
+    parser.add_argument('--model', type=input_file, metavar='FILE',
+                        help='model of the estimator neural')
     parser.add_argument('--namespace', default='/',
                         help='namespace of the recorded network (default: /)')
     live = parser.add_argument_group(
@@ -207,15 +218,15 @@ def _parser() -> argparse.ArgumentParser:
         'of --ros-args -r __ns:=... If the namespace has no optimizer, the replay provides the '
         'recorded codebook instead.')
     live.add_argument('--publish', action='store_true', help='publish instead of estimating')
-    live.add_argument('--rate', type=positive_float, default=1.0, metavar='R',
+    live.add_argument('--rate', type=positive_float, default=_RATE, metavar='R',
                       help='speed relative to the recording (default: 1)')
     live.add_argument('--topic', action='append', choices=_TOPICS, metavar='NAME',
                       help='relative name; may be repeated (default: '
                       f'{topics.NAMES[m.ReceivedSignals]})')
-    live.add_argument('--timeout', type=positive_float, default=60.0, metavar='S',
+    live.add_argument('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
                       help='maximum time to wait for subscribers (default: 60 s)')
     return parser
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -8,7 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.files import write_picture
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions, feed_positions
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
@@ -37,7 +37,7 @@ def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
         If the file cannot be written.
     """
     figure = compose(scene, scenario)
-    write_whole(path, lambda stream: figure.savefig(stream, dpi=_DPI, format='png'))
+    write_picture(path, figure, _DPI)
 
 
 def compose(scene: SceneState, scenario: Scenario) -> Any:

@@ -16,6 +16,8 @@ from rclpy.node import Node
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
+from rhs_isac_ros.executables import discard_stdout
+from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
 
 # Changes of the graph do not wake the executor, so the graph is polled with this period [s].
@@ -101,21 +103,14 @@ class Session:
             name = expand_topic_name(topic, self.node.get_name(), self.node.get_namespace())
             validate_full_topic_name(name)
         except (ValueError, InvalidTopicNameException) as error:
-            raise ToolError(str(error)) from None
+            # The end of the text is a position in the sources of ROS.
+            raise ToolError(str(error).partition(', at /')[0]) from None
         return name
 
 
 def print_now(*values: object, end: str = '\n') -> None:
     """Print and flush, so that a pipe receives the text at once."""
     print(*values, end=end, flush=True)
-
-
-def discard_stdout() -> None:
-    """Redirect the standard output to `os.devnull` after its reader has closed it.
-
-    Otherwise the flush at the exit of Python would fail.
-    """
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
@@ -134,6 +129,7 @@ def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
         Exit code: 0, including after a signal or when the reader closes the output; 1 after an
         error.
     """
+    check_domain(parser)
     options = parser.parse_args(arguments)
     try:
         with Session() as session:

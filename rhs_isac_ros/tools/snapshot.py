@@ -5,15 +5,21 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 from rclpy.node import Node
-from rclpy.utilities import remove_ros_args
 
-from rhs_isac_ros.experiments.arguments import check_directory
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    nonnegative_float,
+    picture_file,
+)
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.subscriptions import subscribe_messages
 from rhs_isac_ros.tools.scene_picture import draw
@@ -80,8 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
-    options = parser.parse_args(remove_ros_args(['snapshot', *arguments])[1:])
-    check_directory(parser, '--output', options.output)
+    options = parse(parser, arguments)
+    check_distinct(parser, {'--config': options.config}, {'--output': options.output})
     try:
         scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
     except ScenarioError as error:
@@ -141,17 +147,17 @@ def write_picture(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='snapshot', description='Draw the scene of a network when every user has an '
         'estimate. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
-    parser.add_argument('--output', type=Path, default=Path('scene.png'), metavar='FILE',
-                        help='PNG file to write (default: scene.png)')
-    parser.add_argument('--timeout', type=float, default=30.0, metavar='S',
+    parser.add_argument('--output', type=picture_file, default='scene.png', metavar='FILE',
+                        help='picture to write: PNG, PDF or SVG (default: scene.png)')
+    parser.add_argument('--timeout', type=nonnegative_float, default=30.0, metavar='S',
                         help='draw an incomplete scene after this time (default: 30 s)')
-    parser.add_argument('--config', type=Path, metavar='FILE',
+    parser.add_argument('--config', type=input_file, metavar='FILE',
                         help="scenario file of the network; by default the paper's Table I")
     return parser
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -20,7 +20,8 @@ from rclpy.qos import (
 )
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
-from rhs_isac_ros.experiments.arguments import positive_int
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float, positive_int
 from rhs_isac_ros.ros.timers import steady_timer
 from rhs_isac_ros.tools.message_text import Layout, as_csv, as_yaml
 from rhs_isac_ros.tools.rate import Rate
@@ -203,8 +204,8 @@ def _load_type(name: str) -> type[Any]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='topic', description='List topics, print messages, measure rates.')
+    parser = ArgumentParser(
+        prog='scripts/topic', description='List topics, print messages, measure rates.')
     verbs = parser.add_subparsers(required=True, metavar='list | echo | hz | info')
     verb = verbs.add_parser('list', help='Print the names of all topics.')
     verb.set_defaults(verb=show_list)
@@ -238,7 +239,8 @@ def _add_echo_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('topic_name')
     parser.add_argument('message_type', nargs='?', help='such as std_msgs/msg/String')
     parser.add_argument('--once', action='store_true', help='exit after one message')
-    parser.add_argument('--timeout', type=float, metavar='N', help='exit after N seconds')
+    parser.add_argument('--timeout', type=nonnegative_float, metavar='N',
+                        help='exit after N seconds')
     parser.add_argument('--field', help='print only this field; dots select nested fields')
     parser.add_argument('--csv', action='store_true', help='print each message as one CSV line')
     parser.add_argument('--flow-style', action='store_true',
@@ -259,9 +261,10 @@ def _add_echo_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_spin_time(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--spin-time', type=float, default=_DISCOVERY_TIMEOUT_S, metavar='S',
+    parser.add_argument('--spin-time', type=nonnegative_float, default=_DISCOVERY_TIMEOUT_S,
+                        metavar='S',
                         help=f'time for discovery (default: {_DISCOVERY_TIMEOUT_S:g} s)')
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
-from rclpy.utilities import remove_ros_args
 
+from rhs_isac_ros.executables import discard_stdout, exit_code_of
+from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
 from rhs_isac_ros.ros import diagnostics, qos, topics
+from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
-from rhs_isac_ros.tools.session import discard_stdout, print_now
+from rhs_isac_ros.tools.session import print_now
 from rhs_isac_ros.tools.watch_view import render
 
 if TYPE_CHECKING:
@@ -68,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         was complete in time.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = _parser().parse_args(remove_ros_args(['watch', *arguments])[1:])
+    options = parse(_parser(), arguments)
     try:
         with optional_import('watch', extra='watch'):
             import rich  # noqa: F401
@@ -148,15 +150,15 @@ def _create(nodes: list[WatchNode]) -> list[WatchNode]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='watch', description='Show phase, users, losses and faults of a network until '
         'Ctrl-C. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('--once', action='store_true',
                         help='wait for one complete cycle, print the view, and exit')
-    parser.add_argument('--timeout', type=float, default=60.0, metavar='S',
+    parser.add_argument('--timeout', type=nonnegative_float, default=60.0, metavar='S',
                         help='maximum wait of --once (default: 60 s)')
     return parser
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

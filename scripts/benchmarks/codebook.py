@@ -13,15 +13,24 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
-from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.codebook import Codebook, CodebookError, directional_codebook, random_codebook
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments.resampling import reduction
 from rhs_isac_ros.model import Scenario, simulate_received, streams
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    input_file,
+    output_file,
+    positive_int,
+    seed,
+)
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import make_estimator
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -30,14 +39,15 @@ BATCH = 50
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = ArgumentParser(
+        prog='scripts/benchmark codebook', description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--positions', type=positive_int, default=1000,
                         help='number of positions')
-    parser.add_argument('--seed', type=int, default=1, help='seed of all random numbers')
-    parser.add_argument('--codebook', type=Path, action='append', default=[],
+    parser.add_argument('--seed', type=seed, default=1, help='seed of all random numbers')
+    parser.add_argument('--codebook', type=input_file, action='append', default=[],
                         help='another codebook to compare; may be repeated')
-    parser.add_argument('--json', type=Path, help='JSON file for the results')
+    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario()
     codebooks = {
@@ -72,7 +82,7 @@ def main() -> None:
         print(f'ambiguity is {percent:.1f} % below {rival} '
               f'(95 % interval {low:.1f} to {high:.1f})')
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
 
 
 def draw_positions(scenario: Scenario, n: int, seed: int) -> np.ndarray:
@@ -95,4 +105,4 @@ def squared_errors(
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(exit_code_of(main, (CodebookError,)))

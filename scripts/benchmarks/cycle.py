@@ -18,13 +18,16 @@ import rclpy
 from parts.hops import hops_of, ping_pong
 
 from rhs_isac_ros.codebook import default_codebook_file
-from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo import start_network, watch
+from rhs_isac_ros.tools.demo import check_users, start_network, watch
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
@@ -32,12 +35,15 @@ REST_S = 0.05
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = ArgumentParser(
+        prog='scripts/benchmark cycle', description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--users', type=positive_int, default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
-    parser.add_argument('--json', type=Path, help='JSON file for the results')
+    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
+    check_domain(parser)
+    check_users(parser, options.users)
     os.environ.update(private_domain())
     scenario = Scenario()
     hops = hops_of(scenario)
@@ -69,7 +75,7 @@ def main() -> int:
     for phase, value in figures['phases_ms'].items():
         print(f'  {phase:12s}{value:7.2f} ms')
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
     return 0
 
 
@@ -87,4 +93,4 @@ def run_cycles(scenario: Scenario, users: int, cycles: int) -> list:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

@@ -28,8 +28,17 @@ from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.codebook.sampling import monte_carlo, sobol
 from rhs_isac_ros.codebook.search import BudgetSpent, Search
-from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    check_distinct,
+    output_file,
+    picture_file,
+    positive_float,
+    positive_int,
+)
+from rhs_isac_ros.model.files import write_picture, write_whole
 from rhs_isac_ros.model.optional import optional_import
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
@@ -39,16 +48,18 @@ HELD_OUT = 2000
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = ArgumentParser(
+        prog='scripts/benchmark optimizer', description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--threads', type=positive_int, default=1,
                         help='number of cores and threads')
-    parser.add_argument('--limit', type=float, default=120.0,
+    parser.add_argument('--limit', type=positive_float, default=120.0,
                         help='time limit per method in (b) [s]')
-    parser.add_argument('--parts', default='abc', help='parts to run')
-    parser.add_argument('--json', type=Path, help='JSON file for the results')
-    parser.add_argument('--picture', type=Path, help='file for the picture')
+    parser.add_argument('--parts', type=parts, default='abc', help='parts to run')
+    parser.add_argument('--json', type=output_file, help='JSON file for the results')
+    parser.add_argument('--picture', type=picture_file, help='file for the picture')
     options = parser.parse_args()
+    check_distinct(parser, {}, {'--json': options.json, '--picture': options.picture})
     restrict_to(options.threads)
     if not HAVE_JAX:
         print('JAX is not installed, so its figures are omitted; to install it: '
@@ -58,9 +69,16 @@ def main() -> None:
         if part in options.parts:
             figures |= measure()
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
     if options.picture:
         draw(figures, options.picture)
+
+
+def parts(text: str) -> str:
+    """Parse the letters of the parts, for argparse."""
+    if not text or set(text) - set('abc'):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected letters of abc')
+    return text
 
 
 def restrict_to(n: int) -> None:
@@ -262,8 +280,8 @@ def draw(figures: dict, path: Path) -> None:
             right.loglog(np.array(values) / values[0], times, 'o-', label=symbol)
         right.set(title='(c) Growth of an evaluation', xlabel='size, relative', ylabel='ms')
         right.legend()
-    figure.savefig(path, dpi=120)
+    write_picture(path, figure)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(exit_code_of(main))

@@ -28,13 +28,15 @@ import numpy as np
 from scipy.special import chdtri
 
 from rhs_isac_ros.bounds import crlb
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.experiments import positive_int
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import ArgumentParser, input_file, integer, positive_int, seed
 from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     Estimate,
+    ModelError,
     exhaustive_posterior,
     make_estimator,
     simulate_pairs,
@@ -85,17 +87,17 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__.partition('\n')[0],
+    parser = ArgumentParser(
+        prog='scripts/benchmark positioning', description=__doc__.partition('\n')[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
     add('--estimator', choices=sorted(ESTIMATORS), default='bayes', help='estimator')
-    add('--model', type=Path, help='trained model of the estimator neural')
-    add('--codebook', type=Path, default=DEFAULT_CODEBOOK, help='codebook file')
-    add('--scenario', type=Path, help='YAML file of the scenario')
+    add('--model', type=input_file, help='trained model of the estimator neural')
+    add('--codebook', type=input_file, default=DEFAULT_CODEBOOK, help='codebook file')
+    add('--scenario', type=input_file, help='YAML file of the scenario')
     add('--positions', type=positive_int, default=1000, help='number of positions')
-    add('--seed', type=int, default=1, help='seed of all random numbers')
-    add('--reference', type=int, default=0, metavar='N',
+    add('--seed', type=seed, default=1, help='seed of all random numbers')
+    add('--reference', type=integer(0, 24), default=0, metavar='N',
         help='compare with the posterior mean over 2^N points; 0 to omit')
     add('--table-folder', type=Path, help=argparse.SUPPRESS)
     add('--only-load', action='store_true', help=argparse.SUPPRESS)
@@ -161,4 +163,4 @@ def print_loading(settings: dict[str, Any]) -> None:
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(exit_code_of(main, (CodebookError, ModelError, ScenarioError)))

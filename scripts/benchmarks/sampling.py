@@ -13,16 +13,18 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
 import json
+import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.sampling import sobol
-from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int
+from rhs_isac_ros.model.files import write_whole
 
 CHOICES = (('monte_carlo', 300), ('monte_carlo', 600), ('monte_carlo', 1200), ('sobol', 64),
            ('sobol', 128), ('sobol', 256), ('sobol', 1024))
@@ -31,12 +33,13 @@ HELD_OUT, HELD_OUT_SEED = 16384, 1 << 20
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = ArgumentParser(
+        prog='scripts/benchmark sampling', description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--seeds', type=positive_int, default=5, help='number of runs per choice')
     parser.add_argument('--steps', type=positive_int, default=600,
                         help='update steps of each run')
-    parser.add_argument('--json', type=Path, help='JSON file for the results')
+    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario()
     held_out = sobol(scenario, HELD_OUT, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))
@@ -60,8 +63,8 @@ def main() -> None:
         print('| {} | {mean_m2:.5f} | {std_m2:.5f} | {time_s:.1f} |'.format(name, **figures[name]),
               flush=True)
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(exit_code_of(main))

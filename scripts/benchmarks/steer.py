@@ -14,17 +14,18 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
-from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.link import Beam, capacity, steer
 from rhs_isac_ros.link.band_link import BandLink
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import ArgumentParser, input_file, integer, positive_int, seed
 from rhs_isac_ros.model.surface import matched_configuration
 
 # Standard deviations of the estimates around the true position [m].
@@ -35,18 +36,21 @@ REFINED = 5
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--scenario', type=Path, help='YAML file of the scenario')
-    parser.add_argument('--band', type=int, default=0, help='index of the band')
+    parser = ArgumentParser(
+        prog='scripts/benchmark steer', description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument('--scenario', type=input_file, help='YAML file of the scenario')
+    parser.add_argument('--band', type=integer(0), default=0, help='index of the band')
     parser.add_argument('--positions', type=positive_int, default=100, help='number of positions')
     parser.add_argument('--starts', type=positive_int, default=150,
                         help='random starts of the long optimisation per position')
     parser.add_argument('--pairs', type=positive_int, default=2000,
                         help='number of pairs of true position and estimate')
-    parser.add_argument('--seed', type=int, default=1, help='seed of all random numbers')
+    parser.add_argument('--seed', type=seed, default=1, help='seed of all random numbers')
     options = parser.parse_args()
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+    if options.band >= scenario.n_bands:
+        parser.error(f'argument --band: {options.band}, expected at most {scenario.n_bands - 1}')
     rng = np.random.default_rng(options.seed)
     positions = scenario.sample_positions(options.positions, rng)
     print(f'{options.positions} positions, band {options.band}, seed {options.seed}')
@@ -169,4 +173,4 @@ def compare_with_estimates(
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(exit_code_of(main, (ScenarioError,)))

@@ -19,19 +19,23 @@ from parts.hops import hops_of, ping_pong
 from system.observer import NetworkObserver
 
 from rhs_isac_ros.codebook import default_codebook_file
-from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int
+from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo import start_network
+from rhs_isac_ros.tools.demo import check_users, start_network
 
 TIMEOUT_S = 600.0
 
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = ArgumentParser(
+        prog='scripts/benchmark users', description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--few', type=positive_int, default=2,
                         help='number of users in the first run')
     parser.add_argument('--users', type=positive_int, default=64,
@@ -39,8 +43,11 @@ def main() -> int:
     parser.add_argument('--rounds', type=positive_int, default=5, help='cycles for each user')
     parser.add_argument('--composed', action='store_true',
                         help='run all nodes in one process instead of one process per node')
-    parser.add_argument('--json', type=Path, help='JSON file for the results')
+    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
+    check_domain(parser)
+    if not options.composed:
+        check_users(parser, max(options.few, options.users))
     os.environ.update(private_domain())
     use_discovery_profile()
     rclpy.init(args=[])
@@ -68,7 +75,7 @@ def main() -> int:
     print(f'rate with {options.users} users relative to that with {options.few}: '
           f'{figures["rate_ratio"]:.2f}; fair, one round at most: {figures["fair"]}')
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
     return 0
 
 
@@ -122,4 +129,4 @@ def waits(order: list[int], ended_s: np.ndarray) -> dict:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(exit_code_of(main))

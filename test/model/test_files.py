@@ -44,5 +44,5 @@ def test_a_missing_folder_is_an_error(tmp_path):
 def test_a_file_in_a_missing_folder_is_not_writable(tmp_path):
     check_writable(tmp_path / 'file')
     path = tmp_path / 'none' / 'file'
-    with pytest.raises(OSError, match=f'^{path}: expected a file in a directory that can be'):
+    with pytest.raises(OSError, match=f'^{path}: expected a file in a directory that exists'):
         check_writable(path)

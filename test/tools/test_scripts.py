@@ -30,7 +30,7 @@ def test_a_link_in_another_directory_finds_the_package(built_scripts, tmp_path):
     done = subprocess.run([tmp_path / 'param', '--help'], cwd=tmp_path, capture_output=True,
                           text=True, check=False)
     assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout.startswith('usage: param ')
+    assert done.stdout.startswith('usage: scripts/param ')
 
 
 @pytest.mark.parametrize(('script', 'built', 'distribution', 'line'), [

@@ -2,6 +2,7 @@
 
 import sys
 
+from rhs_isac_ros.executables import exit_code_of
 from system.chaos.command import main
 
-sys.exit(main())
+sys.exit(exit_code_of(main))

@@ -2,11 +2,10 @@
 
 import argparse
 import json
-import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,20 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.experiments.arguments import check_directory
 from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    output_file,
+    positive_float,
+    positive_int,
+    seed,
+)
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.monitoring.invariants import CHECK_DELAY_S
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import load_files, start_network
@@ -47,7 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    check_directory(parser, '--json', options.json)
+    check_domain(parser)
+    check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
+                   {'--json': options.json})
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
@@ -148,17 +158,17 @@ def _show_progress(text: str) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='chaos', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    parser = ArgumentParser(
+        prog='scripts/chaos', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         description='Start a network of processes, kill and restart each node in each phase, '
                     'start a second node of each role, and check from outside that no invariant '
                     'of the results is violated.')
     test = parser.add_mutually_exclusive_group()
-    test.add_argument('--soak', type=_positive(float), metavar='MINUTES',
+    test.add_argument('--soak', type=positive_float, metavar='MINUTES',
                       help='instead of killing nodes, run for this time with an impaired channel '
                       'that loses 5 %% of signals and packets, duplicates 5 %%, and delays and '
                       'reorders them')
-    test.add_argument('--fuzz', type=_positive(int), metavar='N',
+    test.add_argument('--fuzz', type=positive_int, metavar='N',
                       help='instead of killing nodes, publish this number of random and mutated '
                       'messages of every type on every topic')
     parser.add_argument('--nodes', nargs='+', choices=crashes.NODES, metavar='NODE',
@@ -168,21 +178,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--intruders', nargs='+', choices=intruders.INTRUDERS, metavar='NODE',
                         help='only start these second nodes, which may be repeated; of '
                              f'{", ".join(intruders.INTRUDERS)}')
-    parser.add_argument('--seconds', type=_positive(float), default=intruders.SECONDS,
+    parser.add_argument('--seconds', type=positive_float, default=intruders.SECONDS,
                         metavar='S', help='duration of each intrusion')
-    parser.add_argument('--seed', type=int, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', type=Path,
+    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
+    parser.add_argument('--config', type=input_file,
                         help="scenario file; by default the paper's Table I")
-    parser.add_argument('--codebook', type=Path,
+    parser.add_argument('--codebook', type=input_file,
                         help='codebook file; by default that of the package')
-    parser.add_argument('--json', type=Path, metavar='PATH', help='JSON file for the results')
+    parser.add_argument('--json', type=output_file, metavar='PATH',
+                        help='JSON file for the results')
     return parser
-
-
-def _positive(kind: type) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        value = kind(text)
-        if not 0 < value < math.inf:
-            raise argparse.ArgumentTypeError(f'{text}, expected a number above 0')
-        return value
-    return number

@@ -83,5 +83,6 @@ def test_invalid_arguments_are_rejected(arguments, capsys):
 
 
 def test_an_invalid_file_is_named(capsys):
-    assert main(['--config', '/nonexistent.yaml']) == 2
+    with pytest.raises(SystemExit, match='2'):
+        main(['--config', '/nonexistent.yaml'])
     assert '/nonexistent.yaml' in capsys.readouterr().err

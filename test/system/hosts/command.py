@@ -12,12 +12,20 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from rhs_isac_ros.codebook import CodebookError
-from rhs_isac_ros.experiments.arguments import check_directory
 from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    integer,
+    output_file,
+    positive_float,
+    seed,
+)
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.resources import discovery_profile_file
-from rhs_isac_ros.tools.demo import load_files, start_network
+from rhs_isac_ros.tools.demo import check_users, load_files, start_network
 from system.hosts import plan
 from system.hosts.namespaces import Hosts, NamespacesUnavailable, interruptible
 from system.hosts.trial import NetworkBroken, Trial
@@ -44,7 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = parser.parse_args(arguments)
-    check_directory(parser, '--json', options.json)
+    check_users(parser, options.users)
+    check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
+                   {'--json': options.json})
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
@@ -129,7 +139,7 @@ def _report(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog='scripts/hosts', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         description='Run the network on several hosts of this machine, which are network '
         'namespaces, and take their links down: cycles must be served again within '
@@ -140,22 +150,24 @@ def _parser() -> argparse.ArgumentParser:
                         'default each in turn')
     parser.add_argument('--seconds', type=_positive, default=6.0,
                         help='duration of each outage')
-    parser.add_argument('--users', type=int, choices=range(1, 65), metavar='N', default=2,
+    parser.add_argument('--users', type=integer(1, 64), metavar='N', default=2,
                         help='number of users')
-    parser.add_argument('--seed', type=int, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', type=Path,
+    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
+    parser.add_argument('--config', type=input_file,
                         help="scenario file; by default the paper's Table I")
-    parser.add_argument('--codebook', type=Path,
+    parser.add_argument('--codebook', type=input_file,
                         help='codebook file; by default that of the package')
     parser.add_argument('--usual-discovery', action='store_true',
                         help="use Fast DDS's default settings instead of the package's profile")
     parser.add_argument('--static-peers', action='store_true',
                         help='discover nodes by their addresses, without multicast')
-    parser.add_argument('--json', type=Path, metavar='PATH', help='JSON file for the results')
+    parser.add_argument('--json', type=output_file, metavar='PATH',
+                        help='JSON file for the results')
     return parser
 
 
 def _positive(text: str) -> float:
-    if not 0 < float(text) <= 3600:
-        raise argparse.ArgumentTypeError(f'{text}, expected more than 0 s and at most 3600 s')
-    return float(text)
+    seconds = positive_float(text)
+    if seconds > 3600:
+        raise argparse.ArgumentTypeError(f'{text}, expected at most 3600 s')
+    return seconds

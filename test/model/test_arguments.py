@@ -4,7 +4,7 @@ import argparse
 
 import pytest
 
-from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.model.arguments import positive_int
 
 
 @pytest.mark.parametrize(('text', 'number'), [('1', 1), ('250', 250)])
