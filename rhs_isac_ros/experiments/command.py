@@ -1,6 +1,7 @@
 """The command line of an experiment: common options and exit codes."""
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Sequence
 
@@ -43,7 +44,7 @@ def parse_options(
         add(parser)
     parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
                         help='number of parallel jobs (default: one per core)')
-    parser.add_argument('--dask', metavar='ADDRESS',
+    parser.add_argument('--dask', type=_address, metavar='ADDRESS',
                         help='scheduler of a Dask cluster to use instead of this machine; '
                              'its workers need this package, and one thread each for '
                              'accurate timing')
@@ -53,6 +54,13 @@ def parse_options(
     options = parser.parse_args(arguments)
     options.trials = quick_trials if options.quick else options.trials or trials
     return options
+
+
+def _address(text: str) -> str:
+    """Check the address of a scheduler, for argparse."""
+    if not re.fullmatch(r'(\w+://)?[^\s/:]+:\d{1,5}', text):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected HOST:PORT')
+    return text
 
 
 def run_command(experiment: Callable[[], None]) -> int:
@@ -67,7 +75,7 @@ def run_command(experiment: Callable[[], None]) -> int:
               file=sys.stderr)
         return _INTERRUPTED
     except (JobError, MissingLibraryError, OSError) as error:
-        print(f'error: {error}\nfinished jobs are kept; repeat the command to resume',
+        print(f'error: {error}; finished jobs are kept; repeat the command to resume',
               file=sys.stderr)
         return 1
     return 0

@@ -113,10 +113,12 @@ def output_folder(text: str) -> Path:
     try:
         found = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
         if not text or not found.is_dir():
-            raise OSError(f'{text!r}, expected a folder; {found} is none')
+            raise OSError
         check_writable(found / 'file')
-    except (OSError, ValueError) as error:
-        raise argparse.ArgumentTypeError(_reason(error)) from None
+    except (OSError, ValueError):
+        raise argparse.ArgumentTypeError(
+            f'{text!r}, expected a folder that exists or can be made, and can be written'
+        ) from None
     return path
 
 

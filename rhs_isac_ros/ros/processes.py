@@ -16,6 +16,7 @@ from rhs_isac_ros.executables import PARENT_ID
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
 _PROCESSES_PER_CORE = 40
+_MEMORY_FILE = Path('/proc/meminfo')
 # Signals sent in order to end a process, each with the time to wait for its exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 
@@ -39,7 +40,7 @@ def private_domain() -> dict[str, str]:
 def max_processes() -> int:
     """Return the number of nodes that this machine can run as processes of their own."""
     fields = dict(line.split(':') for line in
-                  Path('/proc/meminfo').read_text(encoding='ascii').splitlines())
+                  _MEMORY_FILE.read_text(encoding='ascii').splitlines())
     available_bytes = 1024 * int(fields['MemAvailable'].split()[0])
     return min(available_bytes // _MEMORY_BYTES,
                _PROCESSES_PER_CORE * len(os.sched_getaffinity(0)))

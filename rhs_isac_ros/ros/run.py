@@ -74,9 +74,10 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     executor = None
     try:
         nodes = make()
-        executor = EventsExecutor()
         for node in nodes:
             parameters.check_overrides(node)
+        executor = EventsExecutor()
+        for node in nodes:
             executor.add_node(node)
         while ok() and not signals and not done():
             executor.spin_once(timeout_sec=_POLL_S)

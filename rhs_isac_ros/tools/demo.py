@@ -57,7 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     check_domain(parser)
-    check_users(parser, options.users)
+    check_users(parser, options.users,
+                f'scripts/run network --ros-args -p users:={options.users}')
     check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
                    {'--record': options.record, '--picture': options.picture})
     try:
@@ -98,14 +99,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
 
 
-def check_users(parser: argparse.ArgumentParser, users: int) -> None:
-    """Exit with a usage error if a process for each user would overload this machine."""
+def check_users(parser: argparse.ArgumentParser, users: int, instead: str = '') -> None:
+    """Exit with a usage error if a process for each user would overload this machine.
+
+    Parameters
+    ----------
+    instead
+        Arguments or a command that run more users in one process, for the message.
+    """
     limit = max_processes() - _N_OTHERS
     if users > limit:
         parser.error(
             f'argument --users: {users}, expected at most {limit} on this machine, because each '
-            'user is a process; run more in one process: scripts/run network --ros-args '
-            f'-p users:={users}')
+            'user is a process' + (f'; for more in one process: {instead}' if instead else ''))
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:

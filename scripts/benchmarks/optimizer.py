@@ -33,10 +33,10 @@ from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
     check_distinct,
+    integer,
     output_file,
     picture_file,
     positive_float,
-    positive_int,
 )
 from rhs_isac_ros.model.files import write_picture, write_whole
 from rhs_isac_ros.model.optional import optional_import
@@ -51,7 +51,7 @@ def main() -> None:
     parser = ArgumentParser(
         prog='scripts/benchmark optimizer', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--threads', type=positive_int, default=1,
+    parser.add_argument('--threads', type=integer(1, len(os.sched_getaffinity(0))), default=1,
                         help='number of cores and threads')
     parser.add_argument('--limit', type=positive_float, default=120.0,
                         help='time limit per method in (b) [s]')

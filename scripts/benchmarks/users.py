@@ -47,7 +47,7 @@ def main() -> int:
     options = parser.parse_args()
     check_domain(parser)
     if not options.composed:
-        check_users(parser, max(options.few, options.users))
+        check_users(parser, max(options.few, options.users), '--composed')
     os.environ.update(private_domain())
     use_discovery_profile()
     rclpy.init(args=[])

@@ -33,12 +33,12 @@ from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codeboo
 from rhs_isac_ros.experiments import (
     Job,
     parse_options,
-    positive_int,
     run_command,
     run_jobs,
 )
 from rhs_isac_ros.link import CapacityReport, capacity, choose_beam
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.arguments import integer
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning import NeuralEstimator, make_estimator
@@ -169,9 +169,9 @@ def reproduce(options: argparse.Namespace) -> None:
 
 def add_sizes(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment."""
-    parser.add_argument('--pairs', type=positive_int, metavar='N',
+    parser.add_argument('--pairs', type=integer(20, 10**7), metavar='N',
                         help=f'pairs per training (default: {PAIRS}, quick {QUICK_PAIRS})')
-    parser.add_argument('--positions', type=positive_int, metavar='N',
+    parser.add_argument('--positions', type=integer(1, 10**6), metavar='N',
                         help=f'test positions (default: {POSITIONS}, quick {QUICK_POSITIONS})')
     parser.add_argument('--ros', action='store_true',
                         help='measure (b) in a running network with the default codebook instead, '

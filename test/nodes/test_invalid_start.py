@@ -37,6 +37,9 @@ CASES = {
     'users': ('network', {'users': 0}, ['users', '0', '1 to 1000']),
     'network': ('network', {'policy': 'best'}, ['policy', "'best'"]),
     'allowed users': ('bs', {'allowed_users': '7, 5-3'}, ['allowed_users', "'5-3'", '10-20']),
+    'unknown parameter': ('user', {'user_di': 2}, ['user_di: unknown parameter', 'user_id']),
+    'unknown to a composed node': ('network', {'rest': 2.0}, ['rest: unknown', 'rest_s']),
+    'unknown in a file': ('bs', ['--params-file', 'unknown.yaml'], ['polcy', 'policy']),
     'no parameter file': ('bs', ['--params-file', '/no/parameters.yaml'],
                           ['/no/parameters.yaml']),
 }
@@ -51,6 +54,13 @@ def files(shipped, tmp_path_factory):
     folder = tmp_path_factory.mktemp('files')
     (folder / 'unknown_key.yaml').write_text('n_feed: 3')
     (folder / 'one_feed.yaml').write_text('n_feeds: 1')
+    (folder / 'unknown.yaml').write_text('/**/bs:\n  ros__parameters: {polcy: random}\n')
+    # Parameters of other nodes, of rclpy, and of nodes with another name.
+    (folder / 'shared.yaml').write_text(
+        '/**:\n  ros__parameters: {seed: 3, policy: random, use_sim_time: false,\n'
+        '    start_type_description_service: true,\n'
+        '    qos_overrides: {/beacon: {publisher: {depth: 3}}}}\n'
+        'another_node:\n  ros__parameters: {anything: 1}\n')
     (folder / 'broken.yaml').write_text('n_feeds: [\nn_frames: }\n')
     shipped.save(folder / 'good.yaml')
     first = repr(float(shipped.analog.flat[0]))
@@ -63,7 +73,7 @@ def files(shipped, tmp_path_factory):
 def arguments(name, files):
     given = CASES[name][1]
     if isinstance(given, list):
-        return given
+        return [str(files / word) if (files / word).is_file() else word for word in given]
     words = []
     for key, value in given.items():
         in_folder = str(value).endswith('.yaml') and not str(value).startswith('/')
@@ -109,6 +119,13 @@ def test_a_valid_start_reaches_the_executor(files, never_spins):
     with pytest.raises(AssertionError, match='the executable starts'):
         importlib.import_module('rhs_isac_ros.nodes.optimizer').main(
             ['--ros-args', '-p', f'codebook_file:={files / "good.yaml"}'])
+
+
+@pytest.mark.parametrize('executable', ['user', 'bs', 'optimizer'])
+def test_a_file_with_the_parameters_of_several_nodes_is_valid(executable, files, never_spins):
+    with pytest.raises(AssertionError, match='the executable starts'):
+        importlib.import_module(f'rhs_isac_ros.nodes.{executable}').main(
+            ['--ros-args', '--params-file', str(files / 'shared.yaml')])
 
 
 @pytest.fixture(scope='module')

@@ -192,8 +192,7 @@ def test_the_command_writes_the_network_that_train_returns(files, scenario, code
 
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['--codebook', 'no.yaml'], 'no.yaml'),
-    (['--codebook', 'codebook.yaml', '--scenario', 'scenario.yaml', '--pairs', '30',
-      '--hidden', '0'], '--hidden'),
+    (['--codebook', 'codebook.yaml', '--scenario', 'scenario.yaml', '--pairs', '3'], '--pairs'),
     (['--codebook', 'codebook.yaml'], 'analog: shape'),
     (['--codebook', 'codebook.yaml', '--output', 'no/model.npz'], 'no/model.npz: expected')])
 def test_the_command_reports_errors(files, monkeypatch, capsys, arguments, message):

@@ -1,0 +1,77 @@
+"""Executables as child processes, and their end with their parent."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from ament_index_python.packages import get_package_prefix
+
+from rhs_isac_ros.executables import PARENT_ID
+from rhs_isac_ros.ros import processes
+
+TIMEOUT_S = 60.0
+# A parent that starts two nodes and prints their process ids.
+PARENT = """
+import signal, sys
+from pathlib import Path
+from rhs_isac_ros.ros.processes import Processes
+with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]}) as children:
+    children.start('visualizer')
+    children.start('rhs_controller')
+    print(*(child.pid for child in children._running.values()), flush=True)
+    signal.pause()
+"""
+
+
+def until_ended(descriptors):
+    """Wait for the end of processes, given as file descriptors that become readable then."""
+    for descriptor in descriptors:
+        assert select.select([descriptor], [], [], TIMEOUT_S)[0]
+        os.close(descriptor)
+
+
+def test_no_child_survives_a_parent_that_is_killed(tmp_path):
+    """The parent dies while its children start."""
+    with subprocess.Popen([sys.executable, '-c', PARENT, tmp_path], stdout=subprocess.PIPE,
+                          text=True) as parent:
+        children = [os.pidfd_open(int(pid)) for pid in parent.stdout.readline().split()]
+        assert len(children) == 2
+        parent.send_signal(signal.SIGKILL)
+        until_ended(children)
+
+
+def test_no_node_survives_a_demonstration_that_is_killed(tmp_path):
+    program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / 'demo'
+    with subprocess.Popen(
+            [program, '--cycles', '1000000'], cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, 'TMPDIR': str(tmp_path)}) as demo:
+        # The first line follows the start of all nodes.
+        assert demo.stderr.readline().startswith('network started')
+        folder = f'/proc/{demo.pid}/task/{demo.pid}/children'
+        with open(folder, encoding='ascii') as file:
+            children = [os.pidfd_open(int(pid)) for pid in file.read().split()]
+        assert len(children) == 8
+        demo.send_signal(signal.SIGKILL)
+        until_ended(children)
+
+
+def test_a_child_whose_parent_has_already_died_ends_before_it_starts(tmp_path):
+    done = subprocess.run(
+        [sys.executable, '-c', 'from rhs_isac_ros import executables; executables.bs()'],
+        env={**os.environ, PARENT_ID: '1'}, capture_output=True, timeout=TIMEOUT_S, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b'', b'')
+
+
+@pytest.mark.parametrize(('cores', 'available_kb', 'expected'), [
+    (2, 23_000_000, 80), (1, 23_000_000, 40), (64, 1_000_000, 15)])
+def test_cores_and_memory_limit_the_number_of_processes(
+        cores, available_kb, expected, monkeypatch, tmp_path):
+    (tmp_path / 'meminfo').write_text(
+        f'MemTotal:       99999999 kB\nMemAvailable:   {available_kb} kB\n', encoding='ascii')
+    monkeypatch.setattr(processes, '_MEMORY_FILE', tmp_path / 'meminfo')
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: set(range(cores)))
+    assert processes.max_processes() == expected

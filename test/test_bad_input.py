@@ -1,0 +1,202 @@
+"""Bad input ends every command with one line and exit code 2, before anything starts."""
+
+import importlib
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='ROS is not installed')
+ROOT = Path(__file__).parents[1]
+SCRIPTS = ROOT / 'scripts'
+CODEBOOK = str(ROOT / 'config' / 'codebook.yaml')
+QUICK_CODEBOOK = str(ROOT / 'config' / 'codebook_quick.yaml')
+QUICK = str(ROOT / 'config' / 'quick.yaml')
+LONG = 300 * 'x'
+
+# Module whose main function is called, arguments, and a part of the error. Every call takes place
+# in a folder with the files of the fixture `folder`.
+CALLS = [
+    ('tools.demo', ['--users', '0'], 'argument --users: 0, expected at least 1'),
+    ('tools.demo', ['--users', '-3'], 'argument --users: -3, expected at least 1'),
+    ('tools.demo', ['--users', 'many'], "argument --users: 'many', expected an integer"),
+    ('tools.demo', ['--users', '100000'], 'users:=100000'),
+    ('tools.demo', ['--cycles', '1e3'], "argument --cycles: '1e3', expected an integer"),
+    ('tools.demo', ['--cycles', str(10**30)], 'expected at most 1000000000'),
+    ('tools.demo', ['--seed', '2147483648'], 'expected at most 2147483647'),
+    ('tools.demo', ['--picture', 'x.xyz'], 'ends in .png, .pdf, .svg'),
+    ('tools.demo', ['--picture', 'none/x.png'], 'none/x.png: expected a file in a directory'),
+    ('tools.demo', ['--record', 'folder'], 'folder: a directory, expected a file'),
+    ('tools.demo', ['--record', 'a.png', '--picture', './a.png'], 'another file than --record'),
+    ('tools.demo', ['--config', 'none.yaml'], "'none.yaml', expected an existing file"),
+    ('tools.demo', ['--config', 'garbage'], 'garbage: cannot be read'),
+    ('tools.demo', ['--codebook', 'garbage'], 'garbage: cannot be read'),
+    ('tools.demo', ['--codebook', QUICK_CODEBOOK], 'analog: shape (2, 3, 36), expected'),
+    ('tools.demo', ['--pict', 'x.png'], 'unrecognized arguments: --pict'),
+    ('tools.demo', ['a\nb'], 'unrecognized arguments: a b'),
+    ('tools.record', [], 'required: file'),
+    ('tools.record', [''], "argument file: '', expected a file"),
+    ('tools.record', ['folder'], 'folder: a directory'),
+    ('tools.record', ['/dev/null'], 'expected a regular file'),
+    ('tools.record', ['/proc/x.mcap'], '/proc/x.mcap: expected a file in a directory'),
+    ('tools.record', [LONG], 'File name too long'),
+    ('tools.record', ['x.mcap', '--config', 'garbage'], 'garbage: cannot be read'),
+    ('tools.record', ['good.yaml', '--config', 'good.yaml'], 'another file than --config'),
+    ('tools.record', ['x.mcap', '-p', 'a:=1'], 'ROS arguments follow --ros-args'),
+    ('tools.record', ['x.mcap', '--ros-args', '--bogus'], "invalid ROS arguments: ['--bogus']"),
+    ('tools.replay', ['none.mcap'], "'none.mcap', expected an existing file"),
+    ('tools.replay', ['folder'], 'folder: a directory'),
+    ('tools.replay', ['garbage'], 'garbage: not a complete recording'),
+    ('tools.replay', ['garbage', '--estimator', 'magic'], "invalid choice: 'magic'"),
+    ('tools.replay', ['garbage', '--publish', '--rate', 'nan'], 'expected a positive number'),
+    ('tools.replay', ['garbage', '--publish', '--estimator', 'ml'], 'not allowed with'),
+    ('tools.replay', ['garbage', '--rate', '2'], 'expected together with --publish'),
+    ('tools.replay', ['garbage', '--model', 'good.yaml'], 'together with --estimator neural'),
+    ('tools.snapshot', ['--output', 'x.jpg'], 'ends in .png, .pdf, .svg'),
+    ('tools.snapshot', ['--timeout', '-1'], 'expected a number of at least 0'),
+    ('tools.snapshot', ['--timeout', 'inf'], 'expected a number of at least 0'),
+    ('tools.snapshot', ['--config', QUICK_CODEBOOK], 'unknown field'),
+    ('tools.watch', ['--timeout', 'x'], "argument --timeout: 'x'"),
+    ('tools.watch', ['--once', 'twice'], 'unrecognized arguments: twice'),
+    ('tools.topic', ['show'], "invalid choice: 'show'"),
+    ('tools.topic', ['echo'], 'required: topic_name'),
+    ('tools.topic', ['hz', 'beam', '--window', '0'], 'expected at least 1'),
+    ('tools.topic', ['list', '--spin-time', 'nan'], 'expected a number of at least 0'),
+    ('tools.param', ['get', 'bs'], 'required: parameter_name'),
+    ('tools.param', ['list', '--filter', '('], 'expected a regular expression'),
+    ('tools.permissions', ['--users', '-1'], 'expected at least 0'),
+    ('codebook.__main__', ['--output', '.'], '.: a directory, expected a file'),
+    ('codebook.__main__', ['--plot', 'p.xyz'], 'ends in .png, .pdf, .svg'),
+    ('codebook.__main__', ['--output', 'a.pdf', '--plot', 'a.pdf'], 'another file than --output'),
+    ('codebook.__main__', ['--positions', '0'], 'expected at least 1'),
+    ('codebook.__main__', ['--steps', '-1'], 'expected at least 1'),
+    ('codebook.__main__', ['--start', 'none'], "'none', expected an existing file"),
+    ('codebook.__main__', ['--start', QUICK_CODEBOOK], 'analog: shape (2, 3, 36)'),
+    ('codebook.__main__', ['--resume'], 'expected codebook.yaml.part or codebook.yaml'),
+    ('codebook.__main__', ['--scenario', 'good.yaml', '--output', 'good.yaml'], 'another file'),
+    ('positioning.__main__', [], 'required: --codebook'),
+    ('positioning.__main__', ['--codebook', 'garbage'], 'garbage: cannot be read'),
+    ('positioning.__main__', ['--codebook', CODEBOOK, '--pairs', '3'], 'expected at least 20'),
+    ('positioning.__main__', ['--codebook', CODEBOOK, '--output', 'folder'], 'a directory'),
+    ('positioning.__main__', ['--codebook', CODEBOOK, '--scenario', QUICK], 'analog: shape'),
+    ('nodes.user', ['-p', 'user_id:=2'], 'ROS arguments follow --ros-args'),
+    ('nodes.user', ['2'], 'unrecognized arguments: 2'),
+    ('nodes.bs', ['--policy', 'random'], 'unrecognized arguments: --policy random'),
+    ('nodes.bs', ['--ros-args', '-p', 'policy'], "parameter override rule: '-p policy'"),
+    ('nodes.network', ['--ros-args', '--params-file', 'garbage'], "'--params-file garbage'"),
+    ('nodes.optimizer', ['--push', '--push-file', 'good.yaml'], 'not allowed with --push'),
+    ('nodes.optimizer', ['--push-file', 'garbage'], 'garbage: cannot be read'),
+]
+# The scripts, as processes.
+PROCESSES = [
+    (['record', ''], "record: error: argument file: '', expected a file"),
+    (['run', 'demo', '--users', '100000'], 'demo: error: argument --users: 100000'),
+    (['run', 'user', 'seed:=1'], 'user: error: unrecognized arguments: seed:=1'),
+    (['run', '../setup'], 'no executable named ../setup'),
+    (['reproduce', 'fig5'], 'no figure named fig5'),
+    (['benchmark', ''], 'no benchmark named'),
+]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working directory, with files and a folder that must stay as they are."""
+    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'garbage').write_bytes(bytes(range(128, 256)) * 10)
+    (tmp_path / 'good.yaml').write_text('n_frames: 4\n', encoding='utf-8')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def contents(folder):
+    return {path.name: path.is_file() and path.read_bytes() for path in folder.rglob('*')}
+
+
+def exit_code(main, arguments):
+    try:
+        return main(arguments)
+    except SystemExit as exit:
+        return exit.code
+
+
+def assert_one_line(errors, expected):
+    assert 'Traceback' not in errors
+    assert len(errors.splitlines()) == 1, errors
+    assert expected in errors
+
+
+@pytest.mark.parametrize(('module', 'arguments', 'expected'), CALLS)
+def test_a_bad_call_prints_one_line_and_starts_and_changes_nothing(
+        module, arguments, expected, folder, monkeypatch, capfd):
+    def refuse(*args, **options):
+        raise AssertionError('the command starts')
+    main = importlib.import_module(f'rhs_isac_ros.{module}').main
+    before = contents(folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, 'Popen', refuse)
+        patch.setattr(rclpy, 'init', refuse)
+        code = exit_code(main, arguments)
+    output, errors = capfd.readouterr()
+    assert code == 2
+    assert output == ''
+    assert_one_line(errors, expected)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize('domain', ['233', '-1', 'abc', '1.5', '9' * 5000])
+@pytest.mark.parametrize('module', ['nodes.bs', 'tools.demo', 'tools.topic'])
+def test_an_invalid_domain_is_an_error(module, domain, monkeypatch, capfd):
+    monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+    main = importlib.import_module(f'rhs_isac_ros.{module}').main
+    assert exit_code(main, ['list'] if module == 'tools.topic' else []) == 2
+    assert_one_line(capfd.readouterr().err, f'ROS_DOMAIN_ID: {domain!r}, expected an integer')
+
+
+@pytest.fixture(scope='module')
+def processes(tmp_path_factory):
+    """The processes of all scripts, which run concurrently, with their working directories."""
+    started = []
+    for command, _ in PROCESSES:
+        folder = tmp_path_factory.mktemp('folder')
+        started.append((folder, subprocess.Popen(
+            [SCRIPTS / command[0], *command[1:]], cwd=folder, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)))
+    return started
+
+
+@pytest.mark.parametrize('index', range(len(PROCESSES)), ids=lambda i: ' '.join(PROCESSES[i][0]))
+def test_a_script_prints_one_line_and_exits_with_code_2(index, processes):
+    folder, process = processes[index]
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, output) == (2, '')
+    assert_one_line(errors, PROCESSES[index][1])
+    assert not os.listdir(folder)
+
+
+@pytest.mark.parametrize('executable', [
+    'bs', 'channel', 'network', 'optimizer', 'positioner', 'rhs_controller', 'transmission',
+    'user', 'visualizer'])
+def test_the_help_of_a_node_lists_its_parameters(executable, capsys):
+    from rhs_isac_ros.ros.parameters import NODES
+    main = importlib.import_module(f'rhs_isac_ros.nodes.{executable}').main
+    assert exit_code(main, ['--help']) == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f'usage: {executable} ')
+    assert f'example: {executable} --ros-args -p ' in text
+    for parameter in NODES[executable]:
+        assert f'\n  {parameter.name} ({parameter.kind}; default ' in text
+        assert f'{parameter.range}' in text
+        assert f'\n      {parameter.text}\n' in text
+
+
+def test_closed_standard_streams_do_not_change_the_exit_code(tmp_path):
+    command = f"'{SCRIPTS}/run' watch --timeout x 0<&- 1>&- 2>&-"
+    assert subprocess.run(['bash', '-c', command], cwd=tmp_path, check=False).returncode == 2
+
+
+def test_a_reader_that_closes_the_output_early_is_no_error():
+    done = subprocess.run(
+        ['bash', '-c', f"set -o pipefail; '{SCRIPTS}/run' user --help | head -c 1"],
+        capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'u', '')
