@@ -48,8 +48,14 @@ def integer(low: int, high: int = _MAX_COUNT) -> Callable[[str], int]:
     return parse
 
 
-positive_int = integer(1)
-seed = integer(0, _MAX_SEED)
+def positive_int(text: str) -> int:
+    """Parse an integer of at least 1, or raise argparse.ArgumentTypeError."""
+    return integer(1)(text)
+
+
+def seed(text: str) -> int:
+    """Parse a seed, which is valid as a ROS parameter too, or raise ArgumentTypeError."""
+    return integer(0, _MAX_SEED)(text)
 
 
 def positive_float(text: str) -> float:

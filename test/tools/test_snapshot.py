@@ -47,11 +47,3 @@ def test_without_a_network_it_is_an_error(capsys):
     assert out == ''
     assert err.startswith('error: no user found within 0.5 s, in the domain ')
     assert not options.output.exists()
-
-
-def test_invalid_files_are_named_before_it_waits(capsys):
-    with pytest.raises(SystemExit):
-        main(['--output', 'none/scene.png'])
-    assert 'argument --output: none/scene.png' in capsys.readouterr().err
-    assert main(['--config', 'nothing.yaml']) == 2
-    assert 'nothing.yaml: cannot be read' in capsys.readouterr().err
