@@ -20,7 +20,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import Recorder, read
-from rhs_isac_ros.tools import record
 from rhs_isac_ros.tools.replay import errors_m, load, main
 
 pytest.importorskip('mcap', reason='mcap is not installed')

@@ -9,7 +9,7 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.scene_state import SceneState
-from rhs_isac_ros.tools.snapshot import main, write_picture
+from rhs_isac_ros.tools.snapshot import write_picture
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / 'scripts' / 'snapshot'
