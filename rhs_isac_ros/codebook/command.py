@@ -84,7 +84,7 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     if options.resume and not (partial.exists() or options.output.exists()):
         parser.error(f'argument --resume: expected {partial} or {options.output}')
     if options.plot and not importlib.util.find_spec('matplotlib'):
-        parser.error('argument --plot: expected matplotlib, which is not installed '
+        parser.error('argument --plot: drawing needs matplotlib, which is not installed '
                      "(pip install 'rhs_isac_ros[plot]')")
 
 
