@@ -22,7 +22,8 @@ def test_fields_keep_their_order_and_arrays_are_block_sequences():
 def test_nested_messages_and_empty_arrays():
     message = ros.Codebook(header=Header(frame_id='map'), codebook_id='cb')
     assert as_yaml(message, Layout()) == (
-        "header:\n  stamp:\n    sec: 0\n    nanosec: 0\n  frame_id: map\ncodebook_id: cb\n"
+        "header:\n  stamp:\n    sec: 0\n    nanosec: 0\n  frame_id: map\nsender: 0\n"
+        "scenario_id: ''\ncodebook_id: cb\n"
         "analog:\n  shape: []\n  data: []\ndigital:\n  shape: []\n  re: []\n  im: []\n"
         "average_crlb_m2: 0.0\n")
 

@@ -40,7 +40,8 @@ def test_echo_prints_documents(output_of):
     text = output_of(main, 'echo', '--once', 'capacity')
     assert text.endswith('\n---\n')
     (content,) = filter(None, yaml.safe_load_all(text))
-    assert list(content)[:4] == ['header', 'cycle_id', 'user', 'codebook_id']
+    assert list(content)[:6] == [
+        'header', 'cycle_id', 'sender', 'scenario_id', 'user', 'codebook_id']
     assert content['actual_bps'] > 0
 
 
@@ -57,7 +58,7 @@ def test_echo_of_a_field_and_as_csv(output_of):
                  .removesuffix('---\n')) > 0
     line = output_of(
         main, 'echo', '--once', '--csv', 'ground_truth', 'rhs_isac_msgs/msg/GroundTruth')
-    assert len(line.strip().split(',')) == 11
+    assert len(line.strip().split(',')) == 13
 
 
 def test_echo_and_info_name_the_error(call):
