@@ -15,6 +15,8 @@ PERIOD_S, SILENCE_S = 0.3, 1.5
 _MAX_OTHERS = 64
 # Maximum number of scenarios that are logged, which bounds the log.
 _MAX_LOGGED = 16
+# Maximum length of the listed differences in the log.
+_MAX_LENGTH = 500
 # Maximum deviation of the clocks of two hosts; an instance that starts later is a forgery [ns].
 _MAX_AHEAD_NS = 3600 * 10**9
 
@@ -66,6 +68,8 @@ class Presences:
         self._others: NewestDict[int, tuple[Presence, float]] = NewestDict(_MAX_OTHERS)
         self._superseded_by: Presence | None = None
         self._serves_instead_of: Presence | None = None
+        # The older node that was named last: one that is slow may seem to return.
+        self._named = 0
         # By id: the differences of other scenarios.
         self._scenarios: dict[str, str] = {}
         self._n_logged = 0
@@ -137,11 +141,12 @@ class Presences:
         newest = rivals[0] if rivals and rivals[0].sender > self.own.sender else None
         previous, self._superseded_by = self._superseded_by, newest
         older = rivals[0] if rivals and not newest else None
-        previous_older, self._serves_instead_of = self._serves_instead_of, older
+        self._serves_instead_of = older
         if newest and newest != previous:
             return [LogMessage(f'two nodes act as {role}: this one stands by for {newest}',
                                warning=True)]
-        if older and not previous_older:
+        if older and older.sender != self._named:
+            self._named = older.sender
             return [LogMessage(f'two nodes act as {role}: this one serves instead of {older}',
                                warning=True)]
         if previous and not newest:
@@ -155,7 +160,8 @@ class Presences:
         differences = [f'{name} {theirs.get(name)} instead of {own.get(name)}'
                        for name in {**own, **theirs} if theirs.get(name) != own.get(name)]
         text = (f'{other.node} uses another scenario, {other.scenario_id}, with '
-                f'{"; ".join(differences) or "unknown differences"}; its messages are dropped')
+                f'{"; ".join(differences)[:_MAX_LENGTH] or "unknown differences"}; '
+                'its messages are dropped')
         self._scenarios[other.scenario_id] = text
         self._n_logged += 1
         return [LogMessage(text, warning=True)] if self._n_logged <= _MAX_LOGGED else []

@@ -6,12 +6,12 @@ import array
 import dataclasses
 import enum
 import functools
+import json
 import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import yaml
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
 from rclpy.serialization import deserialize_message
@@ -140,7 +140,7 @@ def presence_to_ros(presence: Presence, stamp: Time) -> ros.Presence:
     return ros.Presence(
         header=Header(stamp=stamp), sender=presence.sender, scenario_id=presence.scenario_id,
         role=presence.role, node=presence.node,
-        scenario=yaml.safe_dump(dict(presence.scenario), sort_keys=False))
+        scenario=json.dumps(dict(presence.scenario)))
 
 
 def presence_from_ros(message: ros.Presence) -> Presence:
@@ -148,12 +148,11 @@ def presence_from_ros(message: ros.Presence) -> Presence:
 
     Raises
     ------
-    MessageError
-        If the scenario is not a mapping.
-    yaml.YAMLError
-        If the scenario is not YAML.
+    ValueError
+        If the scenario is not a mapping in JSON.
     """
-    scenario = yaml.safe_load(message.scenario)
+    # JSON is YAML without the references that let a short text describe an enormous value.
+    scenario = json.loads(message.scenario)
     if not isinstance(scenario, dict):
         raise MessageError('Presence.scenario: expected a mapping of field names to values')
     return Presence(message.sender, message.scenario_id, message.role, message.node, scenario)

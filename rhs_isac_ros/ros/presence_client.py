@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 
-import yaml
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
@@ -63,7 +62,7 @@ class PresenceClient:
             presence = convert.presence_from_ros(deserialize_message(content, ros.Presence))
         # Anything may be published on the topic, and rclpy raises a RuntimeError without a public
         # class.
-        except (RuntimeError, ValueError, yaml.YAMLError):
+        except (RuntimeError, ValueError):
             return
         if self._handle(self._presences.add(presence, time.time_ns(), time.monotonic())):
             self._announce()

@@ -56,6 +56,9 @@ def test_the_newer_node_serves(presences):
     assert 'serves instead of' in presences.conflicts()['conflict.role']
     assert presences.expire(2.0) == []
     assert presences.conflicts() == {}
+    # It was only slow.
+    assert presences.add(other(age_s=9), NOW_NS, 3.0) == []
+    assert 'serves instead of' in presences.conflicts()['conflict.role']
 
 
 def test_the_newest_of_three_serves(presences):

@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
@@ -44,6 +44,10 @@ class NetworkObserver(CycleObserver):
         super().__init__(
             receives=dict.fromkeys((*cycle_log.RECEIVES, *invariants.RECEIVES)),
             sizes=scenario.sizes, on_malformed=lambda error: None, **node_options)
+        # It takes messages in the order of their arrival. The standard executor takes one message
+        # of each topic in turn, so that under load the queue of the feed signals overflows.
+        self._executor = EventsExecutor()
+        self._executor.add_node(self)
         self.invariants = invariants.InvariantChecker(scenario)
         self.reports: dict[str, Report] = {}
         self.warnings: dict[str, list[str]] = {}
@@ -79,8 +83,13 @@ class NetworkObserver(CycleObserver):
             remaining_s = end_s - time.monotonic()
             if remaining_s <= 0:
                 return False
-            rclpy.spin_once(self, timeout_sec=min(remaining_s, 0.05))
+            self._executor.spin_once(timeout_sec=min(remaining_s, 0.05))
         return True
+
+    def destroy_node(self) -> None:
+        """End the executor, then destroy the node."""
+        self._executor.shutdown()
+        super().destroy_node()
 
     def spin_for(self, duration_s: float) -> None:
         """Receive messages for a time [s]."""
