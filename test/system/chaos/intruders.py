@@ -18,7 +18,7 @@ from system.observer import NetworkObserver
 SCENARIO, USER = 'scenario', 'user'
 INTRUDERS = (
     'bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'optimizer', USER, SCENARIO)
-SECONDS = 6.0
+SECONDS = 4.0
 _PROCESS = 'intruder'
 _USER_NODE = 'user_1'
 _TIMEOUT_S = 30.0
@@ -82,7 +82,7 @@ def intrude_all(
     intruders
         Some of `INTRUDERS`; one may be repeated.
     seconds
-        Duration of each intrusion [s].
+        Duration of each intrusion, from the first report of it [s].
     folder
         Directory for the files of the intruders.
     parameters
@@ -138,6 +138,8 @@ def _intrude(
     observer.invariants.expect_rediscovery(PUBLISHES[node or executable])
     first = len(observer.log.ended)
     processes.start(executable, node, _PROCESS, **parameters)
+    # A process takes seconds to start on a loaded machine.
+    observer.spin_until(lambda: bool(_diagnosed(observer)), _TIMEOUT_S)
     observer.spin_for(seconds)
     served = sum(record.outcome == 'served' for record in observer.log.ended[first:])
     processes.kill(_PROCESS)
@@ -152,9 +154,13 @@ def _intrude(
     recovery_s = time.monotonic() - end_s if recovered else float('inf')
     logged = tuple(line for line in warnings_since(processes, log_lengths)
                    if any(text in line for text in _NAMES_OF_CONFLICTS))
-    diagnosed = tuple(sorted(
+    return IntrusionTrial(
+        intruder, served, recovery_s, not processes.ended(), logged, _diagnosed(observer),
+        tuple(observer.invariants.violations[n_violations:]))
+
+
+def _diagnosed(observer: NetworkObserver) -> tuple[str, ...]:
+    """Return the nodes whose diagnostics named a conflict."""
+    return tuple(sorted(
         name for name, summaries in observer.warnings.items()
         if any(text in summary for text in _NAMES_OF_CONFLICTS for summary in summaries)))
-    return IntrusionTrial(
-        intruder, served, recovery_s, not processes.ended(), logged, diagnosed,
-        tuple(observer.invariants.violations[n_violations:]))

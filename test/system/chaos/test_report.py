@@ -9,6 +9,7 @@ from rhs_isac_ros.monitoring.invariants import InvariantChecker
 from system.chaos import report
 from system.chaos.crashes import CrashTrial
 from system.chaos.fuzzing import FuzzResult
+from system.chaos.intruders import IntrusionTrial
 from system.chaos.soaking import SoakResult
 
 
@@ -47,6 +48,18 @@ def test_a_trial_fails_if_recovery_is_late_a_process_ends_or_the_report_is_missi
     failed = crash_trial(**fields)
     assert not figures_of(crash_trial(), failed)['passed']
     assert mark in report.crash_line(failed)
+
+
+def test_an_intrusion_passes_under_the_same_conditions():
+    given = {'intruder': 'bs', 'served': 20, 'recovery_s': 1.5, 'others_running': True,
+             'logged': ('bs: two nodes', 'intruder: two nodes'), 'diagnosed': ('bs',),
+             'violations': ()}
+    passed = IntrusionTrial(**given)
+    assert figures_of(crash_trial(), passed)['passed']
+    assert report.intrusion_line(passed).split() == [
+        'bs', '20', '1.50', 's', 'running', 'bs,', 'intruder;', 'bs']
+    for failed in ({'recovery_s': 3.01}, {'logged': ()}, {'logged': ('bs: two nodes',) * 2}):
+        assert not figures_of(IntrusionTrial(**given | failed))['passed']
 
 
 def test_violations_fail_and_are_printed():
