@@ -4,6 +4,7 @@
 """
 
 import functools
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from ament_index_python.packages import (
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.events.process import ProcessExited
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import Parameter, ParameterFile
+from launch_ros.parameter_descriptions import ParameterFile
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 
@@ -99,32 +100,34 @@ def _integer(name: str, given: dict[str, str], low: int) -> int:
 
 
 def _node(given: dict[str, str], executable: str, name: str | None, **values: int | str) -> Node:
-    # rcl gives precedence to the parameters that it reads last.
+    # rcl gives precedence to the parameters that it reads last: those of the file.
     file = [ParameterFile(given['params_file'])] if given['params_file'] else []
-    values['scenario_file'] = given['config']
-    return Node(
-        executable=executable, name=name,
-        parameters=[*(Parameter(key, value) for key, value in values.items()), *file],
-        **_common(given, name or executable, given['respawn'] == 'true'))
+    # JSON quotes a string so that YAML does not read it as another type.
+    pairs = [f'{key}:={json.dumps(value, ensure_ascii=False)}'
+             for key, value in {**values, 'scenario_file': given['config']}.items()]
+    return _process(
+        given, name or executable, given['respawn'] == 'true',
+        [word for pair in pairs for word in ('-p', pair)],
+        executable=executable, name=name, parameters=file)
 
 
 def _recorder(given: dict[str, str]) -> list[Node]:
     if not given['record']:
         return []
     # Not restarted, because a second process would replace the recording.
-    return [Node(executable='record', name='recorder',
-                 arguments=[given['record'], '--config', given['config']],
-                 **_common(given, 'record', False))]
+    return [_process(given, 'record', False, [], executable='record', name='recorder',
+                     arguments=[given['record'], '--config', given['config']])]
 
 
-def _common(given: dict[str, str], exec_name: str, respawn: bool) -> dict[str, Any]:
-    """Return the arguments of `Node` that all processes of the package share."""
-    return {
-        'package': PACKAGE, 'exec_name': exec_name, 'output': 'screen', 'prefix': END_WITH_LAUNCH,
-        'namespace': given['namespace'], 'ros_arguments': ['--log-level', given['log_level']],
-        'respawn': respawn, 'respawn_delay': RESPAWN_DELAY_S,
-        'on_exit': functools.partial(_end_if_failed, respawn),
-    }
+def _process(
+        given: dict[str, str], exec_name: str, respawn: bool, ros_arguments: list[str],
+        **options: Any) -> Node:
+    """Return an action for a process of the package, named `exec_name` in the output."""
+    return Node(
+        package=PACKAGE, exec_name=exec_name, output='screen', prefix=END_WITH_LAUNCH,
+        namespace=given['namespace'], respawn=respawn, respawn_delay=RESPAWN_DELAY_S,
+        ros_arguments=['--log-level', given['log_level'], *ros_arguments],
+        on_exit=functools.partial(_end_if_failed, respawn), **options)
 
 
 def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
