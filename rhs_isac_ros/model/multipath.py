@@ -23,9 +23,10 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
 
     The power-angle profile is a product of two Laplacians of `angular_spread_deg`, normalised
     over the half space in front of the surface and scaled by the mean line-of-sight power in the
-    region of interest. The profile is even in azimuth and elevation, so the covariance is real.
-    The covariance of two elements depends only on their lattice offset. A gain pattern of the
-    elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E], read-only.
+    region of interest times ``multipath_to_los_db``. The paper leaves the scale open; that both
+    powers are equal by default is the reading of this package. The profile is even in azimuth and
+    elevation, so the covariance is real. The covariance of two elements depends only on their
+    lattice offset. A gain pattern of the elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E], read-only.
     """
     side = scenario.elements_per_side
     azimuth, weights = _profile_quadrature(scenario)
@@ -45,7 +46,7 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
         along_y = np.einsum('a,eay->ey', weights, along_y)
         along_z = np.cos(wavenumber * np.sin(azimuth)[:, None] * offsets)
         lattice = np.einsum('e,ey,ez->zy', weights, along_y, along_z)
-        scale = mean_los_power(scenario, band)
+        scale = mean_los_power(scenario, band) * 10 ** (scenario.multipath_to_los_db / 10)
         if not isinstance(scenario.element_gain, GainPattern):
             scale *= scenario.element_gain**2
         covariance[band] = scale * lattice[rows, columns]

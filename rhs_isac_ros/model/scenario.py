@@ -4,33 +4,28 @@ import dataclasses
 import functools
 import hashlib
 import json
-import math
-import numbers
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
-from rhs_isac_ros.model.plugins import PluginError
+from rhs_isac_ros.model.deviations import Deviations
+from rhs_isac_ros.model.fields import ScenarioError, checked
+from rhs_isac_ros.model.gain_pattern import GainPattern
+from rhs_isac_ros.model.table1 import Table1
+
+__all__ = ['SPEED_OF_LIGHT_MPS', 'Scenario', 'ScenarioError']
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 
-class ScenarioError(ValueError):
-    """A scenario field has a value that the model cannot use."""
-
-
-def _field(default: Any, low: float, high: float, text: str, unit: str = '') -> Any:
-    """Declare a scenario field with its range (inclusive), description and unit."""
-    meta = {'low': low, 'high': high, 'text': text, 'unit': unit}
-    return dataclasses.field(default=default, metadata=meta)
-
-
 @dataclasses.dataclass(frozen=True)
-class Scenario:
+class Scenario(Deviations, Table1):
     """Geometry, bands and propagation of one system; the defaults are the paper's Table I.
+
+    The fields are those of `Table1`, followed by those of `Deviations`, all of which are off by
+    default.
 
     Lengths are in metres in the frame ``map``: the surface lies in the plane x = 0, centred on
     the origin, with x pointing outward and z up.
@@ -44,40 +39,10 @@ class Scenario:
         If a value has the wrong type, is out of range, or contradicts another one.
     """
 
-    center_frequencies_hz: tuple[float, ...] = _field(
-        (2.5e9, 3.0e9), 1e6, 1e13, 'Centre frequency f_c,i of each band.', 'Hz')
-    n_subbands: int = _field(8, 1, 4096, 'Sub-bands N_SB of each band.')
-    subband_width_hz: float = _field(125e3, 1.0, 1e10, 'Width W of a sub-band.', 'Hz')
-    n_frames: int = _field(4, 1, 4096, 'Frames F of each band.')
-    frame_duration_s: float = _field(4e-6, 1e-12, 1.0, 'Duration of a frame.', 's')
-    elements_per_side: int = _field(10, 1, 128, 'Elements along one side of the square surface.')
-    element_interval_wavelengths: float = _field(
-        0.3, 1e-3, 10.0, 'Spacing of the elements, in mean wavelengths.')
-    n_feeds: int = _field(3, 1, 256, 'Feeds K of the surface.')
-    feed_positions_m: tuple[tuple[float, float, float], ...] | None = _field(
-        None, -1e3, 1e3,
-        'Positions of the feeds; if null, they are evenly spaced on the centre line.', 'm')
-    refractive_index: float = _field(2.1, 1.0, 100.0, 'Refractive index n_r of the board.')
-    element_gain: float | GainPattern = _field(
-        1.0, 1e-6, 1e6, 'Amplitude gain g^E of an element.')
-    user_gain: float | GainPattern = _field(
-        1.0, 1e-6, 1e6, "Amplitude gain g^U of the user's antenna.")
-    delay_spread_s: float = _field(0.5e-6, 0.0, 1.0, 'RMS delay spread of the multipath.', 's')
-    max_user_speed_mps: float = _field(20 / 3.6, 0.0, 1e4, 'Highest speed of a user.', 'm/s')
-    angular_spread_deg: float = _field(
-        10.0, 1e-2, 1e3, 'Angular spread of the multipath, in azimuth and elevation.', 'deg')
-    noise_psd_dbm_hz: float = _field(
-        -174.0, -400.0, 100.0, 'Power spectral density P_N of the noise.', 'dBm/Hz')
-    max_power_w: float = _field(1e-3, 1e-15, 1e6, 'Power P_max of the combining vectors.', 'W')
-    roi_center_m: tuple[float, float, float] = _field(
-        (10.0, 0.0, 0.0), -1e6, 1e6, 'Centre of the region of interest.', 'm')
-    roi_size_m: tuple[float, float, float] = _field(
-        (10.0, 10.0, 2.0), 1e-6, 1e6, 'Side lengths of the region of interest.', 'm')
-
     def __post_init__(self) -> None:
         """Convert every field to its declared type and check it."""
         for field in dataclasses.fields(self):
-            value = _checked(field, getattr(self, field.name))
+            value = checked(field, getattr(self, field.name))
             object.__setattr__(self, field.name, value)
         if self.feed_positions_m is not None and len(self.feed_positions_m) != self.n_feeds:
             raise ScenarioError(
@@ -92,6 +57,9 @@ class Scenario:
             raise ScenarioError(
                 f'subband_width_hz: {self.n_subbands} sub-bands span {span_hz:g} Hz, expected '
                 'less than twice the lowest centre frequency')
+        if self.amplitude_levels == 1:
+            raise ScenarioError(
+                'amplitude_levels: 1, expected 0 for continuous amplitudes, or at least 2')
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> 'Scenario':
@@ -180,77 +148,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, GainPattern):
         return str(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
-
-
-def _checked(field: dataclasses.Field[Any], value: Any) -> Any:
-    """Return a field's value in its declared type, or raise ScenarioError."""
-    name = field.name
-    if name == 'feed_positions_m':
-        return None if value is None else _vectors(field, value)
-    if name in ('element_gain', 'user_gain'):
-        return _gain(field, value)
-    if field.type is int or isinstance(field.default, int):
-        if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-            raise ScenarioError(f'{name}: {value!r}, expected an integer')
-        _check_range(field, int(value))
-        return int(value)
-    if isinstance(field.default, tuple):
-        length = None if name == 'center_frequencies_hz' else 3
-        return _numbers(field, value, length)
-    return _number(field, value)
-
-
-def _gain(field: dataclasses.Field[Any], value: Any) -> float | GainPattern:
-    try:
-        if isinstance(value, GainPattern) or callable(value):
-            return value if isinstance(value, GainPattern) else GainPattern(value)
-        if isinstance(value, str) and not _is_number(value):
-            return GainPattern.named(value)
-    except (PatternError, PluginError) as error:
-        raise ScenarioError(f'{field.name}: {error}') from None
-    return _number(field, value)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _vectors(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[float, ...], ...]:
-    if not isinstance(value, list | tuple | np.ndarray) or len(value) == 0:
-        raise ScenarioError(f'{field.name}: {value!r}, expected a list of [x, y, z]')
-    return tuple(_numbers(field, row, 3) for row in value)
-
-
-def _numbers(field: dataclasses.Field[Any], value: Any, length: int | None) -> tuple[float, ...]:
-    expected = 'a list of numbers' if length is None else f'a list of {length} numbers'
-    if not isinstance(value, list | tuple | np.ndarray) or len(value) == 0:
-        raise ScenarioError(f'{field.name}: {value!r}, expected {expected}')
-    if length is not None and len(value) != length:
-        raise ScenarioError(f'{field.name}: {len(value)} values, expected {expected}')
-    return tuple(_number(field, entry) for entry in value)
-
-
-def _number(field: dataclasses.Field[Any], value: Any) -> float:
-    # YAML reads 28e9 as a string, so that strings must be accepted.
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise ScenarioError(f'{field.name}: {value!r}, expected a number') from None
-    if isinstance(value, bool) or not math.isfinite(number):
-        raise ScenarioError(f'{field.name}: {value!r}, expected a finite number')
-    _check_range(field, number)
-    return number
-
-
-def _check_range(field: dataclasses.Field[Any], value: float) -> None:
-    low, high = field.metadata['low'], field.metadata['high']
-    if not low <= value <= high:
-        unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''
-        # Integers may be too large for a float.
-        shown = value if isinstance(value, int) else f'{value:g}'
-        raise ScenarioError(
-            f'{field.name}: {shown}{unit}, expected {low:g} to {high:g}{unit}')

@@ -19,7 +19,11 @@ def test_defaults_are_table_1_of_the_paper():
         'refractive_index': 2.1, 'element_gain': 1.0, 'user_gain': 1.0, 'delay_spread_s': 0.5e-6,
         'max_user_speed_mps': pytest.approx(20e3 / 3600), 'angular_spread_deg': 10.0,
         'noise_psd_dbm_hz': -174.0, 'max_power_w': 1e-3, 'roi_center_m': (10.0, 0.0, 0.0),
-        'roi_size_m': (10.0, 10.0, 2.0)}
+        'roi_size_m': (10.0, 10.0, 2.0),
+        **dict.fromkeys(
+            ('multipath_to_los_db', 'user_gain_std_db', 'phase_std_rad', 'band_phase_std_rad',
+             'timing_std_s', 'carrier_offset_std_hz', 'element_error_rms',
+             'failed_element_share', 'amplitude_levels'), 0)}
     assert dataclasses.asdict(Scenario()) == expected
 
 
@@ -91,6 +95,8 @@ BAD = [
     ('feed_positions_m', [[0, 0, 0]] * 2, '2 positions', 'expected n_feeds = 3'),
     ('roi_center_m', [5, 0, 0], '(5.0, 0.0, 0.0)', 'expected x > 0'),
     ('roi_center_m', [-10, 0, 0], '(-10.0, 0.0, 0.0)', 'expected x > 0'),
+    ('amplitude_levels', 1, '1', 'expected 0 for continuous amplitudes, or at least 2'),
+    ('user_gain_std_db', -1, '-1 dB', 'expected 0 to 60 dB'),
     ('subband_width_hz', 1e9, '8e+09 Hz', 'expected less than twice the lowest centre frequency'),
 ]
 
