@@ -1,7 +1,8 @@
 """Gaussian model of the signals received in a positioning phase.
 
 The signals of band i are complex Gaussian with a mean that depends on the user's position and a
-covariance Lambda_i that does not. Bands are independent of each other.
+covariance Lambda_i that does not. Bands are independent of each other. Element errors that the
+scenario declares add to the covariance; `nuisance` describes unknown gains and phases.
 """
 
 import functools
@@ -9,7 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.element_error import (
+    error_covariance,
+    error_covariance_at,
+    expected_beams,
+)
 from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.model.imperfections import (
+    SurfaceImperfection,
+    draw_deviations,
+    has_element_errors,
+)
 from rhs_isac_ros.model.los import (
     checked_positions,
     los_derivative,
@@ -20,6 +31,7 @@ from rhs_isac_ros.model.multipath import (
     complex_normal,
     measurement_correlation,
     multipath_covariance,
+    square_root,
 )
 from rhs_isac_ros.model.receive import received_signal
 from rhs_isac_ros.model.scenario import Scenario
@@ -57,11 +69,17 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
     Returns Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W], for the radiation matrices T_i of all
     bands, complex128 [N_B, N_SB F, N_E].
     """
+    noise = scenario.noise_power_w * np.eye(radiation.shape[1])
+    covariance: np.ndarray = _scattered_covariance(scenario, radiation) + noise
+    return covariance
+
+
+def _scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
+    """Covariance of the multipath in the received signals [N_B, N_SB F, N_SB F] [W]."""
     spatial = multipath_covariance(scenario)
     scattered = np.matmul(np.matmul(radiation, spatial), np.conj(np.swapaxes(radiation, 1, 2)))
-    noise = scenario.noise_power_w * np.eye(radiation.shape[1])
-    covariance: np.ndarray = measurement_correlation(scenario) * scattered + noise
-    return covariance
+    correlated: np.ndarray = measurement_correlation(scenario) * scattered
+    return correlated
 
 
 class MeasurementModel:
@@ -73,10 +91,17 @@ class MeasurementModel:
     Positions are those of the user, float64 [N, 3] [m]. Methods that take them raise ValueError
     if the shape is wrong or a value is not finite. Measurements are sub-band-major.
 
+    Parameters
+    ----------
+    surface
+        Known errors of the elements. By default they are unknown, with the distribution that the
+        scenario declares: the mean is then the average over surfaces, and the covariance
+        includes the errors.
+
     Attributes
     ----------
     radiation
-        T_i of Eq. (9), complex128 [N_B, N_SB F, N_E], read-only.
+        T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E], read-only.
 
     Raises
     ------
@@ -84,9 +109,13 @@ class MeasurementModel:
         If the beamforming does not have the sizes of the scenario.
     """
 
-    def __init__(self, scenario: Scenario, beamforming: Beamforming) -> None:
-        self.scenario = scenario
-        self.radiation = _read_only(radiation_matrix(scenario, beamforming))
+    def __init__(self, scenario: Scenario, beamforming: Beamforming,
+                 surface: SurfaceImperfection | None = None) -> None:
+        self.scenario, self._beams = scenario, beamforming
+        self._is_uncertain = surface is None and has_element_errors(scenario)
+        applied = (surface.applied_beams(beamforming) if surface
+                   else expected_beams(scenario, beamforming))
+        self.radiation = _read_only(radiation_matrix(scenario, applied))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -95,8 +124,26 @@ class MeasurementModel:
         return n_bands, n_measurements
 
     def covariance(self) -> np.ndarray:
-        """Compute Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W]; the result is not cached."""
-        return signal_covariance(self.scenario, self.radiation)
+        """Compute Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W]; the result is not cached.
+
+        Unknown errors of the elements contribute their average over the region of interest.
+        """
+        covariance = signal_covariance(self.scenario, self.radiation)
+        if self._is_uncertain:
+            covariance += error_covariance(self.scenario, self._beams)
+        return covariance
+
+    def covariance_at(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the covariance at positions, complex128 [N, N_B, N_SB F, N_SB F] [W].
+
+        It depends on the position through unknown errors of the elements only.
+        """
+        positions = checked_positions(positions)
+        covariance: np.ndarray = np.repeat(
+            signal_covariance(self.scenario, self.radiation)[None], len(positions), axis=0)
+        if self._is_uncertain:
+            covariance += error_covariance_at(self.scenario, self._beams, positions)
+        return covariance
 
     @functools.cached_property
     def root(self) -> np.ndarray:
@@ -170,13 +217,30 @@ class MeasurementModel:
 
         Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
         draws the gain of every element instead; the distribution is the same, but the call takes
-        a hundred times as long.
+        a hundred times as long. Deviations that the scenario declares are drawn as described
+        there.
         """
+        surface, factors = draw_deviations(self.scenario, len(positions), rng)
+        if surface is not None and self._is_uncertain:
+            return MeasurementModel(self.scenario, self._beams, surface)._sample(
+                positions, rng, factors)
+        return self._sample(positions, rng, factors)
+
+    def _sample(self, positions: np.ndarray, rng: np.random.Generator,
+                factors: np.ndarray | None) -> np.ndarray:
         signals = self.mean(positions)
         white = complex_normal(signals.shape, rng)
-        for band, root in enumerate(self.root):
-            signals[:, band] += white[:, band] @ root.T
-        return signals
+        if factors is None:
+            for band, root in enumerate(self.root):
+                signals[:, band] += white[:, band] @ root.T
+            return signals
+        # Factors act on the multipath, but not on the noise.
+        noise = np.sqrt(self.scenario.noise_power_w) * complex_normal(signals.shape, rng)
+        for band, scattered in enumerate(_scattered_covariance(self.scenario, self.radiation)):
+            root = square_root(scattered)
+            signals[:, band] += white[:, band, :root.shape[1]] @ root.T
+        received: np.ndarray = signals * factors + noise
+        return received
 
     @functools.cached_property
     def _weights(self) -> '_Weights':

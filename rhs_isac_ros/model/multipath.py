@@ -26,7 +26,8 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     region of interest times ``multipath_to_los_db``. The paper leaves the scale open; that both
     powers are equal by default is the reading of this package. The profile is even in azimuth and
     elevation, so the covariance is real. The covariance of two elements depends only on their
-    lattice offset. A gain pattern of the elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E], read-only.
+    lattice offset. A gain pattern of the elements weights the profile. Returns V_i,
+    complex128 [N_B, N_E, N_E], read-only.
     """
     side = scenario.elements_per_side
     azimuth, weights = _profile_quadrature(scenario)
@@ -130,7 +131,7 @@ def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray]
     r and s are the numerical ranks.
     """
     pairs = zip(multipath_covariance(scenario), measurement_correlation(scenario), strict=True)
-    return tuple((_square_root(spatial), _square_root(correlation))
+    return tuple((square_root(spatial), square_root(correlation))
                  for spatial, correlation in pairs)
 
 
@@ -161,7 +162,7 @@ def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     return angles, density / density.sum()
 
 
-def _square_root(matrix: np.ndarray) -> np.ndarray:
+def square_root(matrix: np.ndarray) -> np.ndarray:
     """Return R with R R^H = matrix, without eigenvectors that are due to rounding alone."""
     values, vectors = np.linalg.eigh(matrix)
     keep = values > values[-1] * len(values) * np.finfo(float).eps

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from rhs_isac_ros.model.imperfections import SurfaceImperfection, draw_deviations
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.scenario import Scenario
@@ -42,11 +43,17 @@ def received_signal(
 
 def simulate_received(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
-        rng: np.random.Generator) -> np.ndarray:
+        rng: np.random.Generator, surface: SurfaceImperfection | None = None) -> np.ndarray:
     """Simulate signals of independent positioning phases by Eq. (8), element by element.
 
     Takes the user's position in each phase, float64 [N, 3] [m], and returns complex128
-    [N, N_B, N_SB F], sub-band-major.
+    [N, N_B, N_SB F], sub-band-major. Deviations that the scenario declares are drawn too: a new
+    user and a new cycle for each position, and one surface for all of them.
+
+    Parameters
+    ----------
+    surface
+        Errors of the elements; drawn from the scenario's distribution by default.
 
     Raises
     ------
@@ -54,7 +61,10 @@ def simulate_received(
         If `positions` is not a finite [N, 3] array.
     """
     positions = checked_positions(positions)
-    radiation = radiation_matrix(scenario, codebook)
+    drawn, factors = draw_deviations(scenario, len(positions), rng)
+    surface = surface or drawn
+    radiation = radiation_matrix(
+        scenario, surface.applied_beams(codebook) if surface else codebook)
     n_bands, n_measurements, _ = radiation.shape
     received = np.empty((len(positions), n_bands, n_measurements), complex)
     amplitude = np.sqrt(scenario.noise_power_w)
@@ -64,8 +74,12 @@ def simulate_received(
             los = los_gain(scenario, block, band)
             gains = draw_multipath(scenario, band, len(block), rng)
             noise = amplitude * complex_normal((len(block), n_measurements), rng)
-            received[start:start + _BLOCK, band] = received_signal(
-                los, gains, radiation[band], noise)
+            if factors is None:
+                block_received = received_signal(los, gains, radiation[band], noise)
+            else:
+                block_received = received_signal(los, gains, radiation[band], 0.0)
+                block_received = block_received * factors[start:start + _BLOCK, band] + noise
+            received[start:start + _BLOCK, band] = block_received
     return received
 
 

@@ -1,0 +1,75 @@
+"""Covariance of the received signals due to errors and failures of the elements."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.element_error import error_factors
+from rhs_isac_ros.model.imperfections import draw_surface
+
+N_SURFACES = 1500
+ERRORS = [{'element_error_rms': 0.2}, {'failed_element_share': 0.1},
+          {'element_error_rms': 0.3, 'failed_element_share': 0.3}]
+
+
+def test_factors_are_the_covariance_of_the_coefficients():
+    scenario = Scenario(elements_per_side=128, element_error_rms=0.4, failed_element_share=0.3)
+    configurations = np.array([0.0, 0.3, 1.0])
+    analog = np.broadcast_to(configurations[:, None], (3, scenario.n_elements))
+    applied = draw_surface(scenario, np.random.default_rng(0)).applied(analog)
+    mean = 0.7 * configurations + 0.15
+    np.testing.assert_allclose(applied.mean(axis=1), mean, atol=0.02)
+    deviation = applied - mean[:, None]
+    factors = error_factors(scenario, configurations[None, :, None])[:, 0, :, 0]
+    np.testing.assert_allclose(
+        deviation @ deviation.conj().T / scenario.n_elements,
+        np.einsum('tq,tp->qp', factors, factors), atol=0.01)
+
+
+@pytest.mark.parametrize('errors', ERRORS, ids=str)
+def test_mean_and_covariance_are_those_over_surfaces(small, errors):
+    scenario = dataclasses.replace(small.scenario, **errors)
+    position = small.vectors['positions'][1:2]
+    model = MeasurementModel(scenario, small.codebook)
+    rng = np.random.default_rng(1)
+    surfaces = [MeasurementModel(scenario, small.codebook, draw_surface(scenario, rng))
+                for _ in range(N_SURFACES)]
+    covariance = model.covariance_at(position)[0, 0]
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    deviations = np.array([s.mean(position)[0, 0] for s in surfaces]) - model.mean(position)[0, 0]
+    deviations = deviations @ root.T
+    assert np.abs(deviations.mean(axis=0)).max() < 5 / np.sqrt(N_SURFACES)
+    # The covariance over surfaces and multipath is the mean covariance given the surface, plus
+    # the covariance of the mean given the surface.
+    given = np.mean([s.covariance()[0] for s in surfaces], axis=0)
+    found = root @ given @ root.conj().T + deviations.T @ deviations.conj() / N_SURFACES
+    np.testing.assert_allclose(found, np.eye(len(root)), atol=7 / np.sqrt(N_SURFACES))
+
+
+def test_the_average_is_that_over_the_region(table1):
+    scenario = dataclasses.replace(
+        table1.scenario, element_error_rms=0.03, failed_element_share=0.01)
+    model = MeasurementModel(scenario, table1.codebook)
+    low, high = scenario.roi_bounds_m
+    positions = low + qmc.Sobol(3, seed=0).random(128) * (high - low)
+    average = model.covariance_at(positions).mean(axis=0)
+    scale = np.sqrt(np.einsum('brr->br', average).real)
+    difference = (model.covariance() - average) / (scale[:, :, None] * scale[:, None, :])
+    assert np.abs(difference).max() < 0.01
+
+
+def test_without_errors_the_covariance_is_the_same_everywhere(case):
+    model = MeasurementModel(case.scenario, case.codebook)
+    found = model.covariance_at(case.vectors['positions'])
+    np.testing.assert_array_equal(found, np.broadcast_to(model.covariance(), found.shape))
+
+
+def test_a_known_surface_has_no_error(small):
+    scenario = dataclasses.replace(small.scenario, element_error_rms=0.5)
+    surface = draw_surface(scenario, np.random.default_rng(3))
+    known = MeasurementModel(scenario, small.codebook, surface)
+    exact = MeasurementModel(small.scenario, small.codebook, surface)
+    np.testing.assert_array_equal(known.covariance(), exact.covariance())
