@@ -1,16 +1,23 @@
 """Averages of losses that depend on a codebook through quadratic forms, with gradients."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.bounds.compressed_rows import CompressedRows
 from rhs_isac_ros.bounds.fisher import quadratic_form
-from rhs_isac_ros.bounds.gradient import gradient_analog, gradient_digital
-from rhs_isac_ros.bounds.measurement_rows import ExactRows, MeasurementRows, RowSource, blocks
+from rhs_isac_ros.bounds.measurement_rows import (
+    PLAIN,
+    Evaluation,
+    ExactRows,
+    MeasurementRows,
+    Pattern,
+    RowSource,
+    blocks,
+)
+from rhs_isac_ros.bounds.quadratic_gradient import quadratic_gradients
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import Beamforming
 
 # Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses
@@ -34,13 +41,48 @@ class Gradient(NamedTuple):
     by_digital: np.ndarray
 
 
+class Combination(NamedTuple):
+    """Rows of a quadratic form, each a multiple of one of the rows of the source.
+
+    Attributes
+    ----------
+    sources
+        Index of the source's row, int [G].
+    scale
+        Factor of the row in each band, complex128 [N_B, G].
+    """
+
+    sources: np.ndarray
+    scale: np.ndarray
+
+    def forward(self, band: int, whitened: np.ndarray) -> np.ndarray:
+        """Return the rows, complex128 [n, G, R], from those of the source, [n, S, R]."""
+        rows: np.ndarray = whitened[:, self.sources] * self.scale[band, :, None]
+        return rows
+
+    def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
+        """Return derivatives with respect to the source's rows, [n, S, R], from [n, G, R]."""
+        gathered = np.zeros((len(weighted), n_rows, weighted.shape[2]), complex)
+        for row, (source, scale) in enumerate(zip(self.sources, self.scale[band], strict=True)):
+            gathered[:, source] += np.conj(scale) * weighted[:, row]
+        return gathered
+
+
 class Average:
     """Mean loss of items, each of which depends on a codebook through a quadratic form.
 
     The form of an item is 2 Re sum_i D_i^H Lambda_i^-1 D_i, where the G = `n_rows` columns of D_i
     are the means of the item's rows. With derivatives as rows it is the Fisher information; with
-    differences, it is twice the squared distance of two mean signals. `tolerance` is the
-    relative error of the rows, see `CompressedRows`; 0 selects exact ones.
+    differences, it is twice the squared distance of two mean signals.
+
+    Parameters
+    ----------
+    tolerance
+        Relative error of the rows, see `CompressedRows`; 0 selects exact ones.
+    patterns
+        Factors of the rows' means.
+    combination
+        The form's rows, if they are not those of the source.
 
     Raises
     ------
@@ -49,18 +91,20 @@ class Average:
     """
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-                 loss: Loss, tolerance: float) -> None:
+                 loss: Loss, tolerance: float, patterns: Sequence[Pattern] = PLAIN,
+                 combination: Combination | None = None) -> None:
         self.scenario, self._loss = scenario, loss
+        self._n_rows, self._combination = n_rows, combination
         self.rows: MeasurementRows = (
-            ExactRows(scenario, source, n_items, n_rows) if tolerance == 0
-            else CompressedRows(scenario, source, n_items, n_rows, tolerance))
+            ExactRows(scenario, source, n_items, n_rows, patterns) if tolerance == 0
+            else CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns))
 
     def value(self, codebook: Beamforming) -> float:
         """Compute the average without its gradients."""
         evaluation = self.rows.begin(MeasurementModel(self.scenario, codebook))
         total = 0.0
         for block in blocks(self.rows.n_items):
-            whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
+            whitened = self._whitened(evaluation, block)
             total += float(self._loss(block, _sum_of_forms(whitened))[0].sum())
         return total / self.rows.n_items
 
@@ -71,21 +115,26 @@ class Average:
         bands = range(self.scenario.n_bands)
         total = 0.0
         for block in blocks(self.rows.n_items):
-            whitened = [evaluation.whitened(block, band) for band in bands]
+            whitened = self._whitened(evaluation, block)
             losses, weights = self._loss(block, _sum_of_forms(whitened))
             total += float(losses.sum())
             for band in bands:
                 weighted = np.matmul(weights, whitened[band].view(float)).view(complex)
+                if self._combination:
+                    weighted = self._combination.backward(band, weighted, self._n_rows)
                 evaluation.accumulate(block, band, weighted)
         mean_terms, covariance_terms = map(
             np.stack, zip(*map(evaluation.sums, bands), strict=True))
-        through_covariance = np.matmul(
-            np.conj(measurement_correlation(self.scenario)) * covariance_terms,
-            np.matmul(model.radiation, multipath_covariance(self.scenario)))
-        by_radiation = 4 * (through_covariance - mean_terms) / self.rows.n_items
-        return Gradient(
-            total / self.rows.n_items, gradient_analog(self.scenario, codebook, by_radiation),
-            gradient_digital(self.scenario, codebook, by_radiation))
+        gradients = quadratic_gradients(
+            model, codebook, mean_terms, covariance_terms, self.rows.n_items)
+        return Gradient(total / self.rows.n_items, *gradients)
+
+    def _whitened(self, evaluation: Evaluation, block: slice) -> list[np.ndarray]:
+        """Whitened means of the form's rows, [n, G, N_SB F] of each band."""
+        whitened = [evaluation.whitened(block, i) for i in range(self.scenario.n_bands)]
+        if self._combination is None:
+            return whitened
+        return [self._combination.forward(band, rows) for band, rows in enumerate(whitened)]
 
 
 def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:

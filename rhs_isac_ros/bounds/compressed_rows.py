@@ -5,7 +5,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rhs_isac_ros.bounds.measurement_rows import Evaluation, GradientSums, RowSource, blocks
+from rhs_isac_ros.bounds.measurement_rows import (
+    PLAIN,
+    Evaluation,
+    GradientSums,
+    Pattern,
+    RowSource,
+    blocks,
+)
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 
 # Minimum number of columns of the first sketch. Each further sketch has twice as many.
@@ -28,8 +35,8 @@ class CompressedRows:
     """
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-                 tolerance: float) -> None:
-        self.n_items, self._n_rows = n_items, n_rows
+                 tolerance: float, patterns: Sequence[Pattern] = PLAIN) -> None:
+        self.n_items, self._n_rows, self._patterns = n_items, n_rows, patterns
         n_subbands, n_elements = scenario.n_subbands, scenario.n_elements
 
         def flat_rows(block: slice, band: int) -> np.ndarray:
@@ -51,43 +58,61 @@ class CompressedRows:
 
     def begin(self, model: MeasurementModel) -> Evaluation:
         """Begin an evaluation with the radiation and whitening matrices of a model."""
-        return _CompressedEvaluation(self.coefficients, self.bases, self._n_rows, model)
+        return _CompressedEvaluation(
+            self.coefficients, self.bases, self._n_rows, self._patterns, model)
 
 
 class _CompressedEvaluation:
     """One evaluation of `CompressedRows`, in the basis of each band."""
 
     def __init__(self, coefficients: Sequence[np.ndarray], bases: Sequence[np.ndarray],
-                 n_rows: int, model: MeasurementModel) -> None:
+                 n_rows: int, patterns: Sequence[Pattern], model: MeasurementModel) -> None:
         self._coefficients, self._bases, self._n_rows = coefficients, bases, n_rows
-        self._whitener = model.whitener
-        # The filters include whitening, which therefore costs no time per item.
-        self._filters = [
-            _filters(basis, radiation) @ whitener.T
-            for basis, radiation, whitener in zip(
-                bases, model.radiation, model.whitener, strict=True)]
-        self._weights = [np.zeros_like(filters) for filters in self._filters]
+        self._patterns, self._whitener = patterns, model.whitener
+        # The filters of a pattern include whitening, which therefore costs no time per item.
+        self._filters: list[list[np.ndarray]] = []
+        for band, (basis, whitener) in enumerate(zip(bases, model.whitener, strict=True)):
+            means = _filters(basis, model.radiation[band])
+            self._filters.append([
+                (means if pattern is None else means * pattern[band]) @ whitener.T
+                for _, pattern in patterns])
+        self._weights = [[np.zeros_like(one) for one in filters] for filters in self._filters]
 
     def _rows(self, block: slice, band: int) -> np.ndarray:
-        return self._coefficients[band][block.start * self._n_rows:block.stop * self._n_rows]
+        rows = self._coefficients[band][block.start * self._n_rows:block.stop * self._n_rows]
+        return rows.reshape(-1, self._n_rows, rows.shape[1])
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
-        whitened: np.ndarray = self._rows(block, band) @ self._filters[band]
-        return whitened.reshape(-1, self._n_rows, whitened.shape[1])
+        rows = self._rows(block, band)
+        n_measurements = self._filters[band][0].shape[1]
+        whitened = np.empty((*rows.shape[:2], n_measurements), complex)
+        for (part, _), filters in zip(self._patterns, self._filters[band], strict=True):
+            chosen = rows[:, part]
+            product = chosen.reshape(-1, chosen.shape[-1]) @ filters
+            whitened[:, part] = product.reshape(*chosen.shape[:2], n_measurements)
+        return whitened
 
     def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
-        weighted = weighted.reshape(-1, weighted.shape[-1])
-        # Accumulate the conjugate, so that the coefficients need not be copied.
-        self._weights[band] += self._rows(block, band).T @ np.conj(weighted)
+        rows = self._rows(block, band)
+        for (part, _), weights in zip(self._patterns, self._weights[band], strict=True):
+            chosen, of_part = rows[:, part], weighted[:, part]
+            # Accumulate the conjugate, so that the coefficients need not be copied.
+            weights += (chosen.reshape(-1, chosen.shape[-1]).T
+                        @ np.conj(of_part.reshape(-1, of_part.shape[-1])))
 
     def sums(self, band: int) -> GradientSums:
         basis, whitener = self._bases[band], self._whitener[band]
         n_subbands, n_elements, _ = basis.shape
-        weights = np.conj(self._weights[band]) @ np.conj(whitener)
-        zeta = self._filters[band] @ np.conj(whitener)
-        frames = np.moveaxis(weights.reshape(len(weights), n_subbands, -1), 1, 0)
+        total: np.ndarray = np.zeros(())
+        covariance_term = np.zeros_like(whitener)
+        for (_, pattern), filters, gathered in zip(
+                self._patterns, self._filters[band], self._weights[band], strict=True):
+            weights = np.conj(gathered) @ np.conj(whitener)
+            covariance_term += weights.T @ np.conj(filters @ np.conj(whitener))
+            total = total + (weights if pattern is None else weights * np.conj(pattern[band]))
+        frames = np.moveaxis(total.reshape(len(total), n_subbands, -1), 1, 0)
         mean_term = np.swapaxes(np.matmul(basis, frames), 1, 2).reshape(-1, n_elements)
-        return GradientSums(mean_term, weights.T @ np.conj(zeta))
+        return GradientSums(mean_term, covariance_term)
 
 
 def _first_sketch(scenario: Scenario) -> int:

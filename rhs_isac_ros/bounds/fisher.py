@@ -2,8 +2,14 @@
 
 import numpy as np
 
+from rhs_isac_ros.bounds.nuisance import (
+    marginal_information,
+    region_information,
+    scaled_directions,
+)
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.model.surface import Beamforming
 
 # Positions evaluated at a time.
@@ -12,25 +18,48 @@ _BLOCK = 256
 _MIN_PIVOT = 1e-14
 
 
-def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
+def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
+         region_prior: bool = False) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound on the mean squared positioning error.
 
     Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite where
-    the signals do not determine the position.
+    the signals do not determine the position. Nuisance parameters that the scenario declares are
+    unknown, with their distributions as priors: the result is then the hybrid bound. Errors of
+    the elements enter with their covariance averaged over the region.
+
+    Parameters
+    ----------
+    region_prior
+        Whether to add the information of the region of interest, as a Gaussian of covariance
+        size^2 / 12.
 
     Raises
     ------
     ValueError
         If `positions` is not a finite [N, 3] array.
     """
-    return crlb_of(MeasurementModel(scenario, codebook), positions)
+    return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
 
 
-def crlb_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
+def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
+            region_prior: bool = False) -> np.ndarray:
     """Compute `crlb` for a model, whose whitener is shared by all calls."""
-    inverse = inverse_information(fisher_information_of(model, positions))
-    bound: np.ndarray = np.trace(inverse, axis1=1, axis2=2)
+    information = position_information_of(model, positions)
+    if region_prior:
+        information = information + region_information(model.scenario)
+    bound: np.ndarray = np.trace(inverse_information(information), axis1=1, axis2=2)
     return bound
+
+
+def position_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
+    """Compute the information about the position with unknown nuisance parameters.
+
+    Without nuisance parameters, this is `fisher_information_of`. Returns float64 [N, 3, 3]
+    [1/m^2].
+    """
+    if not nuisance_parameters(model.scenario):
+        return fisher_information_of(model, positions)
+    return marginal_information(joint_information_of(model, positions))
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:
@@ -87,6 +116,24 @@ def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.
         for band, whitener in enumerate(model.whitener):
             whitened = model.band_jacobian(positions[block], band) @ whitener.T
             information[block] += quadratic_form(whitened)
+    return information
+
+
+def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
+    """Compute the information about position and nuisance parameters, without any prior.
+
+    Returns float64 [N, 3 + Q, 3 + Q]; nuisance parameters are scaled to unit deviation.
+    """
+    positions = checked_positions(positions)
+    size = 3 + len(nuisance_parameters(model.scenario))
+    information = np.zeros((len(positions), size, size))
+    for start in range(0, len(positions), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        directions = scaled_directions(model.scenario, model.mean(positions[block]))
+        for band, whitener in enumerate(model.whitener):
+            rows = np.concatenate(
+                [model.band_jacobian(positions[block], band), directions[:, :, band]], axis=1)
+            information[block] += quadratic_form(rows @ whitener.T)
     return information
 
 

@@ -6,7 +6,7 @@ mean signals; `mean_derivative`, Eq. (13), computes it. The objectives are funct
 means, whose computation takes most of their time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -17,6 +17,10 @@ from rhs_isac_ros.model.measurement import mean_derivative
 # Callable that takes (block of n items, band) and returns the items' rows, complex128
 # [n, G, N_SB, N_E].
 RowSource = Callable[[slice, int], np.ndarray]
+# Rows and the factor of their means in each band and measurement, complex128 [N_B, N_SB F]; None
+# for 1. Together, the slices cover all rows.
+Pattern = tuple[slice, np.ndarray | None]
+PLAIN: Sequence[Pattern] = ((slice(None), None),)
 # Items per block: the arrays of a block fit into the cache.
 _BLOCK = 128
 # Memory for exact rows that are kept between evaluations.
@@ -73,8 +77,9 @@ class ExactRows:
     """Rows without approximation, kept between evaluations if they fit within the memory limit."""
 
     def __init__(
-            self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int) -> None:
-        self.n_items, self._source = n_items, source
+            self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
+            patterns: Sequence[Pattern] = PLAIN) -> None:
+        self.n_items, self._source, self.patterns = n_items, source, patterns
         size = 16 * n_items * n_rows * scenario.n_bands * scenario.n_subbands * scenario.n_elements
         self._keeps_all = size <= _CACHE_BYTES
         # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
@@ -108,6 +113,9 @@ class _ExactEvaluation:
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
         means = mean_derivative(self._rows.rows(block, band), self._radiation[band])
+        for rows, pattern in self._rows.patterns:
+            if pattern is not None:
+                means[:, rows] *= pattern[band]
         self._last[band] = means @ self._whitener[band].T
         return self._last[band]
 
@@ -119,6 +127,9 @@ class _ExactEvaluation:
         self._covariance_term[band] += weights.T @ np.conj(zeta)
         rows = self._rows.rows(block, band)
         n, n_rows, n_subbands, n_elements = rows.shape
+        for part, pattern in self._rows.patterns:
+            if pattern is not None:
+                weights.reshape(n, n_rows, -1)[:, part] *= np.conj(pattern[band])
         stacked = np.moveaxis(rows, 2, 0).reshape(n_subbands, n * n_rows, n_elements)
         weights = np.conj(weights).reshape(n * n_rows, n_subbands, -1).transpose(1, 2, 0)
         self._mean_term[band] += np.conj(np.matmul(weights, stacked)).reshape(-1, n_elements)

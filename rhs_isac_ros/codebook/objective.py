@@ -1,5 +1,6 @@
 """Objectives of the codebook optimisation."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -26,6 +27,23 @@ def average_bound(
     return AverageCrlb(scenario, positions, ROW_TOLERANCE)
 
 
+def nuisance(
+        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
+    """Objective [m^2]: average bound with unknown phases of the bands and the region as prior.
+
+    A phase is unknown in effect even where the signals carry it, because the same phase occurs in
+    each wavelength of range. The information of the region keeps positions that the rest of the
+    signals does not determine from dominating the average. Further nuisance parameters are those
+    that the scenario declares.
+
+    The positions are float64 [N_sam, 3] [m]. Raise ValueError if `positions` is empty or not a
+    finite [N, 3] array. `rng` is unused.
+    """
+    uniform = dataclasses.replace(
+        scenario, band_phase_std_rad=max(scenario.band_phase_std_rad, 2 * np.pi))
+    return AverageCrlb(uniform, positions, ROW_TOLERANCE, region_prior=True)
+
+
 def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
     """Objective [m^2]: mean cost of confusing sampled positions with similar-looking ones.
@@ -40,4 +58,4 @@ def ambiguity(
 
 
 OBJECTIVES: Mapping[str, Callable[[Scenario, np.ndarray, np.random.Generator], Average]] = {
-    'ambiguity': ambiguity, 'crlb': average_bound}
+    'ambiguity': ambiguity, 'crlb': average_bound, 'nuisance': nuisance}

@@ -85,8 +85,9 @@ def optimize(
     method
         One of `METHODS`.
     objective
-        One of `OBJECTIVES`: ``crlb``, the average bound, or ``ambiguity``, which penalises
-        confusion between distant positions. A local bound ignores this confusion.
+        One of `OBJECTIVES`: ``crlb``, the average bound; ``ambiguity``, which penalises
+        confusion between distant positions, which a local bound ignores; or ``nuisance``, the
+        bound with unknown phases of the bands and the region as prior.
     sampling
         One of `SAMPLINGS`: ``sobol``, or ``monte_carlo`` as in the paper.
     n_positions
