@@ -33,6 +33,7 @@ from rhs_isac_ros.protocol.events import (
     SettingsOffered,
     Timeout,
 )
+from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PositionerSettings
@@ -396,8 +397,10 @@ class Network:
             case 'rhs_controller':
                 return RhsController()
             case 'channel':
-                # Two channels differ in their multipath.
-                return Channel(scenario, self.seed + name.endswith('_twin'))
+                # Two channels differ in their multipath. Without memory, the expected signals
+                # depend on the seed alone.
+                return Channel(scenario, self.seed + name.endswith('_twin'),
+                               Impairments(multipath_memory=False))
             case 'positioner':
                 return Positioner(scenario, lambda: self.now_s)
             case 'transmission':

@@ -19,8 +19,9 @@ class ChannelNode(RoleNode[ImpairedChannel]):
         super().__init__('channel', **node_options)
         values = self.values
         rng = streams.generator(values.seed, streams.AIR)
+        impairments = self.make_settings(values)
         self.start(ImpairedChannel(
-            Channel(self.scenario, values.seed), self.make_settings(values), rng))
+            Channel(self.scenario, values.seed, impairments), impairments, rng))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'serving: {self.scenario.n_bands} bands, {self.scenario.n_elements} elements')
 

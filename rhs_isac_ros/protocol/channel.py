@@ -7,11 +7,14 @@ import numpy as np
 
 from rhs_isac_ros.link import Beam, capacity
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.imperfections import draw_surface, has_element_errors
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.multipath import draw_multipath
+from rhs_isac_ros.model.nuisance import draw_user_cycle, nuisance_factors, nuisance_parameters
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, Event, Send
+from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered
+from rhs_isac_ros.protocol.fading import Fading
+from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import PlainRole
@@ -23,6 +26,31 @@ _MAX_PENDING = 256
 _MAX_REMEMBERED = 8
 
 
+class _Deviations:
+    """Deviations from the model: of the surface, of users and of cycles.
+
+    Each depends on the seed, the user and the cycle alone, so that a failed element remains
+    failed, and a gain stays with its user.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self._scenario, self._seed = scenario, seed
+        self.surface = (
+            draw_surface(scenario, streams.generator(seed, streams.SURFACE))
+            if has_element_errors(scenario) else None)
+
+    def factors(self, truth: m.GroundTruth) -> np.ndarray | None:
+        """Return the factors of the signals of a cycle [N_B, N_SB, F], or None if all are 1."""
+        scenario, seed = self._scenario, self._seed
+        if not nuisance_parameters(scenario):
+            return None
+        values = draw_user_cycle(
+            scenario, streams.generator(seed, streams.USER_DEVIATION, truth.user),
+            streams.generator(seed, streams.CYCLE_DEVIATION, truth.user, truth.cycle_id))
+        return nuisance_factors(scenario, values).reshape(
+            scenario.n_bands, scenario.n_subbands, scenario.n_frames)
+
+
 class _Cycle:
     """The true position of a cycle and the channel that results from it.
 
@@ -32,17 +60,19 @@ class _Cycle:
         Line-of-sight gains of each band, complex128 [N_SB, N_E].
     multipath
         Multipath gains of each band, complex128 [N_SB, F, N_E].
+    surface
+        Errors of the elements; None if there are none.
+    factors
+        Factors of all signals, complex128 [N_B, N_SB, F]; None if there are none.
     """
 
-    def __init__(self, scenario: Scenario, truth: m.GroundTruth, seed: int) -> None:
-        self.truth = truth
+    def __init__(self, scenario: Scenario, truth: m.GroundTruth, multipath: list[np.ndarray],
+                 deviations: _Deviations) -> None:
+        self.truth, self.multipath = truth, multipath
         # Computed here rather than on the first pilot, while other roles prepare the cycle.
-        self.los, self.multipath = [], []
-        for band in range(scenario.n_bands):
-            rng = streams.generator(seed, streams.CHANNEL, truth.user, truth.cycle_id, band)
-            self.los.append(los_gain(scenario, truth.position[None], band)[0])
-            self.multipath.append(draw_multipath(scenario, band, 1, rng).reshape(
-                scenario.n_subbands, scenario.n_frames, scenario.n_elements))
+        self.los = [los_gain(scenario, truth.position[None], band)[0]
+                    for band in range(scenario.n_bands)]
+        self.surface, self.factors = deviations.surface, deviations.factors(truth)
 
 
 class Channel(PlainRole):
@@ -55,20 +85,22 @@ class Channel(PlainRole):
     Parameters
     ----------
     seed
-        Seed of the multipath. The multipath depends only on the seed, the user, the cycle and the
-        band.
+        Seed of the multipath and of the deviations, see `Fading`.
+    impairments
+        Initial deviations from the model; by default those of the scenario. Others take effect
+        with the next cycle after they are offered.
     """
 
     SENDS = (m.FeedSignals, m.Data)
     RECEIVES = (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data)
 
-    def __init__(self, scenario: Scenario, seed: int) -> None:
+    def __init__(self, scenario: Scenario, seed: int,
+                 impairments: Impairments | None = None) -> None:
         super().__init__()
         self._scenario, self._seed = scenario, seed
+        self._deviate(impairments or Impairments())
         self._cycle: _Cycle | None = None
-        # The first draw factorises covariances. Draw once now, so that it does not delay the first
-        # cycle.
-        draw_multipath(scenario, 0, 1, np.random.default_rng(0))
+        self._fading = Fading(scenario, seed)
         # Cycle, user, instance and position of the cycles begun.
         self._begun: NewestDict[tuple[float, ...], None] = NewestDict(_MAX_REMEMBERED)
         # Configurations and beams of the current and of future cycles.
@@ -83,8 +115,11 @@ class Channel(PlainRole):
         """Process a message and return feed signals and delivered data."""
         discarded = 0
         match event:
+            case SettingsOffered(Impairments() as impairments):
+                self._deviate(impairments)
+                return []
             case m.GroundTruth() if event.cycle_id:
-                self._begin(event)
+                self._begin(event, now_s)
             case m.RhsConfiguration():
                 discarded = self._configurations.put(
                     (event.cycle_id, event.mode, event.band), event.analog)
@@ -106,14 +141,20 @@ class Channel(PlainRole):
             return 0
         return self._beams.put(key, beam)
 
-    def _begin(self, truth: m.GroundTruth) -> None:
+    def _deviate(self, impairments: Impairments) -> None:
+        self._has_memory = impairments.multipath_memory
+        self._deviations = _Deviations(impairments.applied_to(self._scenario), self._seed)
+
+    def _begin(self, truth: m.GroundTruth, now_s: float) -> None:
         # A restarted base station may repeat a cycle id, with the user at another position.
         key = truth.cycle_id, truth.user, truth.sender, *truth.position.tolist()
         if key in self._begun:
             self.count(Outcome.DUPLICATE)
             return
         self._begun.put(key, None)
-        self._cycle = _Cycle(self._scenario, truth, self._seed)
+        multipath = self._fading.gains(
+            truth.user, truth.cycle_id, now_s, memory=self._has_memory)
+        self._cycle = _Cycle(self._scenario, truth, multipath, self._deviations)
         stale = [serial for serial, event in self._pending.items()
                  if event.cycle_id != truth.cycle_id]
         for serial in stale:
@@ -159,7 +200,12 @@ class Channel(PlainRole):
         elements = element_signals(
             cycle.los[band], cycle.multipath[band][:, pilot.frame],
             complex(pilot.symbol_re, pilot.symbol_im))
-        feeds = feed_signals(self._scenario, band, applied[pilot.frame], elements)
+        configuration = applied[pilot.frame]
+        if cycle.surface is not None:
+            configuration = cycle.surface.applied(configuration)
+        feeds = feed_signals(self._scenario, band, configuration, elements)
+        if cycle.factors is not None:
+            feeds = feeds * cycle.factors[band, :, pilot.frame, None]
         return m.FeedSignals(
             cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender, band=band,
             frame=pilot.frame, signals=feeds)
@@ -173,7 +219,13 @@ class Channel(PlainRole):
         applied = self._applied(m.Mode.TRANSMISSION, beam.band, cycle)
         if applied is None:
             return None
-        used = Beam(applied[0], beam.digital, beam.band)
+        configuration, digital = applied[0], beam.digital
+        if cycle.surface is not None:
+            configuration = cycle.surface.applied(configuration)
+        if cycle.factors is not None:
+            # Only the magnitude, the gain of the user, changes the capacity.
+            digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
+        used = Beam(configuration, digital, beam.band)
         rate_bps = float(capacity(self._scenario, used, truth.position[None])[0])
         bits = min(data.bits, rate_bps * data.duration_s // 1)
         return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)

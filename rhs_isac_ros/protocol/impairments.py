@@ -5,9 +5,11 @@ import enum
 import heapq
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Timeout
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
@@ -15,9 +17,21 @@ from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.protocol.settings import setting
 
 
+def _of_scenario(name: str) -> Any:
+    """Declare a setting that replaces a field of the scenario."""
+    declared = {field.name: field for field in dataclasses.fields(Scenario)}[name].metadata
+    first_sentence = declared['text'].partition('. ')[0].rstrip('.')
+    return setting(
+        -1.0, f'{first_sentence}; negative: the value of the scenario.', unit=declared['unit'],
+        low=-1.0, high=declared['high'])
+
+
 @dataclasses.dataclass(frozen=True)
 class Impairments:
-    """Impairments of the air interface."""
+    """Impairments of the air interface, and deviations from the model of the signals.
+
+    The network does not learn of deviations that replace those of the scenario.
+    """
 
     loss_probability: float = setting(
         0.0, 'Probability that a message is lost.', low=0.0, high=1.0)
@@ -28,10 +42,29 @@ class Impairments:
     jitter_s: float = setting(
         0.0, 'Maximum additional random delay; messages may be reordered.', unit='s',
         low=0.0, high=10.0)
+    multipath_memory: bool = setting(
+        True, 'Whether the multipath of a user is correlated over its cycles by Eq. (4); '
+        'otherwise it is independent, and depends on the seed and not on times.')
+    user_gain_std_db: float = _of_scenario('user_gain_std_db')
+    phase_std_rad: float = _of_scenario('phase_std_rad')
+    band_phase_std_rad: float = _of_scenario('band_phase_std_rad')
+    timing_std_s: float = _of_scenario('timing_std_s')
+    carrier_offset_std_hz: float = _of_scenario('carrier_offset_std_hz')
+    element_error_rms: float = _of_scenario('element_error_rms')
+    failed_element_share: float = _of_scenario('failed_element_share')
+
+    def applied_to(self, scenario: Scenario) -> Scenario:
+        """Return the scenario with the deviations that are set."""
+        known = {field.name for field in dataclasses.fields(Scenario)}
+        values = dataclasses.asdict(self)
+        return dataclasses.replace(scenario, **{
+            name: value for name, value in values.items() if name in known and value >= 0})
 
 
 class ImpairedChannel:
     """A channel role whose outgoing messages are subject to impairments.
+
+    The role receives new impairments as `SettingsOffered`, for the deviations of its signals.
 
     New impairments take effect at the start of the next cycle, when its true position arrives.
 
@@ -68,7 +101,7 @@ class ImpairedChannel:
             case SettingsOffered(impairments):
                 self._settings.latest = impairments
             case _:
-                arriving += self._begin_cycle(event)
+                arriving += self._begin_cycle(event, now_s)
                 actions = self._role.handle(event, now_s)
         for action in actions:
             if isinstance(action, Send):
@@ -107,11 +140,14 @@ class ImpairedChannel:
         """Return when the next message arrives [s], or None if no message is in flight."""
         return self._in_flight[0][0] if self._in_flight else None
 
-    def _begin_cycle(self, event: Event) -> list[Action]:
+    def _begin_cycle(self, event: Event, now_s: float) -> list[Action]:
         if not isinstance(event, m.GroundTruth) or event.cycle_id in (0, self._cycle_id):
             return []
         self._cycle_id = event.cycle_id
-        return [*self._settings.apply()]
+        notes = self._settings.apply()
+        if notes:
+            self._role.handle(SettingsOffered(self._settings.in_use), now_s)
+        return [*notes]
 
     def _send(self, action: Send, now_s: float) -> None:
         impairments = self._settings.in_use

@@ -1,5 +1,6 @@
 """The channel."""
 
+import dataclasses
 import itertools
 import math
 
@@ -12,6 +13,8 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.events import SettingsOffered
+from rhs_isac_ros.protocol.impairments import Impairments
 
 PLACE = np.array([8.0, -2.0, 0.5])
 
@@ -176,3 +179,69 @@ def signals(codebooks, example):
         return example(m.ReceivedSignals, cycle_id=cycle_id, user=2,
                        codebook_id=codebooks[number].id)
     return make
+
+
+DEVIATING = {
+    'user_gain_std_db': 3.0, 'phase_std_rad': 7.0, 'band_phase_std_rad': 7.0,
+    'timing_std_s': 1e-6, 'carrier_offset_std_hz': 1e4, 'element_error_rms': 0.2,
+    'failed_element_share': 0.3}
+
+
+def received(channel, codebook, user, cycle_id):
+    """Feed signals of the first band in a cycle without multipath memory, [F, N_SB, K]."""
+    events = [
+        m.GroundTruth(cycle_id=cycle_id, user=user, position=PLACE, velocity=np.zeros(3)),
+        m.RhsConfiguration(cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0,
+                           codebook_id='x', analog=codebook.analog[0]),
+        *(m.Pilot(cycle_id=cycle_id, user=user, band=0, frame=frame, symbol_re=1.0,
+                  symbol_im=0.0) for frame in (0, 1))]
+    return np.array([feeds.signals for sent in feed(channel, events) for feeds in sent])
+
+
+def make_deviating(scenario, **impairments):
+    """Return a channel without multipath."""
+    silent = dataclasses.replace(scenario, multipath_to_los_db=-200.0)
+    return Channel(silent, 0, Impairments(**impairments))
+
+
+@pytest.mark.parametrize('name', DEVIATING)
+def test_a_deviation_changes_the_signals_and_can_be_switched_off(scenario, codebooks, name):
+    plain = received(make_deviating(scenario), codebooks[0], 1, 1)
+    impaired = make_deviating(scenario, **{name: DEVIATING[name]})
+    assert not np.allclose(received(impaired, codebooks[0], 1, 1), plain, rtol=1e-3)
+    declared = make_deviating(dataclasses.replace(scenario, **{name: DEVIATING[name]}))
+    np.testing.assert_array_equal(
+        received(declared, codebooks[0], 1, 2), received(impaired, codebooks[0], 1, 2))
+    # The little multipath that is left differs between the cycles.
+    for channel in (impaired, declared):
+        channel.handle(SettingsOffered(Impairments(**{name: 0.0})), 0.0)
+        np.testing.assert_allclose(received(channel, codebooks[0], 1, 3), plain, rtol=1e-6)
+    impaired.handle(SettingsOffered(Impairments()), 0.0)
+    declared.handle(SettingsOffered(Impairments()), 0.0)
+    np.testing.assert_allclose(received(impaired, codebooks[0], 1, 4), plain, rtol=1e-6)
+    assert not np.allclose(received(declared, codebooks[0], 1, 4), plain, rtol=1e-3)
+
+
+@pytest.mark.parametrize(('name', 'same_user', 'same_surface'), [
+    ('user_gain_std_db', True, False), ('carrier_offset_std_hz', True, False),
+    ('phase_std_rad', False, False), ('timing_std_s', False, False),
+    ('element_error_rms', True, True), ('failed_element_share', True, True)])
+def test_deviations_belong_to_the_surface_the_user_or_the_cycle(
+        scenario, codebooks, name, same_user, same_surface):
+    channel = make_deviating(scenario, **{name: DEVIATING[name]})
+    first, again, other = (received(channel, codebooks[0], user, cycle_id)
+                           for user, cycle_id in ((1, 1), (1, 2), (2, 3)))
+    assert np.allclose(again, first, rtol=1e-6) == same_user
+    assert np.allclose(other, first, rtol=1e-6) == same_surface
+
+
+def test_gain_and_element_errors_change_the_capacity(scenario, truth, beam, applied, downlink):
+    def bits(**impairments):
+        channel = make_deviating(scenario, **impairments)
+        feed(channel, [truth, beam, applied])
+        ((delivered,),) = feed(channel, [downlink])
+        return delivered.bits
+
+    assert bits(phase_std_rad=7.0, carrier_offset_std_hz=1e4) == bits()
+    assert bits(user_gain_std_db=3.0) != bits()
+    assert bits(failed_element_share=1.0) < bits()

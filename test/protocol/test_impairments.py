@@ -80,8 +80,8 @@ def test_impairments_of_messages_are_independent(impaired):
 
 def test_nearly_all_cycles_are_served_under_impairments(network):
     net = network(2, rest_s=0.0, retries=3)
-    channel = Channel(net.scenario, net.seed)
-    air = Impairments(0.05, 0.05, 1e-3, 5e-3)
+    air = Impairments(0.05, 0.05, 1e-3, 5e-3, multipath_memory=False)
+    channel = Channel(net.scenario, net.seed, air)
     net._roles['channel'] = ImpairedChannel(channel, air, np.random.default_rng(1))
     net.run_cycles(300, limit_s=600.0)
     outcomes = [outcome for _, _, outcome in net.outcomes()]
