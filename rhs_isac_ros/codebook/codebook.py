@@ -15,11 +15,14 @@ from rhs_isac_ros.codebook import provenance_text
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.shapes import check_shape
+from rhs_isac_ros.model.surface import on_levels
 
 # The node whose parameters a codebook file holds, in any namespace.
 PARAMETER_NODE = '/**/optimizer'
 # Relative tolerance of the power constraint.
 _POWER_TOLERANCE = 1e-6
+# Tolerance of amplitudes, which must be levels of the elements.
+_LEVEL_TOLERANCE = 1e-9
 # The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
 _YAML_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
@@ -92,7 +95,11 @@ class Codebook:
         return f'cb{digest.hexdigest()[:16]}'
 
     def check(self, scenario: Scenario) -> None:
-        """Raise CodebookError if a size, or the power of a frame, differs from the scenario's."""
+        """Raise CodebookError if the codebook does not fit a scenario.
+
+        Sizes and the power of each frame must be those of the scenario, and configurations must
+        be among its amplitude levels.
+        """
         try:
             check_shape('analog', self.analog, 'N_B F N_E', scenario)
             check_shape('digital', self.digital, 'N_B N_SB F K', scenario)
@@ -104,6 +111,11 @@ class Codebook:
             raise CodebookError(
                 f'digital: a frame has power {worst:g} W, expected max_power_w = '
                 f'{scenario.max_power_w:g} W')
+        errors = np.abs(self.analog - on_levels(scenario, self.analog))
+        if errors.max() > _LEVEL_TOLERANCE:
+            raise CodebookError(
+                f'analog: {self.analog.flat[errors.argmax()]:g}, expected one of '
+                f'amplitude_levels = {scenario.amplitude_levels} levels from 0 to 1')
 
     def to_parameters(self) -> dict[str, Any]:
         """Return ROS parameters by name, ``codebook.*``: plain strings, floats and lists."""

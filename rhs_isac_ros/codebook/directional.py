@@ -5,7 +5,7 @@ import numpy as np
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
+from rhs_isac_ros.model.surface import matched_configuration, on_levels, onboard_matrix
 
 
 def directional_codebook(
@@ -30,7 +30,8 @@ def directional_codebook(
     points = focal_points(scenario)
     for band, onboard in enumerate(onboard_matrix(scenario)):
         for frame, los in enumerate(los_gain(scenario, points[:, band], band)):
-            analog[band, frame] = matched_configuration(los, onboard)
+            analog[band, frame] = on_levels(
+                scenario, matched_configuration(los, onboard))
             feeds = np.einsum('jkm,jm->jk', onboard, analog[band, frame] * los)
             if not los.any():
                 raise ValueError(

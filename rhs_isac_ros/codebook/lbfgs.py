@@ -1,6 +1,16 @@
 """Bound-constrained quasi-Newton optimisation of all variables at once."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
 from rhs_isac_ros.codebook.search import Search
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 # Number of corrections that approximate the Hessian. Evaluations are expensive, so more
 # corrections than SciPy's default of 10 pay off.
@@ -9,12 +19,24 @@ _MEMORY = 30
 
 def minimize_lbfgs(search: Search) -> str:
     """Minimise with L-BFGS-B; return the reason for stopping."""
+    result = run_lbfgs(search.value_and_gradient, search.start, search.bounds, search.max_steps,
+                       search.on_step)
+    return 'max_steps reached' if result.status == 1 else str(result.message)
+
+
+def run_lbfgs(
+        objective: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray,
+        bounds: Sequence[tuple[float, float] | tuple[None, None]], max_steps: int,
+        on_step: Callable[[], None]) -> OptimizeResult:
+    """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
+
+    `on_step` is called after each of at most `max_steps` steps.
+    """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
 
-    result = minimize(
-        search.value_and_gradient, search.start, jac=True, method='L-BFGS-B',
-        bounds=search.bounds, callback=lambda _: search.on_step(),
-        options={'maxiter': search.max_steps, 'maxfun': 20 * search.max_steps,
+    return minimize(
+        objective, start, jac=True, method='L-BFGS-B', bounds=bounds,
+        callback=lambda _: on_step(),
+        options={'maxiter': max_steps, 'maxfun': 20 * max_steps,
                  'maxcor': _MEMORY, 'ftol': 1e-10, 'gtol': 1e-10})
-    return 'max_steps reached' if result.status == 1 else str(result.message)

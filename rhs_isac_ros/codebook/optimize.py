@@ -12,6 +12,7 @@ from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.direct import minimize_direct
 from rhs_isac_ros.codebook.genetic import minimize_genetic
 from rhs_isac_ros.codebook.lbfgs import minimize_lbfgs
+from rhs_isac_ros.codebook.levels import minimize_levels
 from rhs_isac_ros.codebook.objective import OBJECTIVES
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.codebook.provenance import Provenance
@@ -75,6 +76,9 @@ def optimize(
         progress: Callable[[Progress], None] | None = None,
         keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
     """Find a codebook that minimises an objective.
+
+    If the scenario has ``amplitude_levels``, configurations are optimised over these levels: by
+    `minimize_levels` for the method ``lbfgs``, and by ``genetic``.
 
     On KeyboardInterrupt, the search ends and the best codebook so far is returned.
 
@@ -141,7 +145,8 @@ def optimize(
     done = provenance.resumed(resume) if resume else provenance
     first = resume or start or STARTS.get(method, random_codebook)(
         scenario, streams.generator(seed, streams.START))
-    first.check(scenario)
+    # A start with continuous amplitudes is the better one.
+    first.check(dataclasses.replace(scenario, amplitude_levels=0))
     problem = Problem(scenario, OBJECTIVES[objective](
         scenario, positions, streams.generator(seed, streams.PAIRS)))
 
@@ -153,12 +158,24 @@ def optimize(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
             tuple(search.history), reason)
 
+    minimize = _minimizer(scenario, method)
     search = Search(
         problem, problem.pack(first), max_steps, max_evaluations,
         streams.generator(seed, streams.METHOD),
         _PeriodicCall(progress, lambda: keep(result('not finished'))) if keep else progress,
         (done.steps, done.evaluations))
-    return result(_run(search, METHODS[method].minimize))
+    return result(_run(search, minimize))
+
+
+def _minimizer(scenario: Scenario, method: str) -> Callable[[Search], str] | None:
+    """Return the function of a method, or raise ValueError if it needs continuous amplitudes."""
+    if scenario.amplitude_levels and method == 'lbfgs':
+        return minimize_levels
+    if scenario.amplitude_levels and method in ('alternating', 'direct'):
+        raise ValueError(
+            f'method: {method!r} with amplitude_levels = {scenario.amplitude_levels}, expected '
+            "'lbfgs' or 'genetic'")
+    return METHODS[method].minimize
 
 
 def _run(search: Search, minimize: Callable[[Search], str] | None) -> str:

@@ -5,6 +5,7 @@ import numpy as np
 from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.surface import on_levels
 
 
 class Problem:
@@ -36,23 +37,35 @@ class Problem:
             [codebook.analog.ravel(), digital.real.ravel(), digital.imag.ravel()])
 
     def unpack(self, variables: np.ndarray) -> Codebook:
-        """Return the codebook of variables from `pack`; it satisfies both constraints."""
-        analog, raw, norm = self._split(variables)
-        return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
+        """Return the codebook of variables from `pack`; it satisfies all constraints.
+
+        Configurations are rounded to the amplitudes that the elements can take.
+        """
+        return self._codebook(variables, relaxed=False)
 
     def value(self, variables: np.ndarray) -> float:
         """Return the objective [m^2] for variables as `pack` returns them."""
         return self.objective.value(self.unpack(variables))
 
-    def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the objective [m^2] and its gradient, float64, shaped like `variables`."""
+    def value_and_gradient(
+            self, variables: np.ndarray, *, relaxed: bool = False) -> tuple[float, np.ndarray]:
+        """Return the objective [m^2] and its gradient, float64, shaped like `variables`.
+
+        Both are those of the codebook of `unpack`. If relaxed, configurations are not rounded.
+        """
         _, raw, norm = self._split(variables)
-        value, by_analog, by_digital = self.objective(self.unpack(variables))
+        value, by_analog, by_digital = self.objective(self._codebook(variables, relaxed=relaxed))
         # d(raw / norm) has no component along raw.
         radial = np.sum((np.conj(raw) * by_digital).real, axis=(1, 3), keepdims=True)
         by_raw = np.sqrt(self.scenario.max_power_w) / norm * (by_digital - raw * radial / norm**2)
         return value, np.concatenate(
             [by_analog.ravel(), by_raw.real.ravel(), by_raw.imag.ravel()])
+
+    def _codebook(self, variables: np.ndarray, *, relaxed: bool) -> Codebook:
+        analog, raw, norm = self._split(variables)
+        if not relaxed:
+            analog = on_levels(self.scenario, analog)
+        return Codebook(analog, raw * (np.sqrt(self.scenario.max_power_w) / norm))
 
     def _split(self, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return configurations, unscaled combining vectors, and their norm in each frame."""

@@ -78,6 +78,11 @@ class Search:
         self.history: list[Progress] = []
         self._last: tuple[np.ndarray, float, np.ndarray] | None = None
 
+    @property
+    def amplitude_levels(self) -> int:
+        """Number of amplitudes of an element; 0 if they are continuous."""
+        return self._problem.scenario.amplitude_levels
+
     def begin(self) -> float:
         """Evaluate the start [m^2] and record it as the first entry of the history.
 
@@ -111,6 +116,14 @@ class Search:
             self._keep_best(value, variables)
             self._last = np.array(variables), value, gradient
         return self._last[1:]
+
+    def relaxed_value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        """Evaluate as if amplitudes were continuous [m^2], [n], or raise BudgetSpent.
+
+        The point does not become the best one.
+        """
+        self._count()
+        return self._problem.value_and_gradient(variables, relaxed=True)
 
     def on_step(self) -> None:
         """Record a step; methods call this after each of their steps."""

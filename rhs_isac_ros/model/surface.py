@@ -114,6 +114,12 @@ def onboard_matrix(scenario: Scenario) -> np.ndarray:
     return matrix
 
 
+def on_levels(scenario: Scenario, analog: np.ndarray) -> np.ndarray:
+    """Round configurations, float64 of any shape, to the amplitudes that elements can take."""
+    steps = scenario.amplitude_levels - 1
+    return np.rint(analog * steps) / steps if steps > 0 else analog
+
+
 def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
     """Compute a configuration by the holographic principle, float64 [N_E], entries in [0, 1].
 

@@ -1,5 +1,6 @@
 """Objectives: values from the plain equations, and gradients."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -93,17 +94,28 @@ def test_optimising_the_ambiguity_lowers_it_on_held_out_pairs(scenario):
     assert bound.codebook.average_crlb_m2 < result.codebook.average_crlb_m2
 
 
-@pytest.mark.parametrize('name', ['ambiguity', 'crlb'])
+@pytest.mark.parametrize('name', OBJECTIVES)
 def test_the_generator_determines_the_random_pairs(scenario, small, name):
     positions = scenario.sample_positions(5, np.random.default_rng(0))
     one, same, other = (
         OBJECTIVES[name](scenario, positions, np.random.default_rng(seed)).value(small.codebook)
         for seed in (1, 1, 2))
     assert one == same
-    assert (one == other) == (name == 'crlb')
+    assert (one == other) == (name != 'ambiguity')
 
 
 @pytest.mark.parametrize('name', OBJECTIVES)
 def test_an_empty_sample_is_an_error(small, name):
     with pytest.raises(ValueError, match='expected .*at least one'):
         OBJECTIVES[name](small.scenario, np.zeros((0, 3)), np.random.default_rng(0))
+
+
+def test_nuisance_is_the_bound_with_unknown_phases_and_the_region_as_prior(table1):
+    positions = table1.vectors['positions']
+    value = OBJECTIVES['nuisance'](
+        table1.scenario, positions, np.random.default_rng(0)).value(table1.codebook)
+    unknown = dataclasses.replace(table1.scenario, band_phase_std_rad=2 * np.pi)
+    expected = crlb(unknown, table1.codebook, positions, region_prior=True).mean()
+    assert value == pytest.approx(expected, rel=1e-3)
+    assert value > crlb(
+        table1.scenario, table1.codebook, positions, region_prior=True).mean()

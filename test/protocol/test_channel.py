@@ -210,9 +210,9 @@ def test_a_deviation_changes_the_signals_and_can_be_switched_off(scenario, codeb
     impaired = make_deviating(scenario, **{name: DEVIATING[name]})
     assert not np.allclose(received(impaired, codebooks[0], 1, 1), plain, rtol=1e-3)
     declared = make_deviating(dataclasses.replace(scenario, **{name: DEVIATING[name]}))
-    np.testing.assert_array_equal(
-        received(declared, codebooks[0], 1, 2), received(impaired, codebooks[0], 1, 2))
-    # The little multipath that is left differs between the cycles.
+    # The little multipath that is left differs.
+    np.testing.assert_allclose(
+        received(declared, codebooks[0], 1, 2), received(impaired, codebooks[0], 1, 2), rtol=1e-6)
     for channel in (impaired, declared):
         channel.handle(SettingsOffered(Impairments(**{name: 0.0})), 0.0)
         np.testing.assert_allclose(received(channel, codebooks[0], 1, 3), plain, rtol=1e-6)
