@@ -5,6 +5,7 @@ reStructuredText or SVG.
 """
 
 import ast
+import dataclasses
 import importlib
 import pkgutil
 import re
@@ -17,6 +18,8 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 from visualization_msgs.msg import MarkerArray
 
+from rhs_isac_ros.model.deviations import Deviations
+from rhs_isac_ros.model.table1 import Table1
 from rhs_isac_ros.protocol import diagram
 from rhs_isac_ros.protocol.outcomes import Kind, Outcome
 from rhs_isac_ros.ros import parameters, qos, recording, topics
@@ -55,6 +58,18 @@ def parameter_table():
                      'yes' if parameter.dynamic else '', ', '.join(nodes_), parameter.text))
     return table(('parameter', 'type', 'default', 'range', 'dynamic', 'nodes', 'description'),
                  rows, '18 8 9 14 8 15 28')
+
+
+def scenario_table(kind):
+    """Return a table of the scenario fields of `Table1` or `Deviations`."""
+    rows = []
+    for field in dataclasses.fields({'table1': Table1, 'deviations': Deviations}[kind]):
+        declared = field.metadata
+        default = list(field.default) if isinstance(field.default, tuple) else field.default
+        source = f' Source: {declared["source"]}.' if declared['source'] else ''
+        rows.append((code(field.name), declared['unit'], 'null' if default is None else default,
+                     f'{declared["low"]:g} to {declared["high"]:g}', declared['text'] + source))
+    return table(('field', 'unit', 'default', 'range', 'meaning'), rows, '22 7 11 14 46')
 
 
 def topic_table():
