@@ -167,8 +167,8 @@ def module_list(package):
 
 
 FUNCTIONS = {function.__name__: function for function in (
-    parameter_table, topic_table, message_list, state_picture, state_table, cycle_sequence,
-    outcome_table, module_list, dependency_table)}
+    parameter_table, scenario_table, topic_table, message_list, state_picture, state_table,
+    cycle_sequence, outcome_table, module_list, dependency_table)}
 
 
 class Generated(SphinxDirective):

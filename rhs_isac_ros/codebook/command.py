@@ -54,8 +54,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="YAML file of the scenario; the paper's Table I if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES), default='crlb',
-        help='the average bound, or the ambiguity between distant positions, which a local '
-             'bound ignores')
+        help='the average bound; the ambiguity between distant positions, which a local bound '
+             'ignores; or the bound with unknown phases of the bands and the region as prior')
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
     add('--positions', type=integer(1, _MAX_POSITIONS), default=DEFAULT_POSITIONS,

@@ -15,8 +15,6 @@ from rhs_isac_ros.model.fields import ScenarioError, checked
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.table1 import Table1
 
-__all__ = ['SPEED_OF_LIGHT_MPS', 'Scenario', 'ScenarioError']
-
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 
