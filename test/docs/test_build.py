@@ -1,5 +1,6 @@
 """The documentation builds without a warning and displays without a network."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip('sphinx', reason='Sphinx is not installed')
 pytest.importorskip('rclpy', reason='the pages of the interfaces need ROS')
 
+from rhs_isac_ros.model import Scenario  # noqa: E402
 from rhs_isac_ros.protocol import diagram  # noqa: E402
 from rhs_isac_ros.ros import parameters, topics  # noqa: E402
 
@@ -95,6 +97,12 @@ def test_parameters_name_every_parameter(site):
     for group in parameters.NODES.values():
         for parameter in group:
             assert contains(text, parameter.name), parameter.name
+
+
+def test_scenarios_name_every_field(site):
+    text = text_of(site, 'scenario')
+    for field in dataclasses.fields(Scenario):
+        assert contains(text, field.name), field.name
 
 
 def test_diagnostics_have_every_kind_of_key(site):

@@ -168,6 +168,31 @@ def test_band_and_impairments_change(running):
     assert running.set('channel', double_probability=0.0, delay_s=0.0).successful
 
 
+def frame_change(running):
+    """Largest relative change of the feed signals between the first two frames of a band."""
+    frames = {}
+    for feeds in running.watch.received[m.FeedSignals]:
+        frames.setdefault((feeds.cycle_id, feeds.band), {})[feeds.frame] = feeds.signals
+    _, latest = max((key, value) for key, value in frames.items() if {0, 1} <= value.keys())
+    return np.abs(latest[1] - latest[0]).max() / np.abs(latest[0]).max()
+
+
+def test_failed_elements_are_switched_on_and_off(running):
+    """If all elements are stuck, the configurations of the frames have no effect."""
+    assert running.set('channel', failed_element_share=1.0).successful
+    running.until_reported('channel', parameter__failed_element_share='1.0',
+                           pending__failed_element_share=None)
+    n_before = len(running.watch.received[m.FeedSignals])
+    running.watch.until(lambda: len(running.watch.received[m.FeedSignals]) > n_before + 20,
+                        'feed signals', [running.process])
+    assert frame_change(running) < 1e-3
+    assert running.set('channel', failed_element_share=-1.0).successful
+    running.until_reported('channel', parameter__failed_element_share='-1.0',
+                           pending__failed_element_share=None)
+    running.watch.until_served(3, processes=[running.process])
+    assert frame_change(running) > 1e-2
+
+
 def test_the_codebook_in_use_is_reported(running, small_files):
     second = Codebook.load(small_files / 'second.yaml')
     assert running.set('optimizer', **second.to_parameters()).successful
