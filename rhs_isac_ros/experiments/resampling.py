@@ -1,6 +1,7 @@
-"""Bootstrap intervals of comparisons."""
+"""Bootstrap intervals of comparisons, over cases alone or over cases and members."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -48,3 +49,73 @@ def reduction(
         reductions = 1 - statistic(samples[picks]) / statistic(baseline[others])
         low, high = np.percentile(100 * reductions, _INTERVAL)
         return 100 * float(1 - statistic(samples) / statistic(baseline)), float(low), float(high)
+
+
+class Statistics:
+    """Mean, median and interquartile range of results of several members, with replicates.
+
+    A member is what is repeated besides the cases: a training, or a draw of a codebook. Each
+    replicate of the bootstrap resamples cases and members. Objects with the same number of cases
+    share the resampled cases, which makes their comparisons paired, and resample their members
+    independently.
+
+    Of M members, M - 1 are drawn with replacement, which makes the variance of the replicates
+    unbiased (Rao and Wu, Resampling inference with complex survey data, 1988). The variance
+    between members is not included if there is only one.
+
+    Attributes
+    ----------
+    values
+        Statistic of the results, then of the replicates, float64 [1 + replicates], by name:
+        ``mean``, and for each quantile its number.
+
+    Parameters
+    ----------
+    results
+        Float64 [members, cases]; NaN where a member has no result for a case.
+    seed
+        Seed of the resampled members; different for results with other members.
+    quantiles
+        Quantiles to compute.
+    """
+
+    def __init__(self, results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -> None:
+        n_members, n_cases = results.shape
+        rng, drawn = np.random.default_rng([1, seed]), max(n_members - 1, 1)
+        members = np.vstack([
+            np.ones(n_members),
+            rng.multinomial(drawn, np.full(n_members, 1 / n_members), _RESAMPLES)])
+        cases = _case_weights(n_cases)
+        present = np.isfinite(results)
+        filled = np.where(present, results, 0.0).astype(np.float32)
+        sums, counts = cases @ filled.T, cases @ present.T.astype(np.float32)
+        self.values = {'mean': np.sum(members * sums, axis=1) / np.sum(members * counts, axis=1)}
+        if quantiles:
+            self._add_quantiles(results, members.astype(np.float32), cases, quantiles)
+
+    def _add_quantiles(self, results: np.ndarray, members: np.ndarray, cases: np.ndarray,
+                       quantiles: Sequence[float]) -> None:
+        member, case = np.nonzero(np.isfinite(results))
+        order = np.argsort(results[member, case])
+        member, case = member[order], case[order]
+        ordered, found = results[member, case], np.empty((len(quantiles), len(cases)))
+        for index, (by_member, by_case) in enumerate(zip(members, cases, strict=True)):
+            total = np.cumsum(by_member[member] * by_case[case], dtype=float)
+            found[:, index] = ordered[np.searchsorted(total, np.array(quantiles) * total[-1])]
+        self.values |= dict(zip(map(str, quantiles), found, strict=True))
+
+
+def interval(replicates: np.ndarray) -> tuple[float, float, float]:
+    """Return the first value, and the 95 % interval of the replicates that follow it."""
+    low, high = np.percentile(replicates[1:], _INTERVAL)
+    return float(replicates[0]), float(low), float(high)
+
+
+@functools.lru_cache(maxsize=2)
+def _case_weights(n: int) -> np.ndarray:
+    """Return how often each case is drawn, float32 [1 + replicates, n]; once in the first row."""
+    rng = np.random.default_rng(0)
+    weights = np.ones((1 + _RESAMPLES, n), np.float32)
+    for row in weights[1:]:
+        row[:] = np.bincount(rng.integers(n, size=n), minlength=n)
+    return weights

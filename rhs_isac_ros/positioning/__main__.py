@@ -18,6 +18,7 @@ from rhs_isac_ros.model.arguments import (
     seed,
 )
 from rhs_isac_ros.model.optional import MissingLibraryError
+from rhs_isac_ros.positioning.network import INPUTS
 from rhs_isac_ros.positioning.training import (
     DEFAULT_EPOCHS,
     DEFAULT_HIDDEN,
@@ -50,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="YAML file of the scenario; the paper's Table I if omitted")
     add('--pairs', type=integer(20, 10**7), default=DEFAULT_PAIRS,
         help='simulated pairs for training, validation and test, 7 : 1.5 : 1.5')
+    add('--inputs', choices=sorted(INPUTS), default='parts',
+        help='real and imaginary parts of the signals, or their magnitudes')
     add('--hidden', type=integer(1, 10**5), default=DEFAULT_HIDDEN,
         help='units of the hidden layer')
     add('--epochs', type=positive_int, default=DEFAULT_EPOCHS,
@@ -80,7 +83,7 @@ def _run(options: argparse.Namespace) -> None:
     codebook.check(scenario)
     with _progress(options) as show:
         network = train(scenario, codebook, options.pairs, options.seed, options.hidden,
-                        options.epochs, show)
+                        options.epochs, show, options.inputs)
     network.save(output)
     about = network.about
     print(f'{output}: codebook {codebook.id}, {about["epochs"]} epochs; mean squared error '

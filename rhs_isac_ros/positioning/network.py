@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,17 @@ _FORMAT = 1
 _FILE_KEYS = {'max_energy': 'loudest'}
 
 
+def magnitudes(signals: np.ndarray) -> np.ndarray:
+    """Flatten complex signals [N, N_B, N_SB F] to their magnitudes, float64 [N, N_B N_SB F]."""
+    flat: np.ndarray = np.abs(signals.reshape(len(signals), -1))
+    return flat
+
+
+# Inputs of a network as functions of the received signals. The paper does not specify them.
+INPUTS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
+    'parts': stack_parts, 'magnitudes': magnitudes}
+
+
 class ModelError(ValueError):
     """A trained model cannot be read, or belongs to another codebook or scenario."""
 
@@ -25,8 +37,9 @@ class Network:
     """A trained network, with the arguments and results of its training.
 
     The input x consists of the real and imaginary parts of the received signals, [D] =
-    [2 N_B N_SB F], each scaled to zero mean and unit variance; the position is
-    p = center + w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
+    [2 N_B N_SB F], or of their magnitudes, [D] = [N_B N_SB F], each scaled to zero mean and unit
+    variance; the position is p = center +
+    w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
 
     Attributes
     ----------
@@ -45,6 +58,8 @@ class Network:
     about
         ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
         ``seed``, ``pairs``, ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
+    inputs
+        One of `INPUTS`: ``parts`` or ``magnitudes``.
     """
 
     input_mean: np.ndarray
@@ -57,9 +72,12 @@ class Network:
     covariance: np.ndarray
     max_energy: float
     about: dict[str, Any]
+    inputs: str = 'parts'
 
     def __post_init__(self) -> None:
         """Check that sizes agree and numbers are finite."""
+        if self.inputs not in INPUTS:
+            raise ModelError(f'inputs: {self.inputs!r}, expected one of {sorted(INPUTS)}')
         n_inputs, n_hidden = np.shape(self.w_in) if np.ndim(self.w_in) == 2 else (0, 0)
         shapes: dict[str, tuple[int, ...]] = {
             'input_mean': (n_inputs,), 'input_scale': (n_inputs,), 'w_in': (n_inputs, n_hidden),
@@ -74,7 +92,7 @@ class Network:
 
     def positions(self, received: np.ndarray) -> np.ndarray:
         """Map received signals, complex128 [N, N_B, N_SB F], to positions, float64 [N, 3] [m]."""
-        inputs = (stack_parts(received) - self.input_mean) / self.input_scale
+        inputs = (INPUTS[self.inputs](received) - self.input_mean) / self.input_scale
         hidden = np.maximum(inputs @ self.w_in + self.b_in, 0.0)
         positions: np.ndarray = hidden @ self.w_out + self.b_out + self.center
         return positions
@@ -85,7 +103,7 @@ class Network:
         An existing file is replaced at the end, or kept if there is an `OSError`.
         """
         arrays = {key: getattr(self, name) for key, name in self._names_by_key().items()}
-        arrays['about'] = json.dumps({'format': _FORMAT, **self.about})
+        arrays['about'] = json.dumps({'format': _FORMAT, 'inputs': self.inputs, **self.about})
         write_whole(path, lambda stream: np.savez(stream, **arrays))
 
     @classmethod
@@ -111,14 +129,16 @@ class Network:
         if not isinstance(about, dict) or about.pop('format', 0) != _FORMAT or (
                 arrays.keys() != names.keys()):
             raise ModelError(f'{path}: not a model, expected a model file of format {_FORMAT}')
+        inputs = str(about.pop('inputs', 'parts'))
         try:
             return cls(**{names[key]: array.astype(float) for key, array in arrays.items()},
-                       about=about)
+                       about=about, inputs=inputs)
         except ValueError as error:
             raise ModelError(f'{path}: {error}') from None
 
     @classmethod
     def _names_by_key(cls) -> dict[str, str]:
         """Map the keys of the arrays in a file to the names of their fields."""
-        names = [field.name for field in dataclasses.fields(cls) if field.name != 'about']
+        names = [field.name for field in dataclasses.fields(cls)
+                 if field.name not in ('about', 'inputs')]
         return {_FILE_KEYS.get(name, name): name for name in names}

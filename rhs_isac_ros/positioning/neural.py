@@ -75,6 +75,6 @@ def check_trained_for(
         raise ModelError(f'{source}: trained for the scenario {about.get("scenario")}, expected '
                          f'{scenario.changes()}')
     n_bands, n_subbands, n_frames, _, _ = codebook.shape
-    expected = 2 * n_bands * n_subbands * n_frames
+    expected = (2 if network.inputs == 'parts' else 1) * n_bands * n_subbands * n_frames
     if len(network.w_in) != expected:
         raise ModelError(f'{source}: {len(network.w_in)} inputs, expected {expected}')

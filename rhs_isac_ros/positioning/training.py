@@ -1,10 +1,11 @@
 """Training of the paper's network: 10^5 simulated pairs, split 7 : 1.5 : 1.5.
 
-The paper does not specify the rest. This implementation uses 512 hidden units with the ReLU
-activation, the squared position error as the loss, and Adam with a learning rate of 10^-3. When
-the validation error has not decreased for some epochs, the batch size grows, which reduces the
-noise of the steps. Training stops after the largest batches, and the weights of the best epoch
-are used.
+The "256 nodes" that the paper mentions in its description of Fig. 4 are read as the units of the
+hidden layer. The paper does not specify the rest. This implementation uses the real and imaginary
+parts of the signals as inputs, the ReLU activation, the squared position error as the loss, and
+Adam with a learning rate of 10^-3. When the validation error has not decreased for some epochs,
+the batch size grows, which reduces the noise of the steps. Training stops after the largest
+batches, and the weights of the best epoch are used.
 """
 
 import copy
@@ -18,13 +19,12 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.optional import optional_import
-from rhs_isac_ros.positioning.estimate import stack_parts
-from rhs_isac_ros.positioning.network import Network
+from rhs_isac_ros.positioning.network import INPUTS, Network
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 DEFAULT_PAIRS = 100_000
-DEFAULT_HIDDEN = 512
+DEFAULT_HIDDEN = 256
 DEFAULT_EPOCHS = 150
 _BATCH_SIZES = (128, 1024, 8192)
 _LEARNING_RATE = 1e-3
@@ -49,7 +49,7 @@ class Epoch(NamedTuple):
 def train(
         scenario: Scenario, codebook: Codebook, n_pairs: int = DEFAULT_PAIRS, seed: int = 0,
         n_hidden: int = DEFAULT_HIDDEN, max_epochs: int = DEFAULT_EPOCHS,
-        progress: Callable[[Epoch], None] | None = None) -> Network:
+        progress: Callable[[Epoch], None] | None = None, inputs: str = 'parts') -> Network:
     """Train a network for a scenario and codebook.
 
     Returns the network of the epoch with the smallest validation error.
@@ -64,13 +64,16 @@ def train(
         Units of the hidden layer.
     progress
         Called after every epoch.
+    inputs
+        One of `INPUTS`: ``parts``, the real and imaginary parts of the signals, or
+        ``magnitudes``.
 
     Raises
     ------
     CodebookError
         If the codebook does not fit the scenario.
     ValueError
-        If a number is too small.
+        If a number is too small, or the inputs are unknown.
     MissingLibraryError
         If scikit-learn is not installed.
     """
@@ -78,19 +81,21 @@ def train(
                                  ('max_epochs', max_epochs, 1)):
         if value < minimum:
             raise ValueError(f'{name}: {value}, expected at least {minimum}')
+    if inputs not in INPUTS:
+        raise ValueError(f'inputs: {inputs!r}, expected one of {sorted(INPUTS)}')
     start_s = time.monotonic()
     regressor, limit_threads = _regressor(n_hidden, seed)
     positions, received = simulate_pairs(scenario, codebook, n_pairs, seed)
     training, validation, test = _split(n_pairs)
-    parts, center = stack_parts(received), scenario.roi_bounds_m.mean(axis=0)
-    mean, scale = parts[training].mean(axis=0), parts[training].std(axis=0)
+    features, center = INPUTS[inputs](received), scenario.roi_bounds_m.mean(axis=0)
+    mean, scale = features[training].mean(axis=0), features[training].std(axis=0)
     # One unit for all coordinates, so that the loss is the squared error.
     unit_m = np.sqrt(np.mean((positions[training] - center)**2))
-    inputs = ((parts - mean) / scale).astype(np.float32)
+    scaled = ((features - mean) / scale).astype(np.float32)
     targets = ((positions - center) / unit_m).astype(np.float32)
 
     def residuals(subset: slice) -> np.ndarray:
-        errors: np.ndarray = regressor.predict(inputs[subset]) - targets[subset]
+        errors: np.ndarray = regressor.predict(scaled[subset]) - targets[subset]
         errors_m: np.ndarray = errors.astype(float) * unit_m
         return errors_m
 
@@ -103,14 +108,15 @@ def train(
     # A single thread: more threads change the rounding and do not speed up such small products.
     with limit_threads(1):
         best_epoch, best_mse = _fit(
-            regressor, inputs[training], targets[training], max_epochs, after_epoch)
+            regressor, scaled[training], targets[training], max_epochs, after_epoch)
     errors, test_errors = residuals(validation), residuals(test)
     (w_in, w_out), (b_in, b_out) = (
         [array.astype(float) for array in arrays]
         for arrays in (regressor.coefs_, regressor.intercepts_))
     return Network(
         input_mean=mean, input_scale=scale, w_in=w_in, b_in=b_in, w_out=w_out * unit_m,
-        b_out=b_out * unit_m, center=center, covariance=errors.T @ errors / len(errors),
+        b_out=b_out * unit_m, center=center, inputs=inputs,
+        covariance=errors.T @ errors / len(errors),
         max_energy=_max_energy(scenario, codebook, positions), about={
             'codebook': codebook.id, 'scenario': scenario.changes(), 'seed': seed,
             'pairs': n_pairs, 'epochs': best_epoch, 'version': __version__,

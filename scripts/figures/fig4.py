@@ -1,19 +1,26 @@
 """Fig. 4 of the paper: positioning error and capacity loss by codebook and estimator.
 
 Problem: a user is somewhere in the region of interest of Table I. The base station estimates the
-position from the signals that a codebook yields, then steers its beam there. How large are (a) the
-mean squared error of the position and (b) the capacity loss due to the error? The codebooks are
-`optimised` (for the average CRLB, as in the paper), `ambiguity`, and the paper's benchmarks
-`directional` and `random`. The estimators are `neural`, the paper's network with one hidden layer,
-retrained in every trial, and `bayes`, the posterior mean. The paper claims that, with its
-network, `optimised` has
+position from the signals that a codebook yields, then steers the beam of band 1 there. How large
+are (a) the mean squared error of the position and (b) the capacity loss due to the error? The
+paper claims that, with its network, the optimised codebook has
 
 (1) a mean squared error 42 % below directional's and 69 % below random's,
 (2) a median capacity loss 82 % below directional's and 86 % below random's,
 (3) an interquartile range of the loss 50 % below directional's and 64 % below random's.
 
-All codebooks are evaluated with the same positions, multipath and noise; (b) uses the best
-training of each.
+The paper leaves open what the network takes as input, how strong the multipath is, and which
+points the directional beams are focused on. Each claim is therefore tested for several readings.
+The rows are `algorithm-1`, the codebook of the paper's algorithm with its settings, optimised anew
+for each level of the multipath and each trial; `crlb` and `ambiguity`, the codebooks of
+config/codebook_crlb.yaml (L-BFGS, 3000 steps) and config/codebook_ambiguity.yaml, both optimised
+at 0 dB; `scan-width`, `scan-per-band` and `scan-grid`, three directional codebooks; and `random`,
+drawn anew in each trial. The estimators are the paper's network, with one hidden layer of 256
+units, retrained in every trial, and `bayes`, the posterior mean.
+
+All rows are evaluated with the same positions, multipath and noise. Panel (b) uses the training of
+each row with the smallest validation error. In rows whose codebook differs between trials, each
+trial serves an equal share of the positions.
 """
 
 import os
@@ -27,85 +34,86 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from parts.fig4_report import ESTIMATORS, Summary, picture, tables
+from parts import fig4_grid, fig4_report
+from parts.fig4_results import NEURAL, ROWS, Condition, Results, codebook_of
 
-from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
-from rhs_isac_ros.experiments import (
-    Job,
-    parse_options,
-    run_command,
-    run_jobs,
-)
-from rhs_isac_ros.link import CapacityReport, capacity, choose_beam
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.codebook import Codebook, directional_codebook, optimize
+from rhs_isac_ros.codebook.optimize import INTERRUPTED
+from rhs_isac_ros.experiments import Job, parse_options, run_command, run_jobs
+from rhs_isac_ros.link import capacity, steer
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arguments import integer
-from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import optional_import
-from rhs_isac_ros.positioning import NeuralEstimator, make_estimator
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.network import INPUTS
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.training import train
 
 CONFIG = Path(__file__).parents[2] / 'config'
-TRIALS, QUICK_TRIALS = 50, 3
-PAIRS, QUICK_PAIRS = 100_000, 20_000
-POSITIONS, QUICK_POSITIONS = 1000, 500
+TRIALS, QUICK_TRIALS = 50, 2
+# Random codebooks are drawn at least this often.
+MIN_DRAWS = 5
+PAIRS, QUICK_PAIRS = 100_000, 30_000
+POSITIONS = 10_000
+QUICK_LOSSES = 500
+# N_sam of Table I.
+SAMPLES = 1200
+LEVELS_DB, GRID_LEVELS_DB = (0.0, -30.0), (0.0, -10.0, -20.0, -25.0, -30.0, -40.0)
+QUICK_ROWS = ('algorithm-1', 'scan-width', 'scan-per-band', 'scan-grid', 'random')
+QUICK_CONDITIONS = (Condition(NEURAL, 'parts', 0.0), Condition(NEURAL, 'magnitudes', -30.0),
+                    Condition('bayes', '', 0.0), Condition('bayes', '', -30.0))
 # Positions per job of (b), and per call of an estimator.
-BLOCK = 50
+BLOCK, BATCH = 250, 50
 # Seed of the test pairs, which are the same for all; trainings use other seeds.
 TEST_SEED = 1 << 20
 
 
-def codebooks(scenario: Scenario) -> dict[str, Codebook]:
-    """Return the codebooks to compare, by name."""
-    return {
-        'optimised': Codebook.load(CONFIG / 'codebook_crlb.yaml'),
-        'ambiguity': Codebook.load(CONFIG / 'codebook_ambiguity.yaml'),
-        'directional': directional_codebook(scenario),
-        'random': random_codebook(scenario, streams.generator(0, streams.START))}
+def optimise(scenario: Mapping[str, Any], samples: int, seed: int) -> dict:
+    """Run Algorithm 1 with the settings of Table I and return the codebook's parameters."""
+    result = optimize(Scenario(**scenario), method='alternating', sampling='monte_carlo',
+                      n_positions=samples, seed=seed)
+    if result.reason == INTERRUPTED:
+        raise KeyboardInterrupt
+    return as_json(result.codebook)
 
 
-def locate(estimator: str, codebook: Mapping[str, Any], n: int, pairs: int, seed: int) -> dict:
-    """Locate the test positions with an estimator, after training it if necessary."""
-    scenario, loaded = Scenario(), Codebook.from_parameters(codebook)
-    if estimator == 'neural':
-        locator = NeuralEstimator(scenario, loaded, train(scenario, loaded, pairs, seed))
+def locate(estimator: str, inputs: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any],
+           pairs: int, seed: int, n: int, first: int, step: int) -> dict:
+    """Locate every `step`-th of the test positions, after training the network if necessary.
+
+    Signals that give no fix are located at the centre of the region.
+    """
+    world, book = Scenario(**scenario), Codebook.from_parameters(codebook)
+    _, received = simulate_pairs(world, book, n, TEST_SEED)
+    received, about = received[first::step], {}
+    if estimator == NEURAL:
+        network = train(world, book, pairs, seed, inputs=inputs)
+        means, about = network.positions(received), network.about
     else:
-        locator = make_estimator(estimator, scenario, loaded)
-    positions, received = simulate_pairs(scenario, loaded, n, TEST_SEED)
-    estimates = [locator.estimate(received[k:k + BLOCK]) for k in range(0, n, BLOCK)]
-    means = np.concatenate([estimate.mean for estimate in estimates])
-    covariances = np.concatenate([estimate.covariance for estimate in estimates])
-    errors = np.sum((means - positions)**2, axis=1)
-    return {'mse_m2': float(errors.mean()), 'means': means.tolist(),
-            'covariances': covariances.tolist()}
+        locator = make_estimator(estimator, world, book)
+        means = np.concatenate([locator.estimate(received[k:k + BATCH]).mean
+                                for k in range(0, len(received), BATCH)])
+    lost = ~np.isfinite(means).all(axis=1)
+    means[lost] = world.roi_center_m
+    return {'means': means.round(5).tolist(), 'without_fix': int(lost.sum()),
+            'validation_mse_m2': about.get('validation_mse_m2', 0.0)}
 
 
-def capacity_losses(first: int, estimates: Mapping[str, Mapping[str, Any]]) -> dict:
-    """Return the capacity losses [bit/s, per cent] of a block of test positions by estimate."""
-    scenario = Scenario()
-    n = len(next(iter(estimates.values()))['means'])
+def capacity_losses(scenario: Mapping[str, Any], first: int,
+                    estimates: Mapping[str, Sequence[Sequence[float]]]) -> dict:
+    """Return the capacity losses of band 1 [bit/s] of a block of positions, by row."""
+    world = Scenario(**scenario)
+    n = len(next(iter(estimates.values())))
     # The positions do not depend on the codebook.
-    truth, _ = simulate_pairs(scenario, directional_codebook(scenario), n, TEST_SEED, first)
-    perfect_bps = [choose_beam(scenario, position).expected_bps for position in truth]
-    losses: dict[str, list] = {}
-    for name, estimate in estimates.items():
-        losses[name] = []
-        for position, best_bps, mean, covariance in zip(
-                truth, perfect_bps, estimate['means'], estimate['covariances'], strict=True):
-            beam = choose_beam(scenario, np.array(mean), np.array(covariance)).beam
-            report = CapacityReport(
-                float(capacity(scenario, beam, position[None])[0]), best_bps)
-            losses[name].append([report.loss_bps, report.loss_percent])
-    return losses
+    truth, _ = simulate_pairs(world, directional_codebook(world), n, TEST_SEED, first)
 
+    def capacities(means: np.ndarray) -> np.ndarray:
+        return np.array([capacity(world, steer(world, mean, 0), position[None])[0]
+                         for mean, position in zip(means, truth, strict=True)])
 
-def location_jobs(books: Mapping[str, Codebook], trials: int, pairs: int, n: int) -> list[Job]:
-    """List a job for every training, and one for every codebook with `bayes`."""
-    return [Job(f'{estimator}-{name}-{seed}',
-                {'estimator': estimator, 'codebook': as_json(book), 'n': n, 'seed': seed,
-                 'pairs': pairs if estimator == 'neural' else 0})
-            for seed in range(trials) for name, book in books.items()
-            for estimator in ESTIMATORS if estimator == 'neural' or seed == 0]
+    perfect = capacities(truth)
+    return {name: (perfect - capacities(np.array(means))).tolist()
+            for name, means in estimates.items()}
 
 
 def as_json(codebook: Codebook) -> dict[str, Any]:
@@ -113,70 +121,122 @@ def as_json(codebook: Codebook) -> dict[str, Any]:
     return {name: np.asarray(value).tolist() for name, value in codebook.to_parameters().items()}
 
 
-def loss_jobs(best: Mapping[str, dict], n: int) -> list[Job]:
-    """List a job for every block of positions."""
-    return [Job(f'loss-{first}',
-                {'first': first, 'estimates': {
-                    name: {key: result[key][first:first + BLOCK]
-                           for key in ('means', 'covariances')}
-                    for name, result in best.items()}})
-            for first in range(0, n, BLOCK)]
+class Experiment:
+    """The jobs of all conditions; those that have results are not repeated."""
 
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._options = options
+        self._trials = {row: max(options.trials, MIN_DRAWS) if row == 'random' else options.trials
+                        for row in options.rows}
 
-def measure(options: argparse.Namespace) -> Summary:
-    """Run the jobs that have no results yet and summarise all."""
-    books = codebooks(Scenario())
-    jobs = location_jobs(books, options.trials, options.pairs, options.positions)
-    results = dict(zip([job.name for job in jobs], run_jobs(
-        locate, jobs, options.output / 'jobs', options.jobs, options.dask), strict=True))
-    trials = {(estimator, name): [results[f'{estimator}-{name}-{seed}']
-                                  for seed in range(options.trials)
-                                  if f'{estimator}-{name}-{seed}' in results]
-              for estimator in ESTIMATORS for name in books}
-    best = {f'{estimator} {name}': min(entries, key=lambda entry: entry['mse_m2'])
-            for (estimator, name), entries in trials.items()}
-    # A stored block is reused only if the best estimates are still the same.
-    blocks = run_jobs(
-        capacity_losses, loss_jobs(best, options.positions), options.output / 'jobs',
-        options.jobs, options.dask)
-    truth, _ = simulate_pairs(
-        Scenario(), books['directional'], options.positions, TEST_SEED)
-    losses = {}
-    for name, entry in best.items():
-        errors = np.sum((np.array(entry['means']) - truth)**2, axis=1)
-        rows = np.concatenate([block[name] for block in blocks])
-        losses[name] = np.column_stack([rows, errors])
-    return Summary(
-        list(books), {key: np.array([entry['mse_m2'] for entry in entries])
-                      for key, entries in trials.items()}, losses)
+    def _run(self, function: Any, jobs: Sequence[Job]) -> dict[str, dict]:
+        options = self._options
+        results = run_jobs(
+            function, jobs, options.output / 'jobs', options.jobs, options.dask)
+        return dict(zip([job.name for job in jobs], results, strict=True))
+
+    def codebooks(self, levels: Sequence[float]) -> dict[tuple[str, float, int], dict]:
+        """Return the codebook of each row, level and trial, after optimising if necessary."""
+        worlds = {level: Scenario(multipath_to_los_db=level) for level in levels}
+        keys = [(row, level, trial) for level in levels for row, trials in self._trials.items()
+                for trial in range(trials)]
+        jobs = {key: Job(f'algorithm-1{key[1]:+g}dB-{key[2]}', {
+                    'scenario': worlds[key[1]].changes(), 'samples': SAMPLES, 'seed': key[2]})
+                for key in keys if key[0] == 'algorithm-1'}
+        optimised = self._run(optimise, list(jobs.values()))
+        return {key: optimised[jobs[key].name] if key in jobs else
+                as_json(codebook_of(key[0], worlds[key[1]], key[2], CONFIG)) for key in keys}
+
+    def results(self, conditions: Sequence[Condition]) -> Results:
+        """Return the estimates in all conditions."""
+        options, jobs, places = self._options, [], []
+        books = self.codebooks(sorted({condition.level_db for condition in conditions}))
+        for condition in conditions:
+            for row, trials in self._trials.items():
+                served = min(condition.trials(row, trials), options.positions)
+                shared = condition.estimator != NEURAL
+                for trial in range(served):
+                    first, step = (trial, served) if shared else (0, 1)
+                    jobs.append(Job(f'{condition.slug}-{row}-{trial}', {
+                        'estimator': condition.estimator, 'inputs': condition.inputs,
+                        'scenario': Scenario(multipath_to_los_db=condition.level_db).changes(),
+                        'codebook': books[row, condition.level_db, trial],
+                        'pairs': options.pairs if condition.estimator == NEURAL else 0,
+                        'seed': trial, 'n': options.positions, 'first': first, 'step': step}))
+                    places.append((condition, row, first, step))
+        done = self._run(locate, jobs)
+        truth, _ = simulate_pairs(
+            Scenario(), directional_codebook(Scenario()), options.positions, TEST_SEED)
+        results = Results(truth)
+        for job, (condition, row, first, step) in zip(jobs, places, strict=True):
+            results.add(condition, row, done[job.name], first, step)
+        return results
+
+    def add_losses(self, results: Results) -> None:
+        """Compute the capacity losses of the first positions, unless there are to be none."""
+        n = min(self._options.losses, self._options.positions)
+        for condition in results.conditions if n else ():
+            estimates = {row: results.best_estimates(condition, row) for row in self._trials}
+            jobs = [Job(f'loss-{condition.slug}-{first}', {
+                'scenario': Scenario(multipath_to_los_db=condition.level_db).changes(),
+                'first': first, 'estimates': {
+                    row: means[first:min(first + BLOCK, n)].tolist()
+                    for row, means in estimates.items()}}) for first in range(0, n, BLOCK)]
+            # A stored block is reused only if the estimates are still the same.
+            blocks = list(self._run(capacity_losses, jobs).values())
+            for row in self._trials:
+                results.add_losses(condition, row, np.concatenate([b[row] for b in blocks]))
 
 
 def reproduce(options: argparse.Namespace) -> None:
     """Run the experiment, print the report and write the files."""
-    summary = measure(options)
-    report = '\n\n'.join([
-        f'{options.trials} trainings with {options.pairs} pairs each; {options.positions} test '
-        'positions. Mean ± standard deviation over trainings; `bayes` needs no training.',
-        summary.table(),
-        'Reduction relative to each benchmark with the same estimator, with 95 % intervals:',
-        summary.claims()])
-    for name, text in tables(summary).items():
-        write_whole(options.output / name, text)
-    write_whole(options.output / 'fig4.png', picture(summary))
-    write_whole(options.output / 'fig4.md', f'# Fig. 4\n\n![Fig. 4](fig4.png)\n\n{report}\n')
-    print(f'{report}\n\nwritten: {options.output}/fig4.png, fig4.md, fig4a.csv and fig4b.csv')
+    experiment = Experiment(options)
+    results = experiment.results(options.conditions)
+    if options.grid:
+        fig4_grid.write(results, options)
+        return
+    experiment.add_losses(results)
+    fig4_report.write(results, options)
 
 
-def add_sizes(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment."""
-    parser.add_argument('--pairs', type=integer(20, 10**7), metavar='N',
-                        help=f'pairs per training (default: {PAIRS}, quick {QUICK_PAIRS})')
-    parser.add_argument('--positions', type=integer(1, 10**6), metavar='N',
-                        help=f'test positions (default: {POSITIONS}, quick {QUICK_POSITIONS})')
-    parser.add_argument('--ros', action='store_true',
-                        help='measure (b) in a running network with the default codebook instead, '
-                             'and compare it with the library; --positions is the number of '
-                             'cycles')
+    add = parser.add_argument
+    add('--pairs', type=integer(20, 10**7), metavar='N',
+        help=f'pairs per training (default: {PAIRS}, quick {QUICK_PAIRS})')
+    add('--positions', type=integer(1, 10**6), default=POSITIONS, metavar='N',
+        help='test positions (default: %(default)s); fewer give no verdicts')
+    add('--losses', type=integer(0, 10**6), metavar='N',
+        help=f'positions of panel (b) (default: all, quick {QUICK_LOSSES}; 0 for none)')
+    add('--rows', nargs='+', choices=ROWS, help='codebooks (default: all)')
+    add('--inputs', nargs='*', choices=sorted(INPUTS), default=sorted(INPUTS),
+        help='inputs of the network; none for bayes alone')
+    add('--multipath', nargs='+', type=float, metavar='DB',
+        help='levels of the multipath relative to the direct path [dB] (default: '
+             f'{", ".join(f"{level:g}" for level in LEVELS_DB)}; with --grid '
+             f'{", ".join(f"{level:g}" for level in GRID_LEVELS_DB)})')
+    add('--no-bayes', action='store_true', help='leave out the posterior mean')
+    add('--grid', action='store_true',
+        help='search, after the fact, for the reading of the paper that matches its errors best')
+    add('--ros', action='store_true',
+        help='measure (b) in a running network with the default codebook instead, and compare it '
+             'with the library; --positions is the number of cycles')
+
+
+def complete(options: argparse.Namespace) -> None:
+    """Set what depends on other options: sizes, rows and conditions."""
+    options.pairs = options.pairs or (QUICK_PAIRS if options.quick else PAIRS)
+    options.rows = options.rows or (QUICK_ROWS if options.quick else ROWS)
+    if options.losses is None:
+        options.losses = QUICK_LOSSES if options.quick else options.positions
+    levels = options.multipath or (GRID_LEVELS_DB if options.grid else LEVELS_DB)
+    if options.quick and not options.multipath and not options.grid:
+        options.conditions = QUICK_CONDITIONS
+        return
+    neural = [Condition(NEURAL, inputs, level) for inputs in options.inputs for level in levels]
+    bayes = [] if options.no_bayes or options.grid else [
+        Condition('bayes', '', level) for level in levels]
+    options.conditions = (*neural, *bayes)
 
 
 def over_ros(options: argparse.Namespace) -> None:
@@ -184,17 +244,17 @@ def over_ros(options: argparse.Namespace) -> None:
     with optional_import('measuring over ROS'):
         from parts import fig4_ros
     options.output.mkdir(parents=True, exist_ok=True)
-    cycles = options.positions or (fig4_ros.QUICK_CYCLES if options.quick else fig4_ros.CYCLES)
+    cycles = (options.positions if options.positions != POSITIONS else
+              fig4_ros.QUICK_CYCLES if options.quick else fig4_ros.CYCLES)
     fig4_ros.compare(CONFIG / 'codebook.yaml', cycles, options.output)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse_options(__doc__, 'fig4', TRIALS, QUICK_TRIALS, arguments, add_sizes)
+    options = parse_options(__doc__, 'fig4', TRIALS, QUICK_TRIALS, arguments, add_options)
     if options.ros:
         return run_command(lambda: over_ros(options))
-    options.pairs = options.pairs or (QUICK_PAIRS if options.quick else PAIRS)
-    options.positions = options.positions or (QUICK_POSITIONS if options.quick else POSITIONS)
+    complete(options)
     return run_command(lambda: reproduce(options))
 
 

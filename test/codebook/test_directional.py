@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import directional_codebook
-from rhs_isac_ros.codebook.directional import focal_points
+from rhs_isac_ros.codebook.directional import SCANS, width_points
 from rhs_isac_ros.model import Scenario
 
 SCENARIOS = [
@@ -26,6 +26,30 @@ def test_constraints_hold_and_sub_bands_share_the_power_evenly(scenario):
     assert codebook.provenance == 'directional'
 
 
+@pytest.mark.parametrize('scan', ['width_per_band', 'grid'])
+@pytest.mark.parametrize('scenario', SCENARIOS)
+def test_the_other_scans_have_the_same_points_in_each_band(scenario, scan):
+    points = SCANS[scan](scenario)
+    low, high = scenario.roi_bounds_m
+    assert points.shape == (scenario.n_frames, scenario.n_bands, 3)
+    assert ((points > low) & (points < high)).all()
+    assert (points == points[:, :1]).all()
+    assert len(np.unique(points[:, 0], axis=0)) == scenario.n_frames
+    np.testing.assert_allclose(points[..., 0], scenario.roi_center_m[0])
+    np.testing.assert_allclose(points[..., 1].mean(), scenario.roi_center_m[1], atol=1e-12)
+    directional_codebook(scenario, scan=scan).check(scenario)
+
+
+def test_the_grid_of_table_1_has_two_points_across_width_and_height():
+    points = SCANS['grid'](Scenario())[:, 0, 1:]
+    np.testing.assert_allclose(points, [[-2.5, -0.5], [2.5, -0.5], [-2.5, 0.5], [2.5, 0.5]])
+
+
+def test_an_unknown_scan_is_an_error():
+    with pytest.raises(ValueError, match="^scan: 'depth', expected one of "):
+        directional_codebook(Scenario(), scan='depth')
+
+
 def test_the_codebook_is_deterministic():
     one, other = (directional_codebook(Scenario(), np.random.default_rng(n)) for n in (1, 2))
     assert one.id == other.id == directional_codebook(Scenario()).id
@@ -33,7 +57,7 @@ def test_the_codebook_is_deterministic():
 
 @pytest.mark.parametrize('scenario', SCENARIOS)
 def test_focal_points_scan_the_width_of_the_region(scenario):
-    points = focal_points(scenario)
+    points = width_points(scenario)
     low, high = scenario.roi_bounds_m
     assert points.shape == (scenario.n_frames, scenario.n_bands, 3)
     assert ((points > low) & (points < high)).all()
@@ -55,7 +79,7 @@ def test_each_beam_is_nearly_strongest_at_its_focal_point(scenario, plain):
     """Compares the received power, without path loss, at all focal points."""
     codebook = directional_codebook(scenario)
     p = plain(scenario, codebook.analog, codebook.digital)
-    points = focal_points(scenario).reshape(-1, 3)
+    points = width_points(scenario).reshape(-1, 3)
     for band in range(scenario.n_bands):
         mean = p.mean(points, band).reshape(len(points), scenario.n_subbands, -1)
         power = np.sum(np.abs(mean)**2, axis=1) * np.sum(points**2, axis=1, keepdims=True)
@@ -68,7 +92,7 @@ def test_each_beam_is_nearly_strongest_at_its_focal_point(scenario, plain):
 @pytest.mark.parametrize('scenario', SCENARIOS[:2])
 def test_no_other_weights_of_a_sub_band_receive_more_power(scenario, plain):
     codebook, rng = directional_codebook(scenario), np.random.default_rng(0)
-    points = focal_points(scenario)
+    points = width_points(scenario)
     for band, frame, j in [(0, 0, 0), (1, 2, 1)]:
         los = np.array([plain(scenario).los(points[frame, band], band, j, m)
                         for m in range(scenario.n_elements)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.experiments.resampling import Statistics, interval, reduction
 
 
 def mean(values):
@@ -46,3 +46,40 @@ def test_empty_or_mismatched_samples_are_errors(samples, baseline, paired):
 
 def test_the_reduction_from_zero_is_nan():
     assert np.isnan(reduction([0.0, 0.0], [0.0, 0.0], mean)).all()
+
+
+def test_statistics_without_resampling_are_those_of_the_results():
+    results = np.random.default_rng(0).exponential(size=(3, 41))
+    values = Statistics(results, 0, (0.25, 0.5)).values
+    assert values['mean'][0] == pytest.approx(results.mean(), rel=1e-6)
+    assert values['0.5'][0] == np.median(results)
+    assert values['0.25'][0] == np.quantile(results, 0.25, method='inverted_cdf')
+
+
+def test_statistics_ignore_cases_that_a_member_did_not_serve():
+    results = np.tile([[1.0, np.nan, 3.0, np.nan], [np.nan, 5.0, np.nan, 6.0]], 10)
+    values = Statistics(results, 0, (0.5,)).values
+    assert values['mean'][0] == pytest.approx(15 / 4)
+    assert values['0.5'][0] == 3
+
+
+def test_comparisons_of_the_same_cases_are_paired():
+    results = np.random.default_rng(0).exponential(size=(1, 200))
+    one, other = (Statistics(factor * results, seed).values['mean']
+                  for seed, factor in enumerate((1.0, 2.0)))
+    np.testing.assert_allclose(one / other, 0.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize('members', [2, 5])
+def test_the_variance_of_the_replicates_includes_that_of_the_members(members):
+    rng, inside, estimates, spreads = np.random.default_rng(0), 0, [], []
+    for trial in range(60):
+        results = (rng.normal(size=(members, 1)) + rng.normal(size=(1, 50))
+                   + np.zeros((members, 50)))
+        value, low, high = interval(Statistics(results, trial).values['mean'])
+        inside += low <= 0 <= high
+        estimates.append(value)
+        spreads.append(Statistics(results, trial).values['mean'][1:].var())
+    # The expectation of the variance is 1 / members + 1 / 50.
+    assert np.mean(spreads) == pytest.approx(1 / members + 1 / 50, rel=0.35)
+    assert inside >= (60 * 0.6 if members == 2 else 60 * 0.75)

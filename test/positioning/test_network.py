@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import json
 import os
 
 import numpy as np
@@ -34,6 +35,19 @@ def test_positions_match_the_formula(network):
     np.testing.assert_allclose(network.positions(received), expected, rtol=1e-12)
 
 
+def test_positions_from_magnitudes_do_not_depend_on_phases(network):
+    rng = np.random.default_rng(1)
+    received = rng.normal(size=(6, 2, 4, 2)) @ [1, 1j]
+    by_magnitude = dataclasses.replace(network, inputs='magnitudes')
+    rotated = received * np.exp(1j * rng.uniform(0, 6, received.shape))
+    np.testing.assert_allclose(
+        by_magnitude.positions(rotated), by_magnitude.positions(received), rtol=1e-12)
+    as_parts = np.abs(received.reshape(6, 2, 4))
+    np.testing.assert_allclose(
+        by_magnitude.positions(received),
+        network.positions(as_parts[:, 0] + 1j * as_parts[:, 1]), rtol=1e-12)
+
+
 def test_a_saved_model_can_be_loaded(network, tmp_path):
     path = tmp_path / 'model.npz'
     network.save(path)
@@ -41,6 +55,21 @@ def test_a_saved_model_can_be_loaded(network, tmp_path):
     for field in dataclasses.fields(Network):
         np.testing.assert_array_equal(getattr(loaded, field.name), getattr(network, field.name))
     assert [p.name for p in tmp_path.iterdir()] == ['model.npz']
+
+
+def test_a_file_contains_the_inputs_of_the_network(network, tmp_path):
+    dataclasses.replace(network, inputs='magnitudes').save(tmp_path / 'model.npz')
+    assert Network.load(tmp_path / 'model.npz').inputs == 'magnitudes'
+
+
+def test_a_file_without_inputs_takes_real_and_imaginary_parts(network, tmp_path):
+    network.save(tmp_path / 'new.npz')
+    with np.load(tmp_path / 'new.npz') as file:
+        arrays = dict(file)
+    about = json.loads(str(arrays['about']))
+    del about['inputs']
+    np.savez(tmp_path / 'old.npz', **arrays | {'about': json.dumps(about)})
+    assert Network.load(tmp_path / 'old.npz').inputs == 'parts'
 
 
 def test_the_keys_of_the_file_do_not_change(network, tmp_path):
@@ -113,7 +142,8 @@ def test_a_flipped_bit_is_an_error_or_has_no_effect(network, tmp_path, share):
     ('b_in', np.zeros(4), r'b_in: shape \(4,\), expected \(5,\)'),
     ('w_in', np.zeros(8), 'expected'),
     ('w_out', np.zeros((5, 2)), r'w_out: shape \(5, 2\), expected \(5, 3\)'),
-    ('center', np.array([0, np.nan, 0]), 'center: not finite')])
+    ('center', np.array([0, np.nan, 0]), 'center: not finite'),
+    ('inputs', 'phases', "inputs: 'phases', expected one of")])
 def test_inconsistent_arrays_are_errors(network, field, value, message):
     with pytest.raises(ModelError, match=message):
         dataclasses.replace(network, **{field: value})

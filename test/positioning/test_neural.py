@@ -87,6 +87,15 @@ def test_the_covariance_matches_the_validation_residuals(scenario, codebook, tra
     assert (estimate.covariance == estimate.covariance[0]).all()
 
 
+def test_a_network_of_magnitudes_locates_signals_of_any_phase(scenario, codebook):
+    network = train(scenario, codebook, 600, 4, 8, 2, inputs='magnitudes')
+    assert len(network.w_in) == scenario.n_bands * scenario.n_subbands * scenario.n_frames
+    received = simulate_pairs(scenario, codebook, 5, 9)[1]
+    estimator = NeuralEstimator(scenario, codebook, network)
+    np.testing.assert_allclose(
+        estimator.estimate(-received).mean, estimator.estimate(received).mean, rtol=1e-12)
+
+
 def test_networks_are_reproducible_by_their_seed(scenario, codebook):
     first, same, other = (train(scenario, codebook, 600, seed, 8, 2) for seed in (4, 4, 5))
     np.testing.assert_array_equal(first.w_in, same.w_in)
@@ -155,8 +164,9 @@ def test_a_model_of_another_purpose_is_rejected(
 
 @pytest.mark.parametrize(('options', 'message'), [
     ({'n_pairs': 19}, 'n_pairs: 19, expected at least 20'),
-    ({'n_hidden': 0}, 'n_hidden: 0'), ({'max_epochs': 0}, 'max_epochs: 0')])
-def test_numbers_below_the_minimum_are_errors(scenario, codebook, options, message):
+    ({'n_hidden': 0}, 'n_hidden: 0'), ({'max_epochs': 0}, 'max_epochs: 0'),
+    ({'inputs': 'phases'}, "inputs: 'phases', expected one of")])
+def test_invalid_options_are_errors(scenario, codebook, options, message):
     with pytest.raises(ValueError, match=message):
         train(scenario, codebook, **options)
 
