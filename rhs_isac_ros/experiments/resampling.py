@@ -89,7 +89,10 @@ class Statistics:
         present = np.isfinite(results)
         filled = np.where(present, results, 0.0).astype(np.float32)
         sums, counts = cases @ filled.T, cases @ present.T.astype(np.float32)
-        self.values = {'mean': np.sum(members * sums, axis=1) / np.sum(members * counts, axis=1)}
+        # A replicate without any result is NaN.
+        with np.errstate(invalid='ignore'):
+            self.values = {
+                'mean': np.sum(members * sums, axis=1) / np.sum(members * counts, axis=1)}
         if quantiles:
             self._add_quantiles(results, members.astype(np.float32), cases, quantiles)
 
@@ -101,13 +104,19 @@ class Statistics:
         ordered, found = results[member, case], np.empty((len(quantiles), len(cases)))
         for index, (by_member, by_case) in enumerate(zip(members, cases, strict=True)):
             total = np.cumsum(by_member[member] * by_case[case], dtype=float)
-            found[:, index] = ordered[np.searchsorted(total, np.array(quantiles) * total[-1])]
+            # A replicate without any result is NaN.
+            found[:, index] = (
+                ordered[np.searchsorted(total, np.array(quantiles) * total[-1])]
+                if total[-1] else np.nan)
         self.values |= dict(zip(map(str, quantiles), found, strict=True))
 
 
 def interval(replicates: np.ndarray) -> tuple[float, float, float]:
-    """Return the first value, and the 95 % interval of the replicates that follow it."""
-    low, high = np.percentile(replicates[1:], _INTERVAL)
+    """Return the first value, and the 95 % interval of the replicates that follow it.
+
+    Replicates that are NaN do not count.
+    """
+    low, high = np.nanpercentile(replicates[1:], _INTERVAL)
     return float(replicates[0]), float(low), float(high)
 
 

@@ -1,14 +1,21 @@
 """Fig. 4: the command with few pairs and positions, and the report of synthetic results."""
 
+import argparse
 import csv
+import functools
 import os
 
 import numpy as np
 import pytest
 
+from rhs_isac_ros.model import Scenario
+
 pytest.importorskip('sklearn')
 pytest.importorskip('joblib')
 pytest.importorskip('matplotlib')
+# Mean squared errors of the synthetic results [m^2]: 50 % below scan-width, 70 % below random.
+LEVELS = {'algorithm-1': 3.0, 'crlb': 3.0, 'ambiguity': 1.5, 'scan-width': 6.0,
+          'scan-per-band': 5.18, 'scan-grid': 4.0, 'random': 10.0}
 
 
 @pytest.fixture(scope='module')
@@ -17,77 +24,175 @@ def fig4(load_figure):
 
 
 @pytest.fixture(scope='module')
-def report(fig4):
-    from parts import fig4_report
-    return fig4_report
+def claims(fig4):
+    from parts import fig4_claims
+    return fig4_claims
 
 
-@pytest.fixture
-def summary(report):
-    """Synthetic results: those of `optimised` are half of directional's, a third of random's."""
-    level = {'optimised': 6.0, 'ambiguity': 3.0, 'directional': 12.0, 'random': 18.0}
-    shape = np.random.default_rng(0).exponential(size=(400, 3))
-    return report.Summary(
-        list(level),
-        {(estimator, name): value * np.array([1.0, 1.1] if estimator == 'neural' else [0.5])
-         for estimator in report.ESTIMATORS for name, value in level.items()},
-        {f'{estimator} {name}': value * shape
-         for estimator in report.ESTIMATORS for name, value in level.items()})
+@pytest.fixture(scope='module')
+def results(fig4):
+    """Synthetic results of a network: errors and losses of every row at 10 000 positions."""
+    return synthetic(fig4, 10_000, 3)
+
+
+def synthetic(fig4, n, trials, losses=60):
+    rng = np.random.default_rng(0)
+    truth, condition = rng.uniform(size=(n, 3)), fig4.Condition('neural', 'parts', 0.0)
+    errors, results = rng.normal(size=(n, 3)) / np.sqrt(3), fig4.Results(truth)
+    for row, level in LEVELS.items():
+        for trial in range(trials):
+            means = truth + np.sqrt(level * (1 + 0.002 * trial)) * errors
+            results.add(condition, row, {
+                'means': means, 'validation_mse_m2': abs(trial - 1.0), 'without_fix': 1}, 0, 1)
+        results.add_losses(condition, row, level * np.abs(errors[:losses, 0]))
+    return results
 
 
 def cells(row):
     return [cell.strip() for cell in row.strip('|').split('|')]
 
 
-def test_the_table_of_claims_has_the_measured_reductions(summary):
-    rows = [cells(row) for row in summary.claims().splitlines()[2:]]
-    assert [row[1] for row in rows] == ['42 %', '69 %', '82 %', '86 %', '50 %', '64 %']
-    for row, less in zip(rows, [50, 67, 50, 67, 50, 67], strict=True):
-        assert row[2:4] == [f'{less} % [{less}, {less}]'] * 2
-    assert [row[4].split()[0] for row in rows] == ['75', '83'] * 3
+def test_a_verdict_follows_from_the_interval_alone(claims):
+    for interval, expected in (((43, 50), 'holds'), ((42, 50), 'holds'), ((40, 44), 'undecided'),
+                               ((30, 41), 'does not hold'), ((-9, -2), 'does not hold')):
+        assert claims.verdict(42, *interval, 10_000, 2) == expected
 
 
-def test_the_table_has_a_row_for_each_pair(summary):
-    rows = [cells(row) for row in summary.table().splitlines()[2:]]
-    assert len(rows) == 8
-    assert rows[0][:3] == ['neural, optimised', '6.300 ± 0.424', '6.000']
-    assert rows[4][:3] == ['bayes, optimised', '3.000', '3.000']
+def test_there_is_no_verdict_on_few_positions_or_a_single_training(claims):
+    assert claims.verdict(42, 43, 50, 9_999, 2) == 'too few positions'
+    assert claims.verdict(42, 43, 50, 10_000, 1) == 'too few trainings'
 
 
-def test_the_data_are_available_as_csv(report, summary):
-    tables = report.tables(summary)
-    rows = list(csv.DictReader(tables['fig4b.csv'].splitlines()))
-    assert len(rows) == 8 * 400
+def test_the_claims_have_the_measured_reductions(results, claims):
+    found = {(f.quantity, f.own, f.benchmark): f for f in claims.findings(
+        results, results.conditions[0])}
+    for benchmark, percent, expected in (
+            ('scan-width', 50, 'holds'), ('scan-per-band', 42, 'undecided'),
+            ('scan-grid', 25, 'does not hold'), ('random', 70, 'holds')):
+        error = found['error', 'algorithm-1', benchmark]
+        assert error.percent == pytest.approx(percent, abs=0.3)
+        assert error.low < error.percent < error.high
+        assert error.verdict == expected
+        assert found['median loss', 'algorithm-1', benchmark].verdict == 'too few positions'
+    assert found['median loss', 'ambiguity', 'random'].percent == pytest.approx(85, abs=1)
+    assert len(found) == 3 * 3 * 4
+
+
+def test_the_summary_lists_the_conditions_of_each_verdict(results, claims):
+    header, _, first, second, *_ = map(cells, claims.summary(results).splitlines())
+    assert header == ['claim about algorithm-1', 'holds', 'undecided', 'does not hold',
+                      'no verdict']
+    assert first == [
+        'mean squared error 42 % below directional', 'network, re/im, 0 dB (scan-width)',
+        'network, re/im, 0 dB (scan-per-band)', 'network, re/im, 0 dB (scan-grid)', '–']
+    assert second[1] == 'network, re/im, 0 dB'
+
+
+def test_the_best_training_is_that_of_the_smallest_validation_error(results):
+    condition = results.conditions[0]
+    np.testing.assert_array_equal(
+        results.best_estimates(condition, 'crlb'), results.estimates[condition, 'crlb'][1])
+    # The codebooks of this row differ, so that all trials serve positions.
+    best = results.best_estimates(condition, 'random')
+    for trial in range(3):
+        np.testing.assert_array_equal(
+            best[trial::3], results.estimates[condition, 'random'][trial, trial::3])
+
+
+def test_trials_may_share_the_positions(fig4):
+    truth, condition = np.zeros((25, 3)), fig4.Condition('bayes', '', 0.0)
+    results = fig4.Results(truth)
+    for trial, size in enumerate((13, 12)):
+        results.add(condition, 'random', {
+            'means': np.full((size, 3), trial + 1.0), 'validation_mse_m2': 0.0,
+            'without_fix': 1}, trial, 2)
+    best = results.best_estimates(condition, 'random')
+    assert best[:5, 0].tolist() == [1, 2, 1, 2, 1]
+    assert results.statistics(condition, 'random')['error'][0] == pytest.approx(
+        (13 * 3 + 12 * 12) / 25)
+    assert results.without_fix[condition, 'random'] == 2
+
+
+def test_the_report_has_tables_picture_and_data(fig4, results, tmp_path, capsys):
+    options = argparse.Namespace(trials=3, pairs=7, output=tmp_path)
+    fig4.fig4_report.write(results, options)
+    out = capsys.readouterr().out
+    assert '10000 test positions; 3 trainings with 7 pairs' in out
+    assert '| scan-grid     | 4.' in out or '| scan-grid ' in out
+    assert (tmp_path / 'fig4.png').read_bytes().startswith(b'\x89PNG')
+    rows = list(csv.DictReader((tmp_path / 'fig4b.csv').read_text().splitlines()))
+    assert len(rows) == len(LEVELS) * 60
     assert float(rows[0]['loss_bps']) == pytest.approx(
-        summary.losses['neural optimised'][0, 0], rel=1e-5)
-    assert len(tables['fig4a.csv'].splitlines()) == 1 + 4 * 3
+        results.losses[results.conditions[0], 'algorithm-1'][0, 0], rel=1e-5)
+    assert len((tmp_path / 'fig4a.csv').read_text().splitlines()) == 1 + len(LEVELS) * 3
 
 
-def test_the_picture_is_drawn(report, summary):
-    assert report.picture(summary).startswith(b'\x89PNG')
+def test_the_grid_ranks_readings_by_their_distance_from_the_paper(fig4, results):
+    ranked = fig4.fig4_grid.readings(results)
+    assert [(scan.own, scan.benchmark) for _, scan, _ in ranked[:2]] == [
+        ('algorithm-1', 'scan-per-band'), ('crlb', 'scan-per-band')]
+    assert len(ranked) == 9
+    distance, scan, random = ranked[0]
+    assert distance == pytest.approx(np.hypot(scan.percent - 42, random.percent - 69))
 
 
-def test_the_command_writes_all_files_and_repeats_no_job(fig4, tmp_path, capsys):
-    call = ['--trials', '1', '--pairs', '200', '--positions', '4', '--jobs', '1',
-            '--output', str(tmp_path)]
+def test_the_report_of_the_grid_is_a_match_after_the_fact(fig4, results, tmp_path, capsys):
+    options = argparse.Namespace(trials=3, pairs=7, output=tmp_path)
+    fig4.fig4_grid.write(results, options)
+    out = capsys.readouterr().out
+    assert '9 readings' in out and 'no evidence for the claims' in out
+    assert len([line for line in out.splitlines() if line.startswith('|')]) == 2 + 9
+    assert '| network, re/im, 0 dB |' in (tmp_path / 'fig4_grid.md').read_text(encoding='utf-8')
+
+
+@pytest.mark.parametrize(('arguments', 'conditions'), [
+    ([], ['magnitudes-+0dB', 'magnitudes--30dB', 'parts-+0dB', 'parts--30dB', 'bayes-+0dB',
+          'bayes--30dB']),
+    (['--inputs', '--multipath', '-20'], ['bayes--20dB']),
+    (['--no-bayes', '--multipath', '0', '--inputs', 'parts'], ['parts-+0dB']),
+    (['--quick'], ['parts-+0dB', 'magnitudes--30dB', 'bayes-+0dB', 'bayes--30dB']),
+    (['--grid', '--inputs', 'parts'], [f'parts-{level:+}dB' for level in (
+        0, -10, -20, -25, -30, -40)])])
+def test_options_select_the_conditions(fig4, monkeypatch, arguments, conditions):
+    seen = []
+    monkeypatch.setattr(fig4, 'reproduce', seen.append)
+    assert fig4.main(arguments) == 0
+    assert [condition.slug for condition in seen[0].conditions] == conditions
+
+
+def test_the_command_writes_all_files_and_repeats_no_job(fig4, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(fig4, 'optimize', functools.partial(fig4.optimize, max_steps=8))
+    monkeypatch.setattr(fig4, 'SAMPLES', 4)
+    monkeypatch.setattr(fig4, 'MIN_DRAWS', 2)
+    call = ['--trials', '1', '--pairs', '200', '--positions', '6', '--losses', '2', '--rows',
+            'algorithm-1', 'random', '--inputs', 'magnitudes', '--no-bayes', '--multipath', '-30',
+            '--jobs', '1', '--output', str(tmp_path)]
     assert fig4.main(call) == 0
     out = capsys.readouterr().out
-    assert 'neural, optimised' in out and 'bayes, ambiguity' in out
+    assert 'network, magnitudes, -30 dB' in out and 'too few positions' in out
     assert {'fig4.md', 'fig4.png', 'fig4a.csv', 'fig4b.csv'} <= set(os.listdir(tmp_path))
     jobs = {path.name: path.stat().st_mtime_ns for path in (tmp_path / 'jobs').iterdir()}
-    assert len(jobs) == 4 + 4 + 1
+    # An optimisation, three trials and a block of losses.
+    assert len(jobs) == 1 + 3 + 1
     assert fig4.main(call) == 0
     assert capsys.readouterr().out == out
     # No job was repeated.
     assert jobs == {path.name: path.stat().st_mtime_ns for path in (tmp_path / 'jobs').iterdir()}
 
 
+def test_trials_of_bayes_locate_their_share_of_the_positions(fig4):
+    world = Scenario(multipath_to_los_db=-30.0)
+    book = fig4.as_json(fig4.directional_codebook(world))
+    located = fig4.locate('bayes', '', world.changes(), book, 0, 0, 6, 1, 2)
+    truth, _ = fig4.simulate_pairs(world, fig4.directional_codebook(world), 6, fig4.TEST_SEED)
+    assert located['without_fix'] == 0
+    np.testing.assert_allclose(located['means'], truth[1::2], atol=0.2)
+
+
 def test_capacity_losses_depend_on_the_estimates(fig4):
-    truth, _ = fig4.simulate_pairs(
-        fig4.Scenario(), fig4.directional_codebook(fig4.Scenario()), 2, fig4.TEST_SEED, 3)
-    still = np.zeros((2, 3, 3)).tolist()
-    losses = fig4.capacity_losses(3, {
-        'right': {'means': truth.tolist(), 'covariances': still},
-        'wrong': {'means': (truth + [0, 2, 0]).tolist(), 'covariances': still}})
+    world = Scenario()
+    truth, _ = fig4.simulate_pairs(world, fig4.directional_codebook(world), 2, fig4.TEST_SEED, 3)
+    losses = fig4.capacity_losses({}, 3, {
+        'right': truth.tolist(), 'wrong': (truth + [0, 2, 0]).tolist()})
     assert np.allclose(losses['right'], 0)
     assert (np.array(losses['wrong']) > 0).all()

@@ -1,124 +1,99 @@
-"""The report of Fig. 4: table, comparison with the paper's claims, picture and CSV files."""
+"""The report of Fig. 4: tables, verdicts on the paper's claims, picture and CSV files."""
 
+import argparse
 import io
-from collections.abc import Mapping, Sequence
 
 import numpy as np
+from parts import fig4_claims
+from parts.fig4_results import Condition, Results
 
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.experiments.resampling import interval
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import optional_import
 
-ESTIMATORS = ('neural', 'bayes')
-# Reductions that the paper claims for `optimised`, by quantity and benchmark [%].
-CLAIMS = {'mean squared error': {'directional': 42, 'random': 69},
-          'median capacity loss': {'directional': 82, 'random': 86},
-          'interquartile range of the loss': {'directional': 50, 'random': 64}}
+
+def write(results: Results, options: argparse.Namespace) -> None:
+    """Print the report and write it with the picture and the data."""
+    report = '\n\n'.join([
+        f'{len(results.truth)} test positions; {options.trials} trainings with {options.pairs} '
+        'pairs each, and the random codebook drawn anew for each. Brackets contain 95 % '
+        'intervals over positions, trainings and drawn codebooks. A claim holds if the whole '
+        'interval is at least the claimed reduction, does not hold if the whole interval is below '
+        'it, and is undecided otherwise.',
+        '## Claims', fig4_claims.summary(results),
+        *(text for condition in results.conditions for text in (
+            f'## {condition}', table(results, condition),
+            'Reduction relative to each benchmark:',
+            fig4_claims.condition_table(results, condition)))])
+    for name, text in csv_files(results).items():
+        write_whole(options.output / name, text)
+    write_whole(options.output / 'fig4.png', picture(results))
+    write_whole(options.output / 'fig4.md', f'# Fig. 4\n\n![Fig. 4](fig4.png)\n\n{report}\n')
+    print(f'{report}\n\nwritten: {options.output}/fig4.png, fig4.md, fig4a.csv and fig4b.csv')
 
 
-class Summary:
-    """Results: the error of every training, and losses and errors at every position.
-
-    Parameters
-    ----------
-    names
-        Names of the codebooks.
-    mses
-        Mean squared errors of the trials by estimator and codebook [m^2].
-    losses
-        Loss, relative loss and squared error by ``estimator codebook``, float64 [n, 3]
-        [bit/s, per cent, m^2].
-    """
-
-    def __init__(self, names: Sequence[str], mses: Mapping[tuple[str, str], np.ndarray],
-                 losses: Mapping[str, np.ndarray]) -> None:
-        self.names, self.mses, self.losses = tuple(names), mses, losses
-
-    def table(self) -> str:
-        """Return a table with a row for each estimator and codebook."""
-        rows = []
-        for estimator in ESTIMATORS:
-            for name in self.names:
-                mses = self.mses[estimator, name]
-                spread = f' ± {mses.std(ddof=1):.3f}' if len(mses) > 1 else ''
-                low, median, high = np.quantile(
-                    self.losses[f'{estimator} {name}'], (0.25, 0.5, 0.75), axis=0)
-                rows.append([
-                    f'{estimator}, {name}', f'{mses.mean():.3f}{spread}', f'{mses.min():.3f}',
-                    f'{median[0] / 1e3:.1f}', f'{(high - low)[0] / 1e3:.1f}',
-                    f'{median[1]:.3f}'])
-        return markdown_table(
-            ['estimator, codebook', 'MSE [m²]', 'best', 'median loss [kbit/s]',
-             'interquartile range [kbit/s]', 'median loss [%]'], rows)
-
-    def claims(self) -> str:
-        """Return a table of the claimed and the measured reductions, with 95 % intervals."""
-        rows = []
-        for quantity, rivals in CLAIMS.items():
-            for rival, claimed in rivals.items():
-                row = [f'{quantity}, below {rival}', f'{claimed} %']
-                for estimator, own in (('neural', 'optimised'), ('bayes', 'optimised'),
-                                       ('bayes', 'ambiguity')):
-                    row.append(self._reduction(quantity, estimator, own, rival))
-                rows.append(row)
-        return markdown_table(
-            ['claim', 'paper', 'neural, optimised', 'bayes, optimised', 'bayes, ambiguity'], rows)
-
-    def _reduction(self, quantity: str, estimator: str, own: str, rival: str) -> str:
-        def values_of(name: str) -> np.ndarray:
-            if quantity == 'mean squared error' and estimator == 'neural':
-                return self.mses[estimator, name]
-            column = 2 if quantity == 'mean squared error' else 0
-            return self.losses[f'{estimator} {name}'][:, column]
-
-        statistic = {
-            'mean squared error': lambda values: values.mean(axis=-1),
-            'median capacity loss': lambda values: np.median(values, axis=-1),
-            'interquartile range of the loss':
-                lambda values: np.subtract(*np.quantile(values, (0.75, 0.25), axis=-1))}[quantity]
-        less, low, high = reduction(values_of(own), values_of(rival), statistic)
-        return f'{less:.0f} % [{low:.0f}, {high:.0f}]'
+def table(results: Results, condition: Condition) -> str:
+    """Return a table of errors and losses with a row for each codebook."""
+    rows = []
+    for row in results.rows:
+        values = results.statistics(condition, row)
+        mse, low, high = interval(values['error'])
+        per_trial = np.nanmean(results.errors_m2(condition, row), axis=1)
+        spread = f'{per_trial.std(ddof=1):.3g}' if len(per_trial) > 1 else '–'
+        losses = [f'{values[name][0] / 1e3:.3g}' if name in values else '–'
+                  for name in ('median loss', 'range of the loss')]
+        rows.append([row, f'{mse:.3g} [{low:.3g}, {high:.3g}]', spread, str(len(per_trial)),
+                     *losses, str(results.without_fix[condition, row])])
+    return markdown_table(
+        ['codebook', 'MSE [m²]', 'its deviation between trials', 'trials',
+         'median loss [kbit/s]', 'interquartile range [kbit/s]', 'without fix'], rows)
 
 
-def picture(summary: Summary) -> bytes:
-    """Draw (a) errors, one dot per training over their distribution, (b) box plots of losses."""
+def csv_files(results: Results) -> dict[str, str]:
+    """Return the data of both panels as CSV, by file name."""
+    first = ['condition,codebook,trial,mse_m2,validation_mse_m2']
+    second = ['condition,codebook,position,loss_bps']
+    for (condition, row), validation in results.validation_m2.items():
+        mses = np.nanmean(results.errors_m2(condition, row), axis=1)
+        first += [f'{condition.slug},{row},{trial},{mse:.6g},{other:.6g}' for trial, (mse, other)
+                  in enumerate(zip(mses, validation, strict=True))]
+    for (condition, row), losses in results.losses.items():
+        second += [f'{condition.slug},{row},{position},{loss:.6g}'
+                   for position, loss in enumerate(np.nanmax(losses, axis=0))]
+    return {name: '\n'.join(lines) + '\n'
+            for name, lines in (('fig4a.csv', first), ('fig4b.csv', second))}
+
+
+def picture(results: Results) -> bytes:
+    """Draw (a) errors, one dot per trial and their interval, (b) box plots of the losses."""
     with optional_import('drawing the figure', extra='plot'):
         from matplotlib.figure import Figure
-    figure = Figure(figsize=(11, 4), layout='constrained')
-    left, right = figure.subplots(1, 2)
-    centers = np.arange(len(summary.names))
-    for shift, estimator, color in zip((-0.2, 0.2), ESTIMATORS, ('C0', 'C1'), strict=True):
-        for x, name in zip(centers + shift, summary.names, strict=True):
-            mses = summary.mses[estimator, name]
-            if len(mses) > 2 and np.ptp(mses) > 0:
-                bodies = left.violinplot(mses, [x], widths=0.35, showextrema=False)['bodies']
-                bodies[0].set(facecolor=color, alpha=0.3)
-            left.plot(np.full(len(mses), x), mses, '.', color=color, alpha=0.6)
-            left.plot(x, mses.mean(), 'x', color='k')
-            box = right.boxplot(
-                summary.losses[f'{estimator} {name}'][:, 0] / 1e3, positions=[x],
-                widths=0.3, showfliers=False, patch_artist=True)
-            box['boxes'][0].set(facecolor=color, alpha=0.5)
-        left.plot([], [], 's', color=color, alpha=0.5, label=estimator)
-    for axes, label in ((left, '(a) mean squared error [m²]'), (right, '(b) loss [kbit/s]')):
-        axes.set_xticks(centers, summary.names)
-        axes.set(ylabel=label)
-    left.set(ylim=(0, None))
-    left.legend()
+    conditions, rows = results.conditions, results.rows
+    figure = Figure(figsize=(9, 8), layout='constrained')
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    shifts = (np.arange(len(conditions)) - (len(conditions) - 1) / 2) * 0.8 / len(conditions)
+    for index, (condition, shift) in enumerate(zip(conditions, shifts, strict=True)):
+        color = f'C{index}'
+        for x, row in enumerate(rows):
+            mse, low, high = interval(results.statistics(condition, row)['error'])
+            mses = np.nanmean(results.errors_m2(condition, row), axis=1)
+            upper.plot(np.full(len(mses), x + shift), mses, '.', color=color, alpha=0.5)
+            upper.errorbar(x + shift, mse, [[mse - low], [high - mse]], fmt='x', color=color,
+                           capsize=3, label=str(condition) if x == 0 else None)
+            if (condition, row) in results.losses:
+                box = lower.boxplot(
+                    np.nanmax(results.losses[condition, row], axis=0) / 1e3,
+                    positions=[x + shift], widths=0.6 / len(conditions), showfliers=False,
+                    patch_artist=True, medianprops={'color': 'k'})
+                box['boxes'][0].set(facecolor=color, alpha=0.6)
+    upper.set(ylabel='(a) mean squared error [m²]', yscale='log')
+    # Logarithmic above 1 kbit/s. The search for a beam ends slightly below the maximum, so that
+    # losses may be slightly negative.
+    lower.set(ylabel='(b) capacity loss [kbit/s]', yscale='symlog')
+    lower.set_ylim(bottom=-0.5)
+    lower.set_xticks(range(len(rows)), rows)
+    upper.legend(fontsize='small', ncols=2)
     stream = io.BytesIO()
-    figure.savefig(stream, format='png', dpi=120)
+    figure.savefig(stream, format='png', dpi=110)
     return stream.getvalue()
-
-
-def tables(summary: Summary) -> dict[str, str]:
-    """Return the data of both panels as CSV, by file name."""
-    lines = {'fig4a.csv': ['estimator,codebook,training,mse_m2'],
-             'fig4b.csv': ['estimator,codebook,position,loss_bps,loss_percent,squared_error_m2']}
-    for estimator in ESTIMATORS:
-        for name in summary.names:
-            lines['fig4a.csv'] += [f'{estimator},{name},{trial},{mse:.6g}' for trial, mse
-                                   in enumerate(summary.mses[estimator, name])]
-            lines['fig4b.csv'] += [
-                f'{estimator},{name},{position},' + ','.join(f'{value:.6g}' for value in row)
-                for position, row in enumerate(summary.losses[f'{estimator} {name}'])]
-    return {name: '\n'.join(rows) + '\n' for name, rows in lines.items()}

@@ -40,6 +40,7 @@ class Condition(NamedTuple):
         return '-'.join([self.inputs or self.estimator, f'{self.level_db:+g}dB'])
 
     def __str__(self) -> str:
+        """Return the name for tables."""
         inputs = {'parts': 'network, re/im', 'magnitudes': 'network, magnitudes'}
         return f'{inputs.get(self.inputs, self.estimator)}, {self.level_db:g} dB'
 
