@@ -1,0 +1,138 @@
+"""Receivers that observe the elements with arbitrary weights, and their posterior mean.
+
+The surface restricts the weights of the elements: a configuration scales the waves on the board,
+and all feeds share it. Here, every output of a receiver has weights of its own.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.los import los_derivative, los_gain
+from rhs_isac_ros.model.multipath import (
+    complex_normal,
+    measurement_correlation,
+    multipath_covariance,
+)
+from rhs_isac_ros.positioning.modes import find_modes
+from rhs_isac_ros.positioning.polar import jacobian, to_positions
+from rhs_isac_ros.positioning.region import likelihood_loss
+from rhs_isac_ros.positioning.table import TemplateTable
+from rhs_isac_ros.positioning.templates import tabulate
+
+# Positions whose mean signals determine the subspace of all mean signals, and its accuracy: the
+# largest whitened amplitude outside of it.
+_N_SUBSPACE, _TOLERANCE = 2000, 1e-3
+_BLOCK = 128
+
+
+class ArrayReceiver:
+    """Whitened signals of a receiver, reduced to the subspace of its mean signals.
+
+    The reduction keeps everything that the signals contain about the position. It has the
+    interface of `WhitenedModel` that the search for modes needs.
+
+    Parameters
+    ----------
+    weights
+        Weights of the elements in the M outputs of every sub-band, complex128
+        [N_B, N_SB or 1, M, N_E] [sqrt(W)].
+    frames
+        Frame of each output, int [M].
+    averaged
+        Number of frames over which each output is averaged, which divides the power of the noise.
+    """
+
+    def __init__(self, scenario: Scenario, weights: np.ndarray, frames: np.ndarray,
+                 averaged: int = 1) -> None:
+        self.scenario = scenario
+        n_elements, n_rows = scenario.n_elements, scenario.n_subbands * len(frames)
+        weights = np.broadcast_to(weights, (
+            scenario.n_bands, scenario.n_subbands, len(frames), n_elements))
+        rows = (np.arange(scenario.n_subbands)[:, None] * scenario.n_frames + frames).ravel()
+        whiteners = []
+        for band, (spatial, correlation) in enumerate(zip(
+                multipath_covariance(scenario), measurement_correlation(scenario), strict=True)):
+            radiation = weights[band].reshape(n_rows, n_elements)
+            covariance = correlation[np.ix_(rows, rows)] * (
+                radiation @ spatial @ radiation.conj().T)
+            covariance += scenario.noise_power_w / averaged * np.eye(n_rows)
+            whiteners.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+        # Whitened response to the gains of the elements, [N_SB N_E, rows] for each band.
+        self._responses = [self._response(scenario, whitener, weights[band])
+                           for band, whitener in enumerate(whiteners)]
+        positions = scenario.sample_positions(_N_SUBSPACE, np.random.default_rng(0))
+        bases = [np.linalg.svd(
+            self._gains(los_gain, positions, band) @ response, full_matrices=False)[1:]
+            for band, response in enumerate(self._responses)]
+        rank = max(int(np.sum(values > _TOLERANCE)) for values, _ in bases)
+        self._responses = [response @ basis[:rank].conj().T for response, (_, basis) in zip(
+            self._responses, bases, strict=True)]
+        self.shape = len(whiteners), min(rank, *(len(basis) for _, basis in bases))
+
+    @staticmethod
+    def _response(scenario: Scenario, whitener: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        by_subband = whitener.reshape(len(whitener), scenario.n_subbands, -1)
+        return np.einsum('rjm,jme->jer', by_subband, weights).reshape(-1, len(whitener))
+
+    def _gains(self, function: Callable[[Scenario, np.ndarray, int], np.ndarray],
+               positions: np.ndarray, band: int) -> np.ndarray:
+        gains = function(self.scenario, positions, band)
+        return gains.reshape(*gains.shape[:-2], -1)
+
+    def mean(self, positions: np.ndarray) -> np.ndarray:
+        """Compute mean signals, complex128 [N, N_B, r], at positions [N, 3] [m]."""
+        return np.stack([self._gains(los_gain, positions, band) @ response
+                         for band, response in enumerate(self._responses)], axis=1)
+
+    def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute mean signals and their derivative, [N, N_B, r] and [N, 3, N_B, r] [1/m]."""
+        return self.mean(positions), np.stack(
+            [self._gains(los_derivative, positions, band) @ response
+             for band, response in enumerate(self._responses)], axis=2)
+
+    def crlb(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the Cramer-Rao bound at positions, float64 [N] [m^2]."""
+        bounds = []
+        for start in range(0, len(positions), _BLOCK):
+            _, slopes = self.mean_and_jacobian(positions[start:start + _BLOCK])
+            information = quadratic_form(slopes.reshape(len(slopes), 3, -1))
+            bounds.append(np.trace(inverse_information(information), axis1=1, axis2=2))
+        return np.concatenate(bounds)
+
+    def simulate(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Draw signals of independent positioning phases, complex128 [N, N_B, r]."""
+        means = np.concatenate([self.mean(positions[start:start + _BLOCK])
+                                for start in range(0, len(positions), _BLOCK)])
+        return means + complex_normal(means.shape, rng)
+
+
+def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray:
+    """Compute the posterior means of positioning phases as `bayes` does, float64 [N, 3] [m].
+
+    Every mode of the likelihood contributes with the mass of its Gaussian inside the region.
+    """
+    table = TemplateTable(receiver.scenario, tabulate(receiver))
+    low, high = receiver.scenario.roi_bounds_m
+    means = []
+    for signals in received:
+        modes = find_modes(receiver, table, signals)
+        factors = np.linalg.inv(np.swapaxes(np.linalg.cholesky(modes.curvature), 1, 2))
+        # Sampled around the point where the Gaussian enters the region; the weights correct for
+        # the shift.
+        shift = np.linalg.solve(factors, modes.roi_offset[..., None])[..., 0]
+        log_weights = (
+            modes.log_likelihood + np.log(np.linalg.det(jacobian(modes.points)))
+            - np.log(np.linalg.det(modes.curvature)) / 2
+            - likelihood_loss(modes.roi_offset, modes.curvature))[:, None] - shift @ table.normal.T
+        positions = to_positions(
+            (modes.points + modes.roi_offset)[:, None]
+            + np.matmul(table.normal, np.swapaxes(factors, 1, 2)))
+        inside = ((positions >= low) & (positions <= high)).all(axis=-1)
+        if not inside.any():
+            positions, inside = np.clip(positions, low, high), ~inside
+        weights = np.where(inside, np.exp(log_weights - log_weights[inside].max()), 0.0).ravel()
+        means.append(weights @ positions.reshape(-1, 3) / weights.sum())
+    return np.array(means)
