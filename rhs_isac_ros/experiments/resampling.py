@@ -2,8 +2,10 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
 _RESAMPLES = 2000
 _INTERVAL = (2.5, 97.5)
@@ -51,23 +53,56 @@ def reduction(
         return 100 * float(1 - statistic(samples) / statistic(baseline)), float(low), float(high)
 
 
-class Statistics:
-    """Mean, median and interquartile range of results of several members, with replicates.
+class Replicates(NamedTuple):
+    """A statistic of results of several members, with replicates of the bootstrap.
 
-    A member is what is repeated besides the cases: a training, or a draw of a codebook. Each
-    replicate of the bootstrap resamples cases and members. Objects with the same number of cases
-    share the resampled cases, which makes their comparisons paired, and resample their members
-    independently.
-
-    Of M members, M - 1 are drawn with replacement, which makes the variance of the replicates
-    unbiased (Rao and Wu, Resampling inference with complex survey data, 1988). The variance
-    between members is not included if there is only one.
+    A member is what is repeated besides the cases: a training, or a draw of a codebook.
 
     Attributes
     ----------
     values
-        Statistic of the results, then of the replicates, float64 [1 + replicates], by name:
-        ``mean``, and for each quantile its number.
+        The statistic, then its replicates, which resample cases and members, float64
+        [1 + replicates]; NaN where a replicate has no result.
+    by_member
+        The same with all cases once: replicates that resample the members only.
+    n_members
+        Number of members.
+    """
+
+    values: np.ndarray
+    by_member: np.ndarray
+    n_members: int
+
+    def minus(self, other: 'Replicates') -> 'Replicates':
+        """Return the difference from another statistic of the same results."""
+        return Replicates(
+            self.values - other.values, self.by_member - other.by_member, self.n_members)
+
+    def interval(self) -> tuple[float, float, float]:
+        """Return the statistic and its 95 % interval."""
+        return _interval(self.values, [(self.by_member, self.n_members)])
+
+    def reduction_from(self, baseline: 'Replicates') -> tuple[float, float, float]:
+        """Return the reduction relative to a baseline, and its 95 % interval [%].
+
+        The comparison is paired if both have the same number of cases.
+        """
+        with np.errstate(divide='ignore', invalid='ignore'):
+            ratios, own, other = (one / two for one, two in (
+                (self.values, baseline.values), (self.by_member, baseline.values[0]),
+                (self.values[0], baseline.by_member)))
+        ratio, low, high = _interval(
+            ratios, [(own, self.n_members), (other, baseline.n_members)])
+        return 100 * (1 - ratio), 100 * (1 - high), 100 * (1 - low)
+
+
+def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -> list[Replicates]:
+    """Return the mean of results, or quantiles, with replicates of cases and members.
+
+    Of M members, M - 1 are drawn with replacement, which makes the variance of the replicates
+    unbiased (Rao and Wu, Resampling inference with complex survey data, 1988). The variance
+    between members is not included if there is only one. Results with the same number of cases
+    share the resampled cases.
 
     Parameters
     ----------
@@ -76,48 +111,72 @@ class Statistics:
     seed
         Seed of the resampled members; different for results with other members.
     quantiles
-        Quantiles to compute.
+        Quantiles to compute instead of the mean.
     """
-
-    def __init__(self, results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -> None:
-        n_members, n_cases = results.shape
-        rng, drawn = np.random.default_rng([1, seed]), max(n_members - 1, 1)
-        members = np.vstack([
-            np.ones(n_members),
-            rng.multinomial(drawn, np.full(n_members, 1 / n_members), _RESAMPLES)])
-        cases = _case_weights(n_cases)
-        present = np.isfinite(results)
-        filled = np.where(present, results, 0.0).astype(np.float32)
-        sums, counts = cases @ filled.T, cases @ present.T.astype(np.float32)
-        # A replicate without any result is NaN.
-        with np.errstate(invalid='ignore'):
-            self.values = {
-                'mean': np.sum(members * sums, axis=1) / np.sum(members * counts, axis=1)}
-        if quantiles:
-            self._add_quantiles(results, members.astype(np.float32), cases, quantiles)
-
-    def _add_quantiles(self, results: np.ndarray, members: np.ndarray, cases: np.ndarray,
-                       quantiles: Sequence[float]) -> None:
-        member, case = np.nonzero(np.isfinite(results))
-        order = np.argsort(results[member, case])
-        member, case = member[order], case[order]
-        ordered, found = results[member, case], np.empty((len(quantiles), len(cases)))
-        for index, (by_member, by_case) in enumerate(zip(members, cases, strict=True)):
-            total = np.cumsum(by_member[member] * by_case[case], dtype=float)
-            # A replicate without any result is NaN.
-            found[:, index] = (
-                ordered[np.searchsorted(total, np.array(quantiles) * total[-1])]
-                if total[-1] else np.nan)
-        self.values |= dict(zip(map(str, quantiles), found, strict=True))
+    n_members, n_cases = results.shape
+    rng, drawn = np.random.default_rng([1, seed]), max(n_members - 1, 1)
+    members = np.vstack([
+        np.ones(n_members), rng.multinomial(drawn, np.full(n_members, 1 / n_members), _RESAMPLES)])
+    resampled = _case_weights(n_cases)
+    statistic = functools.partial(_quantiles, quantiles=quantiles) if quantiles else _mean
+    with np.errstate(invalid='ignore'):
+        return [Replicates(values, by_member, n_members) for values, by_member in zip(
+            statistic(results, members, resampled),
+            statistic(results, members, np.broadcast_to(resampled[:1], resampled.shape)),
+            strict=True)]
 
 
-def interval(replicates: np.ndarray) -> tuple[float, float, float]:
-    """Return the first value, and the 95 % interval of the replicates that follow it.
+def _mean(results: np.ndarray, members: np.ndarray, cases: np.ndarray) -> np.ndarray:
+    """Return the mean for each row of weights of members and cases, float64 [1, rows]."""
+    present = np.isfinite(results)
+    sums = cases @ np.where(present, results, 0.0).astype(np.float32).T
+    counts = cases @ present.T.astype(np.float32)
+    means: np.ndarray = np.sum(members * sums, axis=1) / np.sum(members * counts, axis=1)
+    return means[None]
 
-    Replicates that are NaN do not count.
+
+def _quantiles(results: np.ndarray, members: np.ndarray, cases: np.ndarray,
+               quantiles: Sequence[float]) -> np.ndarray:
+    """Return quantiles for each row of weights of members and cases, float64 [Q, rows]."""
+    member, case = np.nonzero(np.isfinite(results))
+    order = np.argsort(results[member, case])
+    member, case = member[order], case[order]
+    ordered, found = results[member, case], np.full((len(quantiles), len(cases)), np.nan)
+    for index, (by_member, by_case) in enumerate(zip(members, cases, strict=True)):
+        total = np.cumsum(by_member[member] * by_case[case], dtype=float)
+        if total[-1]:
+            found[:, index] = ordered[np.searchsorted(total, np.array(quantiles) * total[-1])]
+    return found
+
+
+def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
+              ) -> tuple[float, float, float]:
+    """Return the first value and the 95 % interval of the replicates that follow it.
+
+    Percentiles of few members are too close to each other. They are moved apart by the ratio of
+    the quantiles of Student's t and of the normal distribution, with the degrees of freedom of
+    Satterthwaite: each part has the replicates due to the members of one sample, and their number.
+    This takes place on a logarithmic scale if all replicates are positive.
     """
-    low, high = np.nanpercentile(replicates[1:], _INTERVAL)
-    return float(replicates[0]), float(low), float(high)
+    with np.errstate(invalid='ignore'):
+        if all(np.nanmin(array) > 0 for array in (values, *(part for part, _ in parts))):
+            logarithms = _spread(np.log(values), [(np.log(part), n) for part, n in parts])
+            value, low, high = np.exp(logarithms)
+            return float(value), float(low), float(high)
+        return _spread(values, parts)
+
+
+def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
+            ) -> tuple[float, float, float]:
+    # A ratio to zero is infinite; percentiles must not interpolate it.
+    low, high = np.nanpercentile(values[1:], _INTERVAL, method='inverted_cdf')
+    total = np.nanvar(values[1:])**2
+    uncertain = sum(np.nanvar(part[1:])**2 / (n - 1) for part, n in parts if n > 1)
+    widening = 1.0
+    if uncertain > 0 and np.isfinite(total):
+        widening = float(stdtrit(max(total / uncertain, 1.0), 0.975) / ndtri(0.975))
+    return (float(values[0]), float(values[0] + widening * (low - values[0])),
+            float(values[0] + widening * (high - values[0])))
 
 
 @functools.lru_cache(maxsize=2)

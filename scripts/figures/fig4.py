@@ -50,10 +50,10 @@ from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.training import train
 
 CONFIG = Path(__file__).parents[2] / 'config'
-TRIALS, QUICK_TRIALS = 50, 2
+TRIALS, QUICK_TRIALS = 50, 3
 # Random codebooks are drawn at least this often.
 MIN_DRAWS = 5
-PAIRS, QUICK_PAIRS = 100_000, 30_000
+PAIRS, QUICK_PAIRS = 100_000, 20_000
 POSITIONS = 10_000
 QUICK_LOSSES = 500
 # N_sam of Table I.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.experiments.resampling import Statistics, interval, reduction
+from rhs_isac_ros.experiments.resampling import reduction, replicate
 
 
 def mean(values):
@@ -50,36 +50,51 @@ def test_the_reduction_from_zero_is_nan():
 
 def test_statistics_without_resampling_are_those_of_the_results():
     results = np.random.default_rng(0).exponential(size=(3, 41))
-    values = Statistics(results, 0, (0.25, 0.5)).values
-    assert values['mean'][0] == pytest.approx(results.mean(), rel=1e-6)
-    assert values['0.5'][0] == np.median(results)
-    assert values['0.25'][0] == np.quantile(results, 0.25, method='inverted_cdf')
+    (average,) = replicate(results, 0)
+    quarter, middle = replicate(results, 0, (0.25, 0.5))
+    assert average.values[0] == average.by_member[0] == pytest.approx(results.mean(), rel=1e-6)
+    assert middle.values[0] == np.median(results)
+    assert quarter.values[0] == np.quantile(results, 0.25, method='inverted_cdf')
+    assert middle.minus(quarter).values[0] == middle.values[0] - quarter.values[0]
 
 
-def test_statistics_ignore_cases_that_a_member_did_not_serve():
+def test_cases_that_a_member_did_not_serve_do_not_count():
     results = np.tile([[1.0, np.nan, 3.0, np.nan], [np.nan, 5.0, np.nan, 6.0]], 10)
-    values = Statistics(results, 0, (0.5,)).values
-    assert values['mean'][0] == pytest.approx(15 / 4)
-    assert values['0.5'][0] == 3
+    assert replicate(results, 0)[0].values[0] == pytest.approx(15 / 4)
+    assert replicate(results, 0, (0.5,))[0].values[0] == 3
 
 
 def test_comparisons_of_the_same_cases_are_paired():
     results = np.random.default_rng(0).exponential(size=(1, 200))
-    one, other = (Statistics(factor * results, seed).values['mean']
-                  for seed, factor in enumerate((1.0, 2.0)))
-    np.testing.assert_allclose(one / other, 0.5, rtol=1e-5)
+    own, baseline = (replicate(factor * results, seed)[0]
+                     for seed, factor in enumerate((0.6, 1.0)))
+    assert own.reduction_from(baseline) == pytest.approx((40, 40, 40), abs=1e-3)
 
 
 @pytest.mark.parametrize('members', [2, 5])
-def test_the_variance_of_the_replicates_includes_that_of_the_members(members):
-    rng, inside, estimates, spreads = np.random.default_rng(0), 0, [], []
-    for trial in range(60):
-        results = (rng.normal(size=(members, 1)) + rng.normal(size=(1, 50))
-                   + np.zeros((members, 50)))
-        value, low, high = interval(Statistics(results, trial).values['mean'])
-        inside += low <= 0 <= high
-        estimates.append(value)
-        spreads.append(Statistics(results, trial).values['mean'][1:].var())
-    # The expectation of the variance is 1 / members + 1 / 50.
-    assert np.mean(spreads) == pytest.approx(1 / members + 1 / 50, rel=0.35)
-    assert inside >= (60 * 0.6 if members == 2 else 60 * 0.75)
+def test_intervals_of_few_members_have_their_nominal_coverage(members):
+    rng, inside, variances = np.random.default_rng(0), 0, []
+    for trial in range(100):
+        (found,) = replicate(
+            10 + rng.normal(size=(members, 1)) + rng.normal(size=(1, 50)), trial)
+        _, low, high = found.interval()
+        inside += low <= 10 <= high
+        variances.append(found.values[1:].var())
+    assert inside >= 85
+    assert np.mean(variances) == pytest.approx(1 / members + 1 / 50, rel=0.35)
+
+
+def test_intervals_of_positive_statistics_are_positive():
+    results = np.array([[1.0], [9.0]]) * np.ones((2, 50))
+    (found,) = replicate(results, 0)
+    value, low, high = found.interval()
+    assert 0 < low < value < high
+    assert value == pytest.approx(5)
+    assert found.reduction_from(replicate(results, 1)[0])[2] < 100
+
+
+def test_the_variance_of_the_cases_alone_does_not_widen_the_interval():
+    results = np.random.default_rng(0).normal(size=(1, 400))
+    value, low, high = replicate(results, 0)[0].interval()
+    assert high - low == pytest.approx(2 * 1.96 * results.std() / 20, rel=0.1)
+    assert low < value < high

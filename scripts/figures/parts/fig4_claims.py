@@ -3,11 +3,9 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
 from parts.fig4_results import NEURAL, SCANS, Condition, Results
 
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.experiments.resampling import interval
 
 # Reductions that the paper claims for its codebook, by quantity and benchmark [%].
 CLAIMS = {'error': {'directional': 42, 'random': 69},
@@ -67,10 +65,8 @@ def findings(results: Results, condition: Condition) -> Iterator[Finding]:
 
 def _finding(results: Results, condition: Condition, quantity: str, own: str, benchmark: str,
              claimed: int) -> Finding:
-    with np.errstate(divide='ignore', invalid='ignore'):
-        percent, low, high = interval(100 * (
-            1 - results.statistics(condition, own)[quantity]
-            / results.statistics(condition, benchmark)[quantity]))
+    percent, low, high = results.statistics(condition, own)[quantity].reduction_from(
+        results.statistics(condition, benchmark)[quantity])
     trainings = MIN_TRAININGS
     if quantity == 'error':
         positions = len(results.truth)
@@ -97,22 +93,16 @@ def condition_table(results: Results, condition: Condition) -> str:
 
 
 def summary(results: Results) -> str:
-    """Return a table with the verdicts on each claim for the paper's codebook, by condition."""
+    """Return the verdicts for the paper's codebook: a row per claim, a column per condition."""
     own = next(name for name in OWN if name in results.rows)
-    cells: dict[tuple[str, str, int], dict[str, list[str]]] = {}
+    rows: dict[tuple[str, str, int], dict[Condition, str]] = {}
     for condition in results.conditions:
         for found in findings(results, condition):
             if found.own == own:
-                kind = 'directional' if found.benchmark in SCANS else found.benchmark
-                where = f'{condition}' + (
-                    f' ({found.benchmark})' if found.benchmark in SCANS else '')
-                cells.setdefault((found.quantity, kind, found.claimed), {}).setdefault(
-                    found.verdict if found.verdict in (HOLDS, OPEN, FAILS) else 'no verdict',
-                    []).append(where if found.verdict in (HOLDS, OPEN, FAILS)
-                               else f'{where}: {found.verdict}')
-    verdicts = (HOLDS, OPEN, FAILS, 'no verdict')
+                key = found.quantity, found.benchmark, found.claimed
+                rows.setdefault(key, {})[condition] = str(found)
     return markdown_table(
-        [f'claim about {own}', *verdicts],
-        [[f'{QUANTITIES[quantity]} {claimed} % below {kind}',
-          *('; '.join(by_verdict.get(name, ['–'])) for name in verdicts)]
-         for (quantity, kind, claimed), by_verdict in cells.items()])
+        [f'claim about {own}', *map(str, results.conditions)],
+        [[f'{QUANTITIES[quantity]} {claimed} % below {benchmark}',
+          *(cells.get(condition, '') for condition in results.conditions)]
+         for (quantity, benchmark, claimed), cells in rows.items()])

@@ -8,7 +8,6 @@ from parts import fig4_claims
 from parts.fig4_results import Condition, Results
 
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.experiments.resampling import interval
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import optional_import
 
@@ -38,10 +37,10 @@ def table(results: Results, condition: Condition) -> str:
     rows = []
     for row in results.rows:
         values = results.statistics(condition, row)
-        mse, low, high = interval(values['error'])
+        mse, low, high = values['error'].interval()
         per_trial = np.nanmean(results.errors_m2(condition, row), axis=1)
         spread = f'{per_trial.std(ddof=1):.3g}' if len(per_trial) > 1 else '–'
-        losses = [f'{values[name][0] / 1e3:.3g}' if name in values else '–'
+        losses = [f'{values[name].values[0] / 1e3:.3g}' if name in values else '–'
                   for name in ('median loss', 'range of the loss')]
         rows.append([row, f'{mse:.3g} [{low:.3g}, {high:.3g}]', spread, str(len(per_trial)),
                      *losses, str(results.without_fix[condition, row])])
@@ -76,7 +75,7 @@ def picture(results: Results) -> bytes:
     for index, (condition, shift) in enumerate(zip(conditions, shifts, strict=True)):
         color = f'C{index}'
         for x, row in enumerate(rows):
-            mse, low, high = interval(results.statistics(condition, row)['error'])
+            mse, low, high = results.statistics(condition, row)['error'].interval()
             mses = np.nanmean(results.errors_m2(condition, row), axis=1)
             upper.plot(np.full(len(mses), x + shift), mses, '.', color=color, alpha=0.5)
             upper.errorbar(x + shift, mse, [[mse - low], [high - mse]], fmt='x', color=color,

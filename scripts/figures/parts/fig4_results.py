@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
-from rhs_isac_ros.experiments.resampling import Statistics
+from rhs_isac_ros.experiments.resampling import Replicates, replicate
 from rhs_isac_ros.model import Scenario, streams
 
 NEURAL = 'neural'
@@ -72,7 +72,7 @@ class Results:
         self.validation_m2: dict[tuple[Condition, str], list[float]] = {}
         self.losses: dict[tuple[Condition, str], np.ndarray] = {}
         self.without_fix: dict[tuple[Condition, str], int] = {}
-        self._statistics: dict[tuple[Condition, str], Mapping[str, np.ndarray]] = {}
+        self._statistics: dict[tuple[Condition, str], Mapping[str, Replicates]] = {}
 
     def add(self, condition: Condition, row: str, result: Mapping[str, Any], first: int,
             step: int) -> None:
@@ -120,15 +120,14 @@ class Results:
             return np.arange(n) % n_trials
         return np.full(n, np.argmin(self.validation_m2[condition, row]))
 
-    def statistics(self, condition: Condition, row: str) -> Mapping[str, np.ndarray]:
+    def statistics(self, condition: Condition, row: str) -> Mapping[str, Replicates]:
         """Return mean error, median and interquartile range of the loss, with replicates."""
         key = condition, row
         if key not in self._statistics:
             seed = list(self.estimates).index(key)
-            values = {'error': Statistics(self.errors_m2(*key), seed).values['mean']}
+            values = {'error': replicate(self.errors_m2(*key), seed)[0]}
             if key in self.losses:
-                quartiles = Statistics(self.losses[key], seed, QUARTILES).values
-                low, middle, high = (quartiles[str(quantile)] for quantile in QUARTILES)
-                values |= {'median loss': middle, 'range of the loss': high - low}
+                low, middle, high = replicate(self.losses[key], seed, QUARTILES)
+                values |= {'median loss': middle, 'range of the loss': high.minus(low)}
             self._statistics[key] = values
         return self._statistics[key]
