@@ -4,11 +4,16 @@ Whitened signals y from a position with the whitened mean t differ from t by noi
 variance: ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
 measurement. Signals beyond its quantiles at the probability `FALSE_ALARM` do not fit any position
 of the region. Possible causes are a user elsewhere, another codebook, or a silent or defective
-receiver. Such signals give no position.
+receiver. Such signals give no position, and neither do signals that are more probably from
+outside of the region.
 """
+
+import math
 
 # Share of valid signals that each test may reject.
 FALSE_ALARM = 1e-9
+# Prior probability that a user is in the region of interest rather than outside.
+REGION_PROBABILITY = 0.75
 
 
 class FitTest:
@@ -53,3 +58,16 @@ class FitTest:
             return ''
         return (f'residual energy at the best position: {residual:.3g}, expected at most '
                 f'{self.max_residual:.3g}')
+
+
+def outside_test(log_bayes_factor: float) -> str:
+    """Reject signals that are more probably from outside of the region than from inside.
+
+    Takes the logarithm of the evidence for the region relative to that for its surroundings, and
+    returns a reason, which is empty if the signals pass.
+    """
+    log_odds = log_bayes_factor + math.log(REGION_PROBABILITY / (1 - REGION_PROBABILITY))
+    if log_odds >= 0:
+        return ''
+    return (f'position outside of the region: log odds of the region {log_odds:.3g}, expected at '
+            'least 0')

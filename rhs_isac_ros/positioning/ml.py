@@ -4,6 +4,7 @@ import numpy as np
 
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
+from rhs_isac_ros.positioning.samples import Samples
 from rhs_isac_ros.positioning.search import SearchEstimator
 
 
@@ -16,7 +17,7 @@ class MlEstimator(SearchEstimator):
 
     name = 'ml'
 
-    def _moments(self, modes: Modes) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         best = np.argmax(modes.roi_log_likelihood)
         point = modes.roi_points[best]
         by_point = jacobian(point[None])[0]

@@ -12,14 +12,14 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.positioning import templates
+from rhs_isac_ros.positioning import surroundings, templates
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 # Maximum number of tables in a folder; the least recently used ones beyond it are deleted.
 _MAX_TABLES = 16
 _PREFIX = 'table-'
 # Version of the contents of a table; tables of another version are not used.
-_FORMAT = 2
+_FORMAT = 3
 
 
 def default_folder() -> Path:
@@ -31,8 +31,8 @@ def default_folder() -> Path:
 def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str, np.ndarray]:
     """Load the table of a model from a folder, or compute it and store it there.
 
-    The result contains the arrays of `tabulate`; from a folder, they are read-only and mapped
-    into memory. Without a folder, the table is in memory only.
+    The result contains the arrays of `tabulate` and `tabulate_surroundings`; from a folder, they
+    are read-only and mapped into memory. Without a folder, the table is in memory only.
 
     Warns
     -----
@@ -40,13 +40,13 @@ def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str,
         If the folder cannot be written; the table is then in memory only.
     """
     if folder is None:
-        return templates.tabulate(model)
+        return _tabulate(model)
     key = table_key(model)
     path = folder / f'{_PREFIX}{key}.npy'
     table = _read(path, key)
     if table is not None:
         return table
-    table = templates.tabulate(model)
+    table = _tabulate(model)
     try:
         _write(path, key, table)
     except OSError as error:
@@ -55,10 +55,15 @@ def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str,
     return _read(path, key) or table
 
 
+def _tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
+    return templates.tabulate(model) | surroundings.tabulate_surroundings(model)
+
+
 def table_key(model: WhitenedModel) -> str:
     """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
     parts = (dataclasses.astuple(model.scenario), model.codebook.id, __version__, _FORMAT,
-             templates.RANGE_CELL_M, templates.DIRECTION_STEP)
+             templates.RANGE_CELL_M, templates.DIRECTION_STEP,
+             surroundings.RANGE_RATIO, surroundings.DIRECTION_STEP)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs, store, templates
+from rhs_isac_ros.positioning.surroundings import tabulate_surroundings
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
@@ -41,7 +42,7 @@ def only_file(folder: Path) -> Path:
 
 
 def assert_same(table, model):
-    expected = templates.tabulate(model)
+    expected = templates.tabulate(model) | tabulate_surroundings(model)
     assert table.keys() == expected.keys()
     for name, array in expected.items():
         assert table[name].dtype == array.dtype

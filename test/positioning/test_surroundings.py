@@ -1,0 +1,117 @@
+"""The evidence for a user outside of the region of interest."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.special import ive
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.positioning import make_estimator, surroundings
+from rhs_isac_ros.positioning.polar import to_positions
+from rhs_isac_ros.positioning.surroundings import Surroundings, tabulate_surroundings
+from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+
+@pytest.fixture(scope='module')
+def setting(random_beams):
+    """A scenario with a small region, its model and the arrays."""
+    scenario = Scenario(n_subbands=2, n_frames=4, elements_per_side=5, roi_center_m=(3, 0, 0),
+                        roi_size_m=(1, 1, 1), max_power_w=1e-6)
+    model = WhitenedModel(scenario, random_beams(scenario, np.random.default_rng(0)))
+    return scenario, model, tabulate_surroundings(model)
+
+
+def test_the_prior_excludes_the_region_and_its_border(setting):
+    scenario, _, arrays = setting
+    weights = arrays['outer_weights']
+    assert weights.sum() == pytest.approx(1)
+    points = surroundings._points(surroundings._ranges(scenario), surroundings._directions())
+    assert points.shape[:2] == weights.shape
+    positions = to_positions(points)
+    distance = np.linalg.norm(
+        positions - np.clip(positions, *scenario.roi_bounds_m), axis=-1)
+    np.testing.assert_array_equal(weights > 0, distance > surroundings.BORDER_M)
+    # The farthest corner of the region is at 3.57 m.
+    assert 3 * 3.57 < points[..., 0].max() < 1.15 * 3 * 3.57
+
+
+def test_evidence_is_the_average_likelihood(setting):
+    """The reference averages the exact likelihood over random positions of the prior."""
+    scenario, model, arrays = setting
+    rng = np.random.default_rng(1)
+    user = np.array([[7.0, 2.0, 1.0]])
+    signals = model.whiten(MeasurementModel(scenario, model.codebook).sample(user, rng))[0]
+    ranges = surroundings._ranges(scenario)[[0, -1]]
+    n = 400_000
+    direction = rng.normal(size=(n, 3))
+    direction[:, 0] = np.abs(direction[:, 0])
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    # Half a step beyond both ends, as the cells of the grid.
+    ratio = np.sqrt(surroundings.RANGE_RATIO)
+    distance = rng.uniform(ranges[0] / ratio, ranges[1] * ratio, n)
+    positions = distance[:, None] * direction
+    outside = np.linalg.norm(
+        positions - np.clip(positions, *scenario.roi_bounds_m), axis=1) > surroundings.BORDER_M
+    means = model.mean(positions[outside])
+    exponent = -np.sum(np.abs(signals - means)**2, axis=(1, 2))
+    highest = exponent.max()
+    expected = highest + np.log(np.mean(np.exp(exponent - highest)))
+    found = Surroundings(scenario, arrays).log_evidence(signals)
+    assert found == pytest.approx(expected, abs=0.5)
+
+
+def test_bessel_function():
+    argument = np.concatenate([np.linspace(0, 5, 100), np.geomspace(5, 1e4, 50)])
+    expected = argument + np.log(ive(0, argument))
+    np.testing.assert_allclose(surroundings._log_bessel(argument), expected, rtol=0, atol=0.04)
+
+
+def test_explained_signals_have_a_small_residual(setting):
+    scenario, model, arrays = setting
+    table = Surroundings(scenario, arrays)
+    outside = model.mean(np.array([[5.0, -2.0, 1.0]]))[0]
+    assert table.explain(outside, 10.0)
+    assert not table.explain(outside + 10 * np.abs(outside).max(), 10.0)
+
+
+def test_a_region_that_leaves_no_surroundings_is_always_accepted(setting):
+    _, model, _ = setting
+    arrays = tabulate_surroundings(model)
+    arrays['outer_weights'][:] = 0
+    table = Surroundings(model.scenario, arrays)
+    signals = model.mean(np.array([[5.0, -2.0, 1.0]]))[0]
+    assert table.log_evidence(signals) == -np.inf
+    assert not table.explain(signals, 1e9)
+
+
+def test_templates_cover_all_ranges():
+    """Wide bands and large surfaces need more templates."""
+    counts = []
+    for change in ({}, {'subband_width_hz': 12.5e6}, {'elements_per_side': 30}):
+        scenario = dataclasses.replace(Scenario(), **change)
+        ranges = surroundings._ranges(scenario)
+        nodes, index = surroundings._template_ranges(scenario, ranges)
+        assert (np.diff(index) >= 0).all()
+        assert set(index) == set(range(len(nodes)))
+        counts.append(len(nodes))
+    assert counts[0] < 6
+    assert counts[1] > counts[0] < counts[2]
+
+
+@pytest.mark.parametrize('name', ['bayes', 'ml'])
+def test_users_around_the_region_get_no_fix(name, shipped, table1_estimator):
+    """The shell extends from 0.5 m to 20 m; more users make the share 2 %."""
+    scenario, rng = Scenario(), np.random.default_rng(2)
+    low, high = scenario.roi_bounds_m
+    positions = rng.uniform([0, -25, -21], [35, 25, 21], (600, 3))
+    distance = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
+    positions = positions[(distance >= 0.5) & (distance <= 20)][:200]
+    assert len(positions) == 200
+    received = MeasurementModel(scenario, shipped).sample(positions, rng)
+    estimator = table1_estimator if name == 'bayes' else make_estimator(name, scenario, shipped)
+    estimate = estimator.estimate(received)
+    assert estimate.fix.mean() < 0.05
+    reasons = [reason for reason in estimate.reason if reason]
+    outside = [reason for reason in reasons if reason.startswith('position outside of the region')]
+    assert len(outside) > 0.95 * len(reasons)
