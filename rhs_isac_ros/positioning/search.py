@@ -8,14 +8,19 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.fit import FitTest, outside_test
+from rhs_isac_ros.positioning.marginal import Found, MarginalSearch
 from rhs_isac_ros.positioning.modes import LONG_SEARCH_STEPS, Modes, find_modes
 from rhs_isac_ros.positioning.samples import Samples, draw_samples
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.surroundings import Surroundings
 from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+# Standard deviations of the user's gain that the test of the energy admits.
+_GAIN_REACH = 6
 
 
 class SearchEstimator(abc.ABC):
@@ -41,6 +46,11 @@ class SearchEstimator(abc.ABC):
         self._test = FitTest(int(np.prod(self._model.shape)))
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
+        self._marginal: MarginalSearch | None = None
+        # Weak signals may be those of a user with a low gain.
+        self._max_power = 10**(_GAIN_REACH * scenario.user_gain_std_db / 10)
+        if nuisance_parameters(scenario):
+            self._marginal = MarginalSearch(self._model, self._table, self._surroundings)
 
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals, as `Estimator.estimate` describes."""
@@ -49,33 +59,37 @@ class SearchEstimator(abc.ABC):
 
     def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
         no_fix = np.full(3, np.nan), np.full((3, 3), np.nan)
-        for whitened in self._model.whiten(batch):
-            reason = self._test.min_energy_test(float(np.sum(np.abs(whitened)**2)))
+        for received, whitened in zip(batch, self._model.whiten(batch), strict=True):
+            reason = self._test.min_energy_test(
+                float(np.sum(np.abs(whitened)**2)) * self._max_power)
             if reason:
                 yield *no_fix, reason
                 continue
-            modes = find_modes(self._model, self._table, whitened)
-            if self._residual_test(modes):
-                # Strong signals may need more steps to reach the maximum.
-                modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
-            samples = draw_samples(modes, self._table.normal, self._bounds)
-            reason = (self._outside_test(whitened, samples, bool(self._residual_test(modes)))
-                      or self._residual_test(modes))
-            yield (*no_fix, reason) if reason else (*self._moments(modes, samples), '')
+            found = self._marginal.find(received) if self._marginal else self._find(whitened)
+            samples = draw_samples(found.modes, self._table.normal, self._bounds)
+            reason = self._reason(found, samples)
+            yield (*no_fix, reason) if reason else (*self._moments(found.modes, samples), '')
 
-    def _residual_test(self, modes: Modes) -> str:
-        return self._test.residual_test(-modes.roi_log_likelihood.max())
+    def _find(self, whitened: np.ndarray) -> Found:
+        modes = find_modes(self._model, self._table, whitened)
+        if self._test.residual_test(-modes.roi_log_likelihood.max()):
+            # Strong signals may need more steps to reach the maximum.
+            modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
+        return Found(modes, float(-modes.roi_log_likelihood.max()), whitened,
+                     self._surroundings.log_evidence(whitened))
 
-    def _outside_test(self, whitened: np.ndarray, samples: Samples, unexplained: bool) -> str:
-        """Return why the signals are from outside of the region, empty if they need not be.
+    def _reason(self, found: Found, samples: Samples) -> str:
+        """Return why there is no fix, empty if there is one.
 
-        If no position of the region explains the signals, one outside has to explain them.
+        If no position of the region explains the signals, one outside has to explain them for
+        the user to be there.
         """
-        evidence = samples.log_evidence(self._volume_m3)
-        log_odds = evidence - self._surroundings.log_evidence(whitened)
-        if unexplained and not self._surroundings.explain(whitened, self._test.max_residual):
-            return ''
-        return outside_test(log_odds)
+        unexplained = self._test.residual_test(found.residual)
+        if unexplained and not self._surroundings.explain(
+                found.whitened, self._test.max_residual):
+            return unexplained
+        inside = samples.log_evidence(self._volume_m3)
+        return outside_test(inside - found.log_evidence_outside) or unexplained
 
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:

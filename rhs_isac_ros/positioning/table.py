@@ -66,13 +66,43 @@ class TemplateTable:
         phase = np.exp(1j * self._wavenumbers * self.range_offsets_m[:, None])
         self._rotation = (2 * np.hstack([phase.real, -phase.imag])).astype(np.float32)
 
-    def log_likelihood(self, whitened: np.ndarray) -> np.ndarray:
-        """Compute the log-likelihood on the fine grid, up to a constant, float32 [G, D].
+    @property
+    def energy(self) -> np.ndarray:
+        """Energy of the templates, float32 [G]."""
+        return self._energy
+
+    @property
+    def wavelength_m(self) -> float:
+        """Shortest wavelength of the bands' centres [m]."""
+        return self._wavelength_m
+
+    @property
+    def filters(self) -> np.ndarray:
+        """Conjugate templates without their carrier, complex64 [N_B, G, N_SB F]."""
+        return self._filters
+
+    def band_outputs(self, whitened: np.ndarray) -> np.ndarray:
+        """Compute the outputs of the matched filters at the grid points, complex64 [N_B, G].
 
         The whitened signals are those of one positioning phase, complex128 [N_B, N_SB F].
         """
         filtered = np.matmul(self._filters, whitened.astype(np.complex64)[..., None])[..., 0]
         filtered *= self._carrier
+        outputs: np.ndarray = filtered
+        return outputs
+
+    def rotations(self, offsets_m: np.ndarray) -> np.ndarray:
+        """Compute the rotations of the outputs over range offsets [D] [m], complex64 [N_B, D]."""
+        rotations: np.ndarray = np.exp(
+            1j * self._wavenumbers[:, None] * offsets_m).astype(np.complex64)
+        return rotations
+
+    def log_likelihood(self, whitened: np.ndarray) -> np.ndarray:
+        """Compute the log-likelihood on the fine grid, up to a constant, float32 [G, D].
+
+        The whitened signals are those of one positioning phase, complex128 [N_B, N_SB F].
+        """
+        filtered = self.band_outputs(whitened)
         result: np.ndarray = self._rotation @ np.concatenate([filtered.real, filtered.imag])
         result -= self._energy
         return np.transpose(result)

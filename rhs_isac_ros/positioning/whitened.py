@@ -33,6 +33,15 @@ class WhitenedModel:
         """Transform signals [N, N_B, N_SB F] to unit covariance; the shape stays the same."""
         return self._model.whiten(received)
 
+    def whitened_operators(self, patterns: np.ndarray) -> np.ndarray:
+        """Compute W P W^-1 for factors P of the signals, e.g. of nuisance parameters.
+
+        Takes complex128 [Q, N_B, N_SB F]; returns [Q, N_B, N_SB F, N_SB F].
+        """
+        operators: np.ndarray = np.matmul(
+            self._model.whitener * patterns[:, :, None], self._model.root)
+        return operators
+
     def mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute whitened mean signals, complex128 [N, N_B, N_SB F].
 

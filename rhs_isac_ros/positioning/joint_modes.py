@@ -1,0 +1,156 @@
+"""The modes of the posterior of position and nuisance parameters, reduced to the position.
+
+Scoring steps maximise over both. Around a mode, the posterior is Gaussian, so that the
+marginal of the position has the Schur complement of the curvature, and its mass contains the
+determinant of the nuisance parameters' curvature: Laplace's method.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.positioning.joint_search import COARSE_STD_RAD, find_starts
+from rhs_isac_ros.positioning.modes import Modes
+from rhs_isac_ros.positioning.polar import jacobian, to_positions
+from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
+from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable
+from rhs_isac_ros.positioning.unknowns import Unknowns
+from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+_MAX_STARTS = 96
+_MAX_MODES = 32
+_TABLE_MARGIN = 10.0
+_EXACT_MARGIN = 9.0
+_N_STEPS = 5
+_MIN_GAIN = 0.02
+_STEP_LIMITS = np.array([0.02, 0.05, 0.05])
+_COARSE_STEP_M = 0.7
+# Squared distance, in units of the curvature, below which modes have converged to the same one.
+_SAME_MODE = 0.5
+
+
+class JointModes(NamedTuple):
+    """Modes of the marginal posterior of the position.
+
+    Attributes
+    ----------
+    modes
+        Their log-likelihood is that of the marginal, without the factors 2 pi that all modes have
+        in common.
+    residual
+        Energy of the whitened residual at each mode, float64 [M].
+    values
+        Nuisance parameters at each mode, float64 [M, Q].
+    """
+
+    modes: Modes
+    residual: np.ndarray
+    values: np.ndarray
+
+    def select(self, chosen: np.ndarray) -> 'JointModes':
+        """Return the modes with the given indices."""
+        return JointModes(self.modes.select(chosen), self.residual[chosen], self.values[chosen])
+
+
+def find_joint_modes(
+        model: WhitenedModel, table: TemplateTable, unknowns: Unknowns, received: np.ndarray,
+        aligned: np.ndarray) -> JointModes:
+    """Find the modes with a substantial weight in the posterior, the most likely first.
+
+    Parameters
+    ----------
+    received
+        Signals of one positioning phase, complex128 [N_B, N_SB F].
+    aligned
+        Values [Q] of the parameters that `Alignment` determines, 0 for the others.
+    """
+    whitened = model.whiten((received * unknowns.factors(aligned))[None])[0]
+    starts = find_starts(table, unknowns, whitened, _MAX_STARTS, _TABLE_MARGIN)
+    joint, gain = _step(model, unknowns, received, starts.points, starts.values + aligned)
+    for _ in range(_N_STEPS - 1):
+        joint, gain = _prune(joint, gain)
+        (moving,) = np.nonzero(gain > _MIN_GAIN)
+        if not len(moving):
+            break
+        moved, gain[moving] = _step(
+            model, unknowns, received, joint.modes.roi_points[moving], joint.values[moving])
+        for field, new in zip((*joint.modes, joint.residual, joint.values),
+                              (*moved.modes, moved.residual, moved.values), strict=True):
+            field[moving] = new
+    return _prune(joint, gain)[0]
+
+
+def _prune(joint: JointModes, gain: np.ndarray) -> tuple[JointModes, np.ndarray]:
+    """Sort by likelihood; drop improbable modes and repetitions."""
+    value = joint.modes.roi_log_likelihood
+    order = np.argsort(-value)
+    order = order[value[order] >= value[order[0]] - _EXACT_MARGIN - np.maximum(gain[order], 0)]
+    points, curvature = joint.modes.roi_points, joint.modes.curvature
+    kept: list[int] = []
+    for index in order.tolist():
+        offset = points[kept] - points[index]
+        distance = np.einsum('mp,pq,mq->m', offset, curvature[index], offset)
+        if not (distance < _SAME_MODE).any():
+            kept.append(index)
+        if len(kept) == _MAX_MODES:
+            break
+    chosen = np.array(kept)
+    return joint.select(chosen), gain[chosen]
+
+
+def _step(
+        model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, points: np.ndarray,
+        values: np.ndarray) -> tuple[JointModes, np.ndarray]:
+    """Take one scoring step; also return the gain of log-likelihood in the region, [M]."""
+    curvature, gradient, value, residual = _local_model(
+        model, unknowns, received, points, values)
+    nuisance = curvature[:, 3:, 3:]
+    coupling = np.linalg.solve(nuisance, curvature[:, 3:, :3])
+    marginal = curvature[:, :3, :3] - np.matmul(curvature[:, :3, 3:], coupling)
+    marginal = (marginal + np.swapaxes(marginal, 1, 2)) / 2
+    reduced = gradient[:, :3] - np.einsum('mqp,mq->mp', coupling, gradient[:, 3:])
+    limits = _STEP_LIMITS.copy()
+    if unknowns.band_phase_std_rad >= COARSE_STD_RAD:
+        limits[0] = _COARSE_STEP_M
+    step = np.linalg.solve(marginal, reduced[..., None])[..., 0]
+    step = np.clip(step, -limits, limits)
+    of_values = (np.linalg.solve(nuisance, gradient[:, 3:, None])[..., 0]
+                 - np.einsum('mqp,mp->mq', coupling, step))
+    whole = np.hstack([step, of_values])
+    change = np.sum(gradient * whole, axis=1) - likelihood_loss(whole, curvature)
+    evidence = value - np.linalg.slogdet(nuisance)[1] / 2 - np.sum(np.log(unknowns.std))
+    points = points + step
+    roi_offset = offset_to_roi(points, marginal, model.scenario.roi_bounds_m)
+    modes = Modes(points, marginal, evidence + change, roi_offset)
+    predicted = residual - change
+    return (JointModes(modes, predicted, values + of_values),
+            modes.roi_log_likelihood - evidence)
+
+
+def _local_model(
+        model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, points: np.ndarray,
+        values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Information [M, 3 + Q, 3 + Q], gradient, value of the log-likelihood, and residual [M].
+
+    The information is the expected one. Observed curvatures of range and phase differ by noise,
+    and would spoil the marginal, in which the two nearly cancel.
+    """
+    n = len(points)
+    mean, by_position = model.mean_and_jacobian(to_positions(points))
+    by_point = np.matmul(np.swapaxes(jacobian(points), 1, 2), by_position.reshape(n, 3, -1))
+    whitened = model.whiten(received * unknowns.factors(values))
+    residual = (whitened - mean).reshape(n, -1)
+    expected = np.concatenate([by_point, unknowns.whitened_slopes(mean)], axis=1).view(float)
+    information = 2 * np.matmul(expected, np.swapaxes(expected, 1, 2))
+    information += np.diag(np.concatenate([MIN_CURVATURE, unknowns.precision]))
+    information[:, 3:, 3:] += unknowns.information
+    slopes = np.concatenate([by_point, unknowns.whitened_slopes(whitened)], axis=1).view(float)
+    gradient = 2 * np.matmul(slopes, residual.view(float)[..., None])[..., 0]
+    gradient[:, 3:] -= unknowns.precision * values
+    energy = np.sum(np.abs(residual)**2, axis=1)
+    value = -energy - values**2 @ unknowns.precision / 2
+    if unknowns.gain is not None:
+        # The volume of the signals changes with the gain.
+        gradient[:, 3 + unknowns.gain] -= 2 * received.size
+        value -= 2 * received.size * values[:, unknowns.gain]
+    return information, gradient, value, energy

@@ -1,0 +1,84 @@
+"""Evidence and modes of signals whose gain, phases or timing the scenario declares as unknown."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.positioning.joint_modes import find_joint_modes
+from rhs_isac_ros.positioning.modes import Modes
+from rhs_isac_ros.positioning.surroundings import Surroundings
+from rhs_isac_ros.positioning.table import TemplateTable
+from rhs_isac_ros.positioning.unknowns import Alignment, Unknowns
+from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+# Quadrature over the gain outside of the region: spacing [nepers], and reach in standard
+# deviations.
+_GAIN_STEP = 0.04
+_GAIN_REACH = 4.0
+
+
+class Found(NamedTuple):
+    """What a search found for one positioning phase.
+
+    Attributes
+    ----------
+    modes
+        Modes of the posterior.
+    residual
+        Energy of the whitened residual at the best mode.
+    whitened
+        Whitened signals without the offsets of carrier and timing, complex128 [N_B, N_SB F].
+    log_evidence_outside
+        Evidence for a user outside of the region.
+    """
+
+    modes: Modes
+    residual: float
+    whitened: np.ndarray
+    log_evidence_outside: float
+
+
+class MarginalSearch:
+    """The search for modes with the nuisance parameters of a scenario eliminated."""
+
+    def __init__(self, model: WhitenedModel, table: TemplateTable,
+                 surroundings: Surroundings) -> None:
+        self._model, self._table, self._surroundings = model, table, surroundings
+        self.unknowns = Unknowns(model)
+        self._alignment = Alignment(model, self.unknowns, table.filters)
+
+    def find(self, received: np.ndarray) -> Found:
+        """Find the modes for the signals of one positioning phase, [N_B, N_SB F]."""
+        aligned = self._alignment.values(received)
+        joint = find_joint_modes(self._model, self._table, self.unknowns, received, aligned)
+        signals = received * self.unknowns.factors(aligned)
+        return Found(joint.modes, float(joint.residual[0]), self._model.whiten(signals[None])[0],
+                     self._outside(received, aligned))
+
+    def _outside(self, received: np.ndarray, aligned: np.ndarray) -> float:
+        unknowns, sharp = self.unknowns, self.unknowns.sharp
+        divided = received * unknowns.factors(aligned)
+        whitened = self._model.whiten(divided[None])[0]
+        evidence = self._over_gain(whitened)
+        if sharp:
+            precision = unknowns.precision[sharp]
+            curvature = unknowns.information[np.ix_(sharp, sharp)] + np.diag(precision)
+            evidence -= float(
+                aligned[sharp]**2 @ precision / 2 + np.linalg.slogdet(curvature)[1] / 2
+                + np.sum(np.log(unknowns.std[sharp])))
+        return evidence
+
+    def _over_gain(self, whitened: np.ndarray) -> float:
+        """Average the evidence outside over the gain."""
+        unknowns = self.unknowns
+        if unknowns.gain is None:
+            return self._surroundings.log_evidence(whitened)
+        std = unknowns.std[unknowns.gain]
+        n_points = 2 * int(np.ceil(_GAIN_REACH * std / _GAIN_STEP)) + 3
+        gain = std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
+        prior = -gain**2 / (2 * std**2)
+        prior -= np.log(np.sum(np.exp(prior)))
+        evidence = np.array([self._surroundings.log_evidence(whitened, factor)
+                             for factor in np.exp(-gain)])
+        evidence += prior - 2 * whitened.size * gain
+        return float(evidence.max() + np.log(np.sum(np.exp(evidence - evidence.max()))))
