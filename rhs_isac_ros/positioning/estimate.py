@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -12,6 +12,11 @@ from rhs_isac_ros.model import Scenario
 # Far above any received amplitude [sqrt(W)]; after whitening, its square is still finite in single
 # precision.
 _MAX_MAGNITUDE = 1e3
+
+
+# Mean [3], covariance [3, 3], reason, and optionally the energy of the residual.
+Located: TypeAlias = (
+    tuple[np.ndarray, np.ndarray, str] | tuple[np.ndarray, np.ndarray, str, float])
 
 
 class SignalError(ValueError):
@@ -30,11 +35,15 @@ class Estimate:
         Covariance of the position, float64 [3, 3] or [N, 3, 3] [m^2]; NaN without a position.
     reason
         Reason why there is no position, empty if there is one; a string, or N of them.
+    residual
+        Energy of the whitened residual at the best position, float64 [] or [N]; NaN from
+        estimators that compute none.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
     reason: str | tuple[str, ...] = ''
+    residual: float | np.ndarray = np.nan
 
     @property
     def fix(self) -> np.ndarray:
@@ -59,7 +68,7 @@ class Estimator(Protocol):
 
 def estimate_each(
         scenario: Scenario, codebook: Codebook, received: np.ndarray,
-        locate: Callable[[np.ndarray], Iterable[tuple[np.ndarray, np.ndarray, str]]]) -> Estimate:
+        locate: Callable[[np.ndarray], Iterable[Located]]) -> Estimate:
     """Check received signals, locate every phase, and match the result to the signals' shape.
 
     Parameters
@@ -68,8 +77,8 @@ def estimate_each(
         Complex128 [N_B, N_SB F] or [N, N_B, N_SB F]; the codebook determines the sizes.
     locate
         Callable that takes checked signals [N, N_B, N_SB F] and yields mean [3], covariance
-        [3, 3] and reason for each phase. If the reason is not empty, mean and covariance are
-        ignored.
+        [3, 3] and reason for each phase, and optionally the energy of the residual. If the reason
+        is not empty, mean and covariance are ignored.
 
     Raises
     ------
@@ -78,14 +87,15 @@ def estimate_each(
     """
     batch = checked_received(scenario, codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
-    reasons = []
-    for row, (position, spread, reason) in enumerate(locate(batch)):
+    reasons, residual = [], np.full(len(batch), np.nan)
+    for row, (position, spread, reason, *energy) in enumerate(locate(batch)):
+        residual[row:row + 1] = energy or np.nan
         reasons.append(reason)
         if not reason:
             mean[row], covariance[row] = position, spread
     if np.ndim(received) == 2:
-        return Estimate(mean[0], covariance[0], reasons[0])
-    return Estimate(mean, covariance, tuple(reasons))
+        return Estimate(mean[0], covariance[0], reasons[0], float(residual[0]))
+    return Estimate(mean, covariance, tuple(reasons), residual)
 
 
 def checked_received(scenario: Scenario, codebook: Codebook, received: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.positioning.joint_modes import find_joint_modes
+from rhs_isac_ros.positioning.model_error import ModelError
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.surroundings import Surroundings
 from rhs_isac_ros.positioning.table import TemplateTable
@@ -42,7 +43,8 @@ class MarginalSearch:
     """The search for modes with the nuisance parameters of a scenario eliminated."""
 
     def __init__(self, model: WhitenedModel, table: TemplateTable,
-                 surroundings: Surroundings) -> None:
+                 surroundings: Surroundings, error: ModelError | None) -> None:
+        self._error = error
         self._model, self._table, self._surroundings = model, table, surroundings
         self.unknowns = Unknowns(model)
         self._alignment = Alignment(model, self.unknowns, table.filters)
@@ -52,7 +54,12 @@ class MarginalSearch:
         aligned = self._alignment.values(received)
         joint = find_joint_modes(self._model, self._table, self.unknowns, received, aligned)
         signals = received * self.unknowns.factors(aligned)
-        return Found(joint.modes, float(joint.residual[0]), self._model.whiten(signals[None])[0],
+        modes, residual = joint.modes, joint.residual
+        if self._error:
+            divided = received * self.unknowns.factors(joint.values)
+            modes, residual = self._error.refine(modes, divided, step=False)
+        best = int(np.argmax(modes.roi_log_likelihood))
+        return Found(modes, float(residual[best]), self._model.whiten(signals[None])[0],
                      self._outside(received, aligned))
 
     def _outside(self, received: np.ndarray, aligned: np.ndarray) -> float:

@@ -8,10 +8,12 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.imperfections import has_element_errors
 from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.fit import FitTest, outside_test
 from rhs_isac_ros.positioning.marginal import Found, MarginalSearch
+from rhs_isac_ros.positioning.model_error import ModelError
 from rhs_isac_ros.positioning.modes import LONG_SEARCH_STEPS, Modes, find_modes
 from rhs_isac_ros.positioning.samples import Samples, draw_samples
 from rhs_isac_ros.positioning.store import load_table
@@ -46,37 +48,45 @@ class SearchEstimator(abc.ABC):
         self._test = FitTest(int(np.prod(self._model.shape)))
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
+        self._error = ModelError(self._model) if has_element_errors(scenario) else None
         self._marginal: MarginalSearch | None = None
         # Weak signals may be those of a user with a low gain.
         self._max_power = 10**(_GAIN_REACH * scenario.user_gain_std_db / 10)
         if nuisance_parameters(scenario):
-            self._marginal = MarginalSearch(self._model, self._table, self._surroundings)
+            self._marginal = MarginalSearch(
+                self._model, self._table, self._surroundings, self._error)
 
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals, as `Estimator.estimate` describes."""
         model = self._model
         return estimate_each(model.scenario, model.codebook, received, self._locate)
 
-    def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
+    def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str, float]]:
         no_fix = np.full(3, np.nan), np.full((3, 3), np.nan)
         for received, whitened in zip(batch, self._model.whiten(batch), strict=True):
             reason = self._test.min_energy_test(
                 float(np.sum(np.abs(whitened)**2)) * self._max_power)
             if reason:
-                yield *no_fix, reason
+                yield *no_fix, reason, np.nan
                 continue
-            found = self._marginal.find(received) if self._marginal else self._find(whitened)
+            found = (self._marginal.find(received) if self._marginal
+                     else self._find(received, whitened))
             samples = draw_samples(found.modes, self._table.normal, self._bounds)
             reason = self._reason(found, samples)
-            yield (*no_fix, reason) if reason else (*self._moments(found.modes, samples), '')
+            moments = no_fix if reason else self._moments(found.modes, samples)
+            yield *moments, reason, found.residual
 
-    def _find(self, whitened: np.ndarray) -> Found:
+    def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
         modes = find_modes(self._model, self._table, whitened)
         if self._test.residual_test(-modes.roi_log_likelihood.max()):
             # Strong signals may need more steps to reach the maximum.
             modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
-        return Found(modes, float(-modes.roi_log_likelihood.max()), whitened,
-                     self._surroundings.log_evidence(whitened))
+        residual = float(-modes.roi_log_likelihood.max())
+        if self._error:
+            signals = np.broadcast_to(received, (len(modes.points), *received.shape))
+            modes, residuals = self._error.refine(modes, signals, step=True)
+            residual = float(residuals[0])
+        return Found(modes, residual, whitened, self._surroundings.log_evidence(whitened))
 
     def _reason(self, found: Found, samples: Samples) -> str:
         """Return why there is no fix, empty if there is one.

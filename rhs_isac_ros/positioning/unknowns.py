@@ -107,8 +107,8 @@ class Alignment:
         candidates = np.zeros((len(grid), n_values))
         candidates[:, unknowns.sharp] = grid
         signals = self._whitened(received * unknowns.factors(candidates))
-        values = candidates[np.argmin(
-            self._cost(np.sum(np.abs(signals)**2, axis=(1, 2)), candidates))]
+        cost = self._cost(np.sum(np.abs(signals)**2, axis=(1, 2)), candidates)
+        values[:] = candidates[np.argmin(cost)]
         precision = np.diag(unknowns.precision[unknowns.sharp])
         for _ in range(_N_POLISH):
             aligned = received * unknowns.factors(values)
@@ -129,7 +129,7 @@ class Alignment:
 
     def _cost(self, energy: np.ndarray, values: np.ndarray) -> np.ndarray:
         if self._unknowns.gain is not None:
-            energy = np.prod(self._model.shape) * np.log(energy)
+            energy = float(np.prod(self._model.shape)) * np.log(energy)
         total: np.ndarray = energy + values**2 @ self._unknowns.precision / 2
         return total
 

@@ -1,0 +1,60 @@
+"""A running test of whether the residuals of fixes have the energy that the model predicts.
+
+A single residual is tested at `fit.FALSE_ALARM`, which only gross errors of the model exceed. The
+mean over many fixes reveals small ones, such as a wrong delay spread, which leave the positions
+plausible but their covariances too small.
+"""
+
+from collections import deque
+
+import numpy as np
+
+# Probability that the mean residual of a correct model causes a warning.
+FALSE_WARNING = 1e-6
+# Number of fixes in the mean, and the smallest number that is judged.
+WINDOW = 100
+MIN_FIXES = 10
+# Real parameters fitted to the signals of each phase.
+_N_FITTED = 3
+
+
+class ResidualMonitor:
+    """Mean energy of the whitened residuals of the last fixes.
+
+    Twice an energy has a chi-square distribution with two degrees of freedom for each complex
+    measurement, less one for each fitted coordinate.
+
+    Parameters
+    ----------
+    n_measurements
+        Complex measurements of a positioning phase, N_B N_SB F.
+    """
+
+    def __init__(self, n_measurements: int, window: int = WINDOW) -> None:
+        self._energies: deque[float] = deque(maxlen=window)
+        # Half a chi-square variable of 2 k degrees of freedom is a gamma variable of shape k.
+        self._shape = max(n_measurements - _N_FITTED / 2, 0.5)
+
+    def add(self, energy: float) -> None:
+        """Add the energy of the residual of a fix; NaN, from an estimator without one, is not."""
+        if not np.isnan(energy):
+            self._energies.append(energy)
+
+    def clear(self) -> None:
+        """Forget all residuals, for example after a change of the scenario or codebook."""
+        self._energies.clear()
+
+    @property
+    def warning(self) -> str:
+        """Text if the mean energy is improbably high, empty otherwise or after too few fixes."""
+        n_fixes = len(self._energies)
+        if n_fixes < MIN_FIXES:
+            return ''
+        # Every node imports this package, and SciPy takes longer to load than ROS.
+        from scipy.special import gammaincc
+
+        total = sum(self._energies)
+        if gammaincc(n_fixes * self._shape, total) >= FALSE_WARNING:
+            return ''
+        return (f'residual energy: {total / n_fixes:.3g} on average over {n_fixes} fixes, '
+                f'expected {self._shape:.3g}: the scenario does not match the signals')

@@ -1,0 +1,256 @@
+"""Positioning when the signals deviate from the model: errors, coverage, fixes and warnings.
+
+Problem: real signals are not those of the model. How large are the errors, do the 95 % regions
+contain the user, how many phases have no fix, and would the residuals cause a warning? Each
+deviation is measured twice: with a scenario that is silent about it, and with one that declares
+it, as an uncertainty or as the true value. Users outside of the region should have no fix.
+
+The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a Gaussian.
+Brackets contain 95 % intervals: Wilson's for shares, the percentile bootstrap for mean squared
+errors. With --reference N, rows without nuisance parameters and element errors are compared with
+the posterior over 2^N points.
+"""
+
+import os
+
+# One thread, as in the positioner node. This must be set before NumPy is imported.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from rhs_isac_ros.codebook import Codebook, random_codebook
+from rhs_isac_ros.experiments import positive_int
+from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.model import MeasurementModel, Scenario, streams
+from rhs_isac_ros.model.imperfections import has_element_errors
+from rhs_isac_ros.model.nuisance import nuisance_parameters
+from rhs_isac_ros.positioning import Estimate, exhaustive_posterior, make_estimator
+from rhs_isac_ros.positioning.residual_monitor import ResidualMonitor
+
+DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
+# Squared Mahalanobis radius of the 95 % region.
+REGION_RADIUS = float(chdtri(3, 0.05))
+# Positions that share a surface with its errors and failures.
+PER_SURFACE = 5
+RESAMPLES = 2000
+SHELL_M = (0.5, 20.0)
+FOUR_BANDS_HZ = (2.5e9, 2.7e9, 3.1e9, 3.6e9)
+UNIFORM_RAD = 2 * np.pi
+
+# The deviations: changes of the scenario that declare each of them.
+DEVIATIONS: dict[str, dict[str, Any]] = {
+    'none': {},
+    'user power off by 1 dB rms': {'user_gain_std_db': 1.0},
+    'user power off by 3 dB rms': {'user_gain_std_db': 3.0},
+    '1 % of elements stuck': {'failed_element_share': 0.01},
+    'element coefficients off by 1 % rms': {'element_error_rms': 0.01},
+    'element coefficients off by 3 % rms': {'element_error_rms': 0.03},
+    'refractive index 2.11 for 2.10': {'refractive_index': 2.11},
+    'delay spread 0.1 us for 0.5': {'delay_spread_s': 0.1e-6},
+    'angular spread 15 deg for 10': {'angular_spread_deg': 15.0},
+    'multipath power twice the assumed': {'multipath_to_los_db': 10 * np.log10(2)},
+    'carrier offset 1 kHz rms': {'carrier_offset_std_hz': 1e3},
+    'carrier offset 3 kHz rms': {'carrier_offset_std_hz': 3e3},
+    'random phase per band': {'band_phase_std_rad': UNIFORM_RAD},
+}
+FOUR_BANDS = 'four unequally spaced bands, random phase per band'
+OUTSIDE = {'x = 18 m': (18.0, 0.0, 0.0), 'x = 30 m': (30.0, 0.0, 0.0),
+           'y = 6 m': (10.0, 6.0, 0.0), 'z = 3 m': (10.0, 0.0, 3.0)}
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add('--positions', type=positive_int, default=600, help='number of positions of each row')
+    add('--seed', type=int, default=1, help='seed of all random numbers')
+    add('--estimator', choices=['bayes', 'ml'], default='bayes', help='estimator')
+    add('--only', action='append', default=[], metavar='TEXT',
+        help='only rows whose name contains the text; may be repeated')
+    add('--reference', type=int, default=0, metavar='N',
+        help='compare with the posterior over 2^N points; 0 to omit')
+    add('--json', type=Path, help='JSON file for the results')
+    options = parser.parse_args()
+    print(f'{options.positions} positions, seed {options.seed}, estimator {options.estimator}\n')
+    print('| signals from | scenario | no fix [%] | MSE [m^2] | predicted | in the 95 % region '
+          '[%] | median residual | warning |\n|---|---|---|---|---|---|---|---|')
+    base, codebook = Scenario(), Codebook.load(DEFAULT_CODEBOOK)
+    rows = [inside_rows(name, base, codebook, changes, options)
+            for name, changes in DEVIATIONS.items() if wanted(name, options)]
+    if wanted(FOUR_BANDS, options):
+        four = Scenario(center_frequencies_hz=FOUR_BANDS_HZ)
+        random = random_codebook(four, streams.generator(options.seed, streams.START))
+        rows.append(inside_rows(
+            FOUR_BANDS, four, random, {'band_phase_std_rad': UNIFORM_RAD}, options))
+    rows.append(outside_rows(base, codebook, options))
+    if options.json:
+        options.json.write_text(
+            json.dumps([row for group in rows for row in group], indent=1) + '\n',
+            encoding='utf-8')
+
+
+def wanted(name: str, options: argparse.Namespace) -> bool:
+    """Return whether a row was requested."""
+    return not options.only or any(text in name for text in options.only)
+
+
+def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[str, Any],
+                options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Measure users inside the region, with a silent and a declaring scenario."""
+    declared = dataclasses.replace(silent, **changes)
+    positions, received = draw(declared, codebook, options)
+    rows = []
+    for kind, scenario in (('silent', silent), ('declared', declared)):
+        if kind == 'silent' and not changes:
+            continue
+        estimator = make_estimator(options.estimator, scenario, codebook)
+        estimate = estimator.estimate(received)
+        row = {'signals': name, 'scenario': kind, **figures(estimate, positions, received[0].size)}
+        plain = not nuisance_parameters(scenario) and not has_element_errors(scenario)
+        if options.reference and kind == 'declared' and plain:
+            row |= ratio_to_reference(
+                exhaustive_posterior(scenario, codebook, received, options.reference),
+                estimate, positions)
+        rows.append(report(row))
+    return rows
+
+
+def outside_rows(scenario: Scenario, codebook: Codebook,
+                 options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Measure users outside of the region."""
+    estimator = make_estimator(options.estimator, scenario, codebook)
+    rng = streams.generator(options.seed, streams.HELD_OUT)
+    model, rows = MeasurementModel(scenario, codebook), []
+    places = {f'a user at {name}': np.tile(place, (options.positions, 1))
+              for name, place in OUTSIDE.items()}
+    places[f'a shell {SHELL_M[0]:g} m to {SHELL_M[1]:g} m outside'] = shell(
+        scenario, options.positions, rng)
+    for name, positions in places.items():
+        if wanted(name, options):
+            received = model.sample(positions, rng)
+            rows.append(report({
+                'signals': name, 'scenario': 'silent',
+                **figures(estimator.estimate(received), positions, received[0].size)}))
+    return rows
+
+
+def draw(scenario: Scenario, codebook: Codebook,
+         options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
+    """Draw positions and signals; every few positions have another surface."""
+    model = MeasurementModel(scenario, codebook)
+    positions, received = [], []
+    for group in range(-(-options.positions // PER_SURFACE)):
+        rng = streams.generator(options.seed, streams.PHASES, group)
+        positions.append(scenario.sample_positions(PER_SURFACE, rng))
+        received.append(model.sample(positions[-1], rng))
+    n = options.positions
+    return np.concatenate(positions)[:n], np.concatenate(received)[:n]
+
+
+def shell(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw positions uniformly around the region, in front of the surface, [n, 3] [m]."""
+    low, high = scenario.roi_bounds_m
+    begin = np.maximum(low - SHELL_M[1], [0.0, -np.inf, -np.inf])
+    found = np.empty((0, 3))
+    while len(found) < n:
+        positions = rng.uniform(begin, high + SHELL_M[1], (4 * n, 3))
+        distance = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
+        found = np.vstack(
+            [found, positions[(distance >= SHELL_M[0]) & (distance <= SHELL_M[1])]])
+    return found[:n]
+
+
+def figures(
+        estimate: Estimate, positions: np.ndarray, n_measurements: int) -> dict[str, Any]:
+    """Compute the figures of a row."""
+    fix, n = estimate.fix, len(positions)
+    errors, covariance = (estimate.mean - positions)[fix], estimate.covariance[fix]
+    squares = np.sum(errors**2, axis=1)
+    normalised = np.sum(
+        errors * np.linalg.solve(covariance, errors[..., None])[..., 0], axis=1)
+    covered = int(np.sum(normalised <= REGION_RADIUS))
+    n_fixes = len(errors)
+    residual = np.asarray(estimate.residual)[fix]
+    return {
+        'positions': n, 'no_fix': n - n_fixes, 'no_fix_share': share(n - n_fixes, n),
+        'reasons': {text: sum(reason.startswith(text) for reason in estimate.reason)
+                    for text in ('position', 'residual', 'energy')},
+        'mse_m2': mean_interval(squares), 'covered_share': share(covered, n_fixes),
+        'missed_share': share(n_fixes - covered, n),
+        'predicted_mse_m2': float(np.trace(covariance, axis1=1, axis2=2).mean())
+        if n_fixes else None,
+        'median_residual': float(np.median(residual)) if n_fixes else None,
+        'warns_after': warns_after(residual, n_measurements),
+    }
+
+
+def warns_after(residual: np.ndarray, n_measurements: int) -> int | None:
+    """Return the number of fixes after which the residuals cause a warning; None if never."""
+    monitor = ResidualMonitor(n_measurements)
+    for count, energy in enumerate(residual, 1):
+        monitor.add(float(energy))
+        if monitor.warning:
+            return count
+    return None
+
+
+def share(count: int, total: int) -> tuple[float, float, float] | None:
+    """Return a share with its 95 % interval by Wilson [%]."""
+    if not total:
+        return None
+    z = 1.96
+    center = (count + z**2 / 2) / (total + z**2)
+    half = z * np.sqrt(count * (total - count) / total + z**2 / 4) / (total + z**2)
+    return 100 * count / total, 100 * float(center - half), 100 * float(center + half)
+
+
+def mean_interval(samples: np.ndarray) -> tuple[float, float, float] | None:
+    """Return a mean with its 95 % interval by the percentile bootstrap."""
+    if not len(samples):
+        return None
+    picks = np.random.default_rng(0).integers(len(samples), size=(RESAMPLES, len(samples)))
+    low, high = np.percentile(samples[picks].mean(axis=1), (2.5, 97.5))
+    return float(samples.mean()), float(low), float(high)
+
+
+def ratio_to_reference(
+        reference: Estimate, estimate: Estimate, positions: np.ndarray) -> dict[str, Any]:
+    """Compare the squared errors of fixes with those of the exhaustive posterior."""
+    fix = estimate.fix
+    own, best = (np.sum((means - positions)[fix]**2, axis=1)
+                 for means in (estimate.mean, reference.mean))
+    value, low, high = reduction(own, best, lambda samples: samples.mean(axis=-1))
+    return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100)}
+
+
+def report(row: dict[str, Any]) -> dict[str, Any]:
+    """Print a row as a line of the table."""
+    def interval(value: tuple[float, float, float] | None, digits: int) -> str:
+        if value is None:
+            return '-'
+        return f'{value[0]:.{digits}f} [{value[1]:.{digits}f}, {value[2]:.{digits}f}]'
+
+    def number(value: float | None, digits: int) -> str:
+        return '-' if value is None else f'{value:.{digits}f}'
+
+    warning = f'after {row["warns_after"]} fixes' if row['warns_after'] else 'none'
+    print(f'| {row["signals"]} | {row["scenario"]} | {interval(row["no_fix_share"], 1)} | '
+          f'{interval(row["mse_m2"], 2)} | {number(row["predicted_mse_m2"], 2)} | '
+          f'{interval(row["covered_share"], 1)} | {number(row["median_residual"], 0)} | '
+          f'{warning} |', flush=True)
+    if 'mse_to_reference' in row:
+        print(f'|  | ratio to the posterior | | {interval(row["mse_to_reference"], 3)} '
+              '| | | | |', flush=True)
+    return row
+
+
+if __name__ == '__main__':
+    main()
