@@ -79,13 +79,12 @@ class MarginalSearch:
         """Average the evidence outside over the gain."""
         unknowns = self.unknowns
         if unknowns.gain is None:
-            return self._surroundings.log_evidence(whitened)
+            return float(self._surroundings.log_evidence(whitened)[0])
         std = unknowns.std[unknowns.gain]
         n_points = 2 * int(np.ceil(_GAIN_REACH * std / _GAIN_STEP)) + 3
         gain = std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
         prior = -gain**2 / (2 * std**2)
         prior -= np.log(np.sum(np.exp(prior)))
-        evidence = np.array([self._surroundings.log_evidence(whitened, factor)
-                             for factor in np.exp(-gain)])
+        evidence = self._surroundings.log_evidence(whitened, np.exp(-gain))
         evidence += prior - 2 * whitened.size * gain
         return float(evidence.max() + np.log(np.sum(np.exp(evidence - evidence.max()))))

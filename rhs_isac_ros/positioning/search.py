@@ -86,7 +86,8 @@ class SearchEstimator(abc.ABC):
             signals = np.broadcast_to(received, (len(modes.points), *received.shape))
             modes, residuals = self._error.refine(modes, signals, step=True)
             residual = float(residuals[0])
-        return Found(modes, residual, whitened, self._surroundings.log_evidence(whitened))
+        return Found(modes, residual, whitened,
+                     float(self._surroundings.log_evidence(whitened)[0]))
 
     def _reason(self, found: Found, samples: Samples) -> str:
         """Return why there is no fix, empty if there is one.

@@ -10,7 +10,7 @@ a closed form, the product over the bands of I_0(2 |t_i^H y_i|). What remains is
 coarse grid suffices.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -86,8 +86,8 @@ class Surroundings:
                            out=np.full(self._possible.shape, -np.inf))
         self._offset = (log_prior - self._energy).astype(np.float32)
 
-    def log_evidence(self, whitened: np.ndarray, scale: float = 1.0) -> float:
-        """Compute the logarithm of the likelihood averaged over the prior.
+    def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
+        """Compute the logarithm of the likelihood averaged over the prior, for each scale.
 
         The likelihood is relative to that of signals without noise, as in `Modes`: at a mean t,
         it is exp(-|y - t|^2).
@@ -96,16 +96,20 @@ class Surroundings:
         ----------
         whitened
             Whitened signals of one positioning phase, complex128 [N_B, N_SB F].
-        scale
-            Factor of the signals.
+        scales
+            Factors of the signals.
         """
-        argument = self._filter(whitened) * (np.float32(scale) * self._scale)
+        argument = self._filter(whitened) * self._scale
+        energy = float(np.sum(np.abs(whitened)**2))
+        return np.array([self._log_average(argument * np.float32(scale)) - scale**2 * energy
+                         for scale in scales])
+
+    def _log_average(self, argument: np.ndarray) -> float:
         log_likelihood = np.sum(_log_bessel(argument), axis=0) + self._offset
         highest = float(log_likelihood.max())
         if np.isneginf(highest):
             return highest
-        energy = scale**2 * float(np.sum(np.abs(whitened)**2))
-        return highest + float(np.log(np.sum(np.exp(log_likelihood - highest)))) - energy
+        return highest + float(np.log(np.sum(np.exp(log_likelihood - highest))))
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position outside leaves a residual with at most this energy.

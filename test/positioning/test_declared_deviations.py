@@ -1,0 +1,136 @@
+"""Estimates of signals with deviations that the scenario declares."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.nuisance import nuisance_factors
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.joint_modes import _local_model
+from rhs_isac_ros.positioning.model_error import ModelError
+from rhs_isac_ros.positioning.modes import Modes
+from rhs_isac_ros.positioning.polar import to_polar, to_positions
+from rhs_isac_ros.positioning.templates import tabulate
+from rhs_isac_ros.positioning.unknowns import Alignment, Unknowns
+from rhs_isac_ros.positioning.whitened import WhitenedModel
+
+SCENARIO = Scenario(
+    center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+    roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
+ALL = {'user_gain_std_db': 1.0, 'carrier_offset_std_hz': 500.0, 'phase_std_rad': 0.5,
+       'timing_std_s': 1e-8, 'band_phase_std_rad': 0.3}
+
+
+@pytest.fixture(scope='module')
+def codebook(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(1))
+
+
+def declaring(**changes) -> Scenario:
+    return dataclasses.replace(SCENARIO, **changes)
+
+
+def share_covered(estimate, positions) -> float:
+    """Share of the phases whose 95 % region contains the user; no fix contains none."""
+    errors = (estimate.mean - positions)[estimate.fix]
+    covariance = estimate.covariance[estimate.fix]
+    normalised = np.sum(errors * np.linalg.solve(covariance, errors[..., None])[..., 0], axis=1)
+    return np.sum(normalised <= 7.815) / len(positions)
+
+
+@pytest.mark.parametrize('changes', [
+    {'user_gain_std_db': 3.0}, {'carrier_offset_std_hz': 2e3}, {'timing_std_s': 5e-8},
+    {'phase_std_rad': 7.0}, {'band_phase_std_rad': 0.2},
+    {'user_gain_std_db': 1.0, 'phase_std_rad': 0.5, 'carrier_offset_std_hz': 1e3},
+    {'element_error_rms': 0.02},
+], ids=lambda changes: ' '.join(changes))
+def test_declared_deviations_leave_consistent_estimates(codebook, changes):
+    """Undeclared, many of these signals have no fix or a wrong one."""
+    scenario, rng = declaring(**changes), np.random.default_rng(2)
+    positions = scenario.sample_positions(25, rng)
+    received = MeasurementModel(scenario, codebook).sample(positions, rng)
+    silent = make_estimator('bayes', SCENARIO, codebook).estimate(received)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received)
+    assert share_covered(silent, positions) < 0.8
+    assert share_covered(estimate, positions) >= 0.88
+    assert estimate.fix.all()
+    assert 75 < np.median(estimate.residual) < 110
+
+
+def test_the_gradient_is_that_of_the_log_likelihood(codebook):
+    scenario, rng = declaring(**ALL), np.random.default_rng(3)
+    model = WhitenedModel(scenario, codebook)
+    unknowns = Unknowns(model)
+    position = np.array([[4.2, 0.3, -0.1]])
+    received = MeasurementModel(scenario, codebook).sample(position, rng)[0]
+    values = 0.3 * unknowns.std * rng.normal(size=(1, len(unknowns.std)))
+    points = to_polar(position + 0.003)
+    information, gradient, _, _ = _local_model(model, unknowns, received, points, values)
+    np.testing.assert_allclose(information, np.swapaxes(information, 1, 2), rtol=1e-9)
+    assert (np.linalg.eigvalsh(information / np.sqrt(
+        np.einsum('mp,mq->mpq', *[np.diagonal(information, axis1=1, axis2=2)] * 2))) > 0).all()
+
+    def value(change):
+        return _local_model(model, unknowns, received, points + change[:3],
+                            values + change[3:])[2][0]
+
+    scale = 1e-4 / np.sqrt(np.diagonal(information[0]))
+    for index, step in enumerate(np.diag(scale)):
+        difference = (value(step) - value(-step)) / (2 * scale[index])
+        assert difference == pytest.approx(gradient[0, index], rel=1e-3, abs=1e-3 / scale[index])
+
+
+def test_the_information_is_the_covariance_of_the_gradient(codebook):
+    """Averaged over signals at the true parameters, without the prior."""
+    scenario, rng = declaring(**ALL), np.random.default_rng(4)
+    model = WhitenedModel(scenario, codebook)
+    unknowns = Unknowns(model)
+    point = to_polar(np.array([[4.2, 0.3, -0.1]]))
+    zero = np.zeros((1, len(unknowns.std)))
+    exact = MeasurementModel(SCENARIO, codebook)
+    received = exact.sample(np.tile(to_positions(point), (2000, 1)), rng)
+    gradients = np.array([
+        _local_model(model, unknowns, signals, point, zero)[1][0] for signals in received])
+    information = _local_model(model, unknowns, received[0], point, zero)[0][0]
+    information[3:, 3:] -= np.diag(unknowns.precision)
+    scale = np.sqrt(np.diag(information))
+    found = np.cov(gradients.T) / np.outer(scale, scale)
+    np.testing.assert_allclose(found, information / np.outer(scale, scale), atol=0.15)
+
+
+def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
+    scenario = declaring(carrier_offset_std_hz=2e3, timing_std_s=1e-7)
+    model = WhitenedModel(scenario, codebook)
+    unknowns = Unknowns(model)
+    alignment = Alignment(model, unknowns, tabulate(model)['filters'])
+    rng = np.random.default_rng(5)
+    values = rng.normal(size=(20, 2)) * unknowns.std
+    positions = scenario.sample_positions(20, rng)
+    received = MeasurementModel(SCENARIO, codebook).sample(positions, rng)
+    received = received * nuisance_factors(scenario, values)
+    found = np.array([alignment.values(signals) for signals in received])
+    assert (np.abs(found - values) / unknowns.std).max() < 0.3
+
+
+def test_weights_of_modes_follow_the_covariance_at_their_position(codebook):
+    scenario = declaring(element_error_rms=0.05)
+    model = WhitenedModel(scenario, codebook)
+    exact = MeasurementModel(scenario, codebook)
+    positions = np.array([[3.2, 0.1, 0.0], [4.8, 0.1, 0.0]])
+    received = exact.sample(positions[:1], np.random.default_rng(6))
+    modes = Modes(to_polar(positions), np.tile(np.eye(3), (2, 1, 1)), np.zeros(2),
+                  np.zeros((2, 3)))
+    weighed, residual = ModelError(model).refine(
+        modes, np.repeat(received, 2, axis=0), step=False)
+    value = np.empty(2)
+    for n, covariance in enumerate(exact.covariance_at(positions)):
+        difference = (received - exact.mean(positions))[n] if n == 0 else (
+            received[0] - exact.mean(positions)[1])
+        energy = sum(np.vdot(d, np.linalg.solve(c, d)).real
+                     for d, c in zip(difference, covariance, strict=True))
+        assert residual[n] == pytest.approx(energy, rel=1e-6)
+        searched = np.sum(np.abs(model.whiten(difference[None]))**2)
+        value[n] = searched - energy - np.sum(np.linalg.slogdet(covariance)[1])
+    assert np.diff(weighed.log_likelihood)[0] == pytest.approx(np.diff(value)[0], rel=1e-6)
