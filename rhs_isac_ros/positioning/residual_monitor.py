@@ -46,15 +46,19 @@ class ResidualMonitor:
 
     @property
     def warning(self) -> str:
-        """Text if the mean energy is improbably high, empty otherwise or after too few fixes."""
+        """Text if the mean energy is improbable, empty otherwise or after too few fixes.
+
+        A mean below the expectation also causes a warning: the assumed multipath is then too
+        strong in some directions of the signals, and may be too weak in others.
+        """
         n_fixes = len(self._energies)
         if n_fixes < MIN_FIXES:
             return ''
         # Every node imports this package, and SciPy takes longer to load than ROS.
-        from scipy.special import gammaincc
+        from scipy.special import gammainc, gammaincc
 
-        total = sum(self._energies)
-        if gammaincc(n_fixes * self._shape, total) >= FALSE_WARNING:
+        total, shape = sum(self._energies), n_fixes * self._shape
+        if min(gammainc(shape, total), gammaincc(shape, total)) >= FALSE_WARNING / 2:
             return ''
         return (f'residual energy: {total / n_fixes:.3g} on average over {n_fixes} fixes, '
                 f'expected {self._shape:.3g}: the scenario does not match the signals')

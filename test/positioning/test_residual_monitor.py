@@ -50,10 +50,11 @@ def test_old_residuals_are_forgotten():
 
 
 @pytest.mark.parametrize('n_fixes', [MIN_FIXES, WINDOW])
-def test_the_limit_is_a_quantile(n_fixes):
-    limit = gamma(n_fixes * 62.5).isf(1e-6) / n_fixes
-    assert filled([limit * (1 - 1e-6)] * n_fixes).warning == ''
-    assert filled([limit * (1 + 1e-6)] * n_fixes).warning != ''
+def test_the_limits_are_quantiles(n_fixes):
+    for limit, sign in ((gamma(n_fixes * 62.5).isf(0.5e-6), 1),
+                        (gamma(n_fixes * 62.5).ppf(0.5e-6), -1)):
+        assert filled([limit / n_fixes * (1 - 1e-6 * sign)] * n_fixes).warning == ''
+        assert filled([limit / n_fixes * (1 + 1e-6 * sign)] * n_fixes).warning != ''
 
 
 def test_estimates_without_a_residual_are_ignored():
