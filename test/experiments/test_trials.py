@@ -27,6 +27,9 @@ import os, signal, sys
 from pathlib import Path
 from rhs_isac_ros.experiments import Job, run_command, run_jobs
 
+# As in a terminal: a shell starts background jobs, and so perhaps the tests, with SIGINT ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 def work(number):
     if number == 2:
         os.killpg(0, signal.SIGINT)
