@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import Progress, directional_codebook, plot
-from rhs_isac_ros.codebook.directional import focal_points
+from rhs_isac_ros.codebook.directional import width_points
 from rhs_isac_ros.codebook.plot import beam_powers, plot_optimization
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.optional import MissingLibraryError
@@ -42,9 +42,9 @@ def test_without_matplotlib_the_error_names_the_extra(scenario, tmp_path, monkey
         plot_optimization(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.png')
 
 
-def test_beams_point_at_their_focal_points():
+def test_beams_point_at_their_width_points():
     scenario = Scenario()
-    codebook, points = directional_codebook(scenario), focal_points(scenario)
+    codebook, points = directional_codebook(scenario), width_points(scenario)
     for band in range(scenario.n_bands):
         azimuths, powers = beam_powers(scenario, codebook, band)
         assert powers.shape == (scenario.n_frames, len(azimuths))
