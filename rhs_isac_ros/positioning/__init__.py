@@ -45,8 +45,9 @@ def make_estimator(
     name
         A key of `ESTIMATORS`, or an entry point of the group `plugins.ESTIMATORS`.
     **options
-        ``table_folder``, a folder for tables, for `bayes` and `ml`; ``model_file``, a
-        `Network` or its file, for `neural`. Plug-ins define their own options.
+        ``table_folder``, a folder for tables, and ``reject_outside``, whether users outside of
+        the region get no fix, for `bayes` and `ml`; ``model_file``, a `Network` or its file, for
+        `neural`. Plug-ins define their own options.
 
     Raises
     ------

@@ -23,8 +23,8 @@ class BayesEstimator(SearchEstimator):
 
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
-            table_folder: Path | None = None) -> None:
-        super().__init__(scenario, codebook, table_folder)
+            table_folder: Path | None = None, *, reject_outside: bool = False) -> None:
+        super().__init__(scenario, codebook, table_folder, reject_outside=reject_outside)
         self._prior_covariance = np.diag((self._bounds[1] - self._bounds[0])**2 / 12)
 
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:

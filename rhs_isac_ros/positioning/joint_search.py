@@ -2,7 +2,7 @@
 
 One complex number per band and grid point, the output z_i of the matched filter, suffices: with
 the amplitude A = sum_i Re(z_i) in its most likely phases, the log-likelihood at a factor h of the
-signals is -h^2 |y|^2 + 2 h A - E + 2 n log h, with the energy E of the template.
+signals is ``-h^2 |y|^2 + 2 h A - E + 2 n log h``, with the energy E of the template.
 """
 
 from typing import NamedTuple

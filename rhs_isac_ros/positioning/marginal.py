@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.joint_modes import find_joint_modes
-from rhs_isac_ros.positioning.model_error import ModelError
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.surroundings import Surroundings
 from rhs_isac_ros.positioning.table import TemplateTable
@@ -43,7 +43,7 @@ class MarginalSearch:
     """The search for modes with the nuisance parameters of a scenario eliminated."""
 
     def __init__(self, model: WhitenedModel, table: TemplateTable,
-                 surroundings: Surroundings, error: ModelError | None) -> None:
+                 surroundings: Surroundings, error: ElementErrorModel | None) -> None:
         self._error = error
         self._model, self._table, self._surroundings = model, table, surroundings
         self.unknowns = Unknowns(model)

@@ -10,10 +10,10 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.imperfections import has_element_errors
 from rhs_isac_ros.model.nuisance import nuisance_parameters
+from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.fit import FitTest, outside_test
 from rhs_isac_ros.positioning.marginal import Found, MarginalSearch
-from rhs_isac_ros.positioning.model_error import ModelError
 from rhs_isac_ros.positioning.modes import LONG_SEARCH_STEPS, Modes, find_modes
 from rhs_isac_ros.positioning.samples import Samples, draw_samples
 from rhs_isac_ros.positioning.store import load_table
@@ -28,9 +28,14 @@ _GAIN_REACH = 6
 class SearchEstimator(abc.ABC):
     """An estimator from the modes of the posterior, for a uniform prior on the region of interest.
 
-    Signals that the model cannot explain at the best mode give no fix; see `fit`. Nor do signals
-    that are more probably from outside of the region; see `surroundings`. Tables are kept in
-    `table_folder` between runs.
+    Signals that the model cannot explain at the best mode give no fix; see `fit`. Tables are kept
+    in `table_folder` between runs.
+
+    Parameters
+    ----------
+    reject_outside
+        Whether signals that are more probably from outside of the region give no fix either; see
+        `surroundings`. Few users inside then lose theirs: the fewer measurements, the more.
 
     Raises
     ------
@@ -40,7 +45,8 @@ class SearchEstimator(abc.ABC):
 
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
-            table_folder: Path | None = None) -> None:
+            table_folder: Path | None = None, *, reject_outside: bool = False) -> None:
+        self._rejects_outside = reject_outside
         self._model = WhitenedModel(scenario, codebook)
         arrays = load_table(self._model, table_folder)
         self._table = TemplateTable(scenario, arrays)
@@ -48,7 +54,7 @@ class SearchEstimator(abc.ABC):
         self._test = FitTest(int(np.prod(self._model.shape)))
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
-        self._error = ModelError(self._model) if has_element_errors(scenario) else None
+        self._error = ElementErrorModel(self._model) if has_element_errors(scenario) else None
         self._marginal: MarginalSearch | None = None
         # Weak signals may be those of a user with a low gain.
         self._max_power = 10**(_GAIN_REACH * scenario.user_gain_std_db / 10)
@@ -86,8 +92,9 @@ class SearchEstimator(abc.ABC):
             signals = np.broadcast_to(received, (len(modes.points), *received.shape))
             modes, residuals = self._error.refine(modes, signals, step=True)
             residual = float(residuals[0])
-        return Found(modes, residual, whitened,
-                     float(self._surroundings.log_evidence(whitened)[0]))
+        outside = (float(self._surroundings.log_evidence(whitened)[0])
+                   if self._rejects_outside else -np.inf)
+        return Found(modes, residual, whitened, outside)
 
     def _reason(self, found: Found, samples: Samples) -> str:
         """Return why there is no fix, empty if there is one.
@@ -96,7 +103,7 @@ class SearchEstimator(abc.ABC):
         the user to be there.
         """
         unexplained = self._test.residual_test(found.residual)
-        if unexplained and not self._surroundings.explain(
+        if not self._rejects_outside or unexplained and not self._surroundings.explain(
                 found.whitened, self._test.max_residual):
             return unexplained
         inside = samples.log_evidence(self._volume_m3)

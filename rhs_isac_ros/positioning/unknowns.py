@@ -4,7 +4,7 @@ A scenario may declare unknown gains and phases; see `rhs_isac_ros.model.nuisanc
 factor exp(theta P) of direct path and multipath. Thermal noise is far weaker than the multipath,
 so that the signals divided by the factor have the distribution of the model without it, apart
 from the change of volume: the log-likelihood of position and theta is
--|W (y exp(-theta P)) - t|^2 - 2 n theta_gain, with n complex measurements.
+``-|W (y exp(-theta P)) - t|^2 - 2 n theta_gain``, with n complex measurements.
 """
 
 import numpy as np

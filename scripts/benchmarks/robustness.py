@@ -111,7 +111,8 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
     for kind, scenario in (('silent', silent), ('declared', declared)):
         if kind == 'silent' and not changes:
             continue
-        estimator = make_estimator(options.estimator, scenario, codebook)
+        estimator = make_estimator(
+            options.estimator, scenario, codebook, reject_outside=True)
         estimate = estimator.estimate(received)
         row = {'signals': name, 'scenario': kind, **figures(estimate, positions, received[0].size)}
         plain = not nuisance_parameters(scenario) and not has_element_errors(scenario)
@@ -126,7 +127,8 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
 def outside_rows(scenario: Scenario, codebook: Codebook,
                  options: argparse.Namespace) -> list[dict[str, Any]]:
     """Measure users outside of the region."""
-    estimator = make_estimator(options.estimator, scenario, codebook)
+    estimator = make_estimator(
+            options.estimator, scenario, codebook, reject_outside=True)
     rng = streams.generator(options.seed, streams.HELD_OUT)
     model, rows = MeasurementModel(scenario, codebook), []
     places = {f'a user at {name}': np.tile(place, (options.positions, 1))

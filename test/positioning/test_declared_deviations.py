@@ -8,8 +8,8 @@ import pytest
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.nuisance import nuisance_factors
 from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.joint_modes import _local_model
-from rhs_isac_ros.positioning.model_error import ModelError
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.polar import to_polar, to_positions
 from rhs_isac_ros.positioning.templates import tabulate
@@ -122,7 +122,7 @@ def test_weights_of_modes_follow_the_covariance_at_their_position(codebook):
     received = exact.sample(positions[:1], np.random.default_rng(6))
     modes = Modes(to_polar(positions), np.tile(np.eye(3), (2, 1, 1)), np.zeros(2),
                   np.zeros((2, 3)))
-    weighed, residual = ModelError(model).refine(
+    weighed, residual = ElementErrorModel(model).refine(
         modes, np.repeat(received, 2, axis=0), step=False)
     value = np.empty(2)
     for n, covariance in enumerate(exact.covariance_at(positions)):

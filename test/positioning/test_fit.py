@@ -59,7 +59,7 @@ def test_a_user_far_outside_the_region_gives_no_fix(setting, position):
     scenario, codebook, estimator = setting
     received = simulate_received(
         scenario, codebook, np.tile(position, (4, 1)), np.random.default_rng(0))
-    assert_no_fix(estimator.estimate(received), 'position outside of the region')
+    assert_no_fix(estimator.estimate(received), 'residual')
 
 
 def test_signals_of_another_codebook_give_no_fix(setting, random_beams):
@@ -69,20 +69,15 @@ def test_signals_of_another_codebook_give_no_fix(setting, random_beams):
 
 
 @pytest.mark.parametrize('change', [
+    lambda received: 3 * received,
     lambda received: received.conj(),
     lambda received: received[:, ::-1],
     lambda received: received * np.exp(2j * np.pi * np.arange(received.shape[2]) / 7),
-], ids=['conjugate', 'bands swapped', 'rotating phase'])
+], ids=['amplified', 'conjugate', 'bands swapped', 'rotating phase'])
 def test_distorted_signals_give_no_fix(setting, change):
     scenario, codebook, estimator = setting
     received = simulate_pairs(scenario, codebook, 20, 0)[1]
     assert_no_fix(estimator.estimate(change(received)), 'residual')
-
-
-def test_strong_signals_are_those_of_a_user_in_front_of_the_region(setting):
-    scenario, codebook, estimator = setting
-    received = 3 * simulate_pairs(scenario, codebook, 20, 0)[1]
-    assert_no_fix(estimator.estimate(received), '')
 
 
 def test_the_odds_of_the_region_decide():
@@ -105,9 +100,7 @@ def test_valid_signals_are_located_beside_invalid_ones(setting):
     assert np.linalg.norm(estimate.mean - positions, axis=1)[estimate.fix].max() < 0.1
 
 
-def test_nearly_all_valid_signals_are_located(table1_estimator, shipped):
-    """Signals of Table I are weak or strong; only the surroundings compete with the region."""
+def test_all_valid_signals_are_located(table1_estimator, shipped):
+    """Signals of Table I are weak or strong; each test rejects one in 10^9."""
     received = simulate_pairs(Scenario(), shipped, 300, 5)[1]
-    estimate = table1_estimator.estimate(received)
-    assert estimate.fix.mean() > 0.98
-    assert all(reason.startswith('position outside') for reason in estimate.reason if reason)
+    assert table1_estimator.estimate(received).fix.all()

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ive
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import make_estimator, surroundings
+from rhs_isac_ros.positioning import make_estimator, simulate_pairs, surroundings
 from rhs_isac_ros.positioning.polar import to_positions
 from rhs_isac_ros.positioning.surroundings import Surroundings, tabulate_surroundings
 from rhs_isac_ros.positioning.whitened import WhitenedModel
@@ -100,7 +100,7 @@ def test_templates_cover_all_ranges():
 
 
 @pytest.mark.parametrize('name', ['bayes', 'ml'])
-def test_users_around_the_region_get_no_fix(name, shipped, table1_estimator):
+def test_users_around_the_region_get_no_fix_and_nearly_all_inside_do(name, shipped):
     """The shell extends from 0.5 m to 20 m; more users make the share 2 %."""
     scenario, rng = Scenario(), np.random.default_rng(2)
     low, high = scenario.roi_bounds_m
@@ -109,9 +109,11 @@ def test_users_around_the_region_get_no_fix(name, shipped, table1_estimator):
     positions = positions[(distance >= 0.5) & (distance <= 20)][:200]
     assert len(positions) == 200
     received = MeasurementModel(scenario, shipped).sample(positions, rng)
-    estimator = table1_estimator if name == 'bayes' else make_estimator(name, scenario, shipped)
+    estimator = make_estimator(name, scenario, shipped, reject_outside=True)
     estimate = estimator.estimate(received)
     assert estimate.fix.mean() < 0.05
     reasons = [reason for reason in estimate.reason if reason]
     outside = [reason for reason in reasons if reason.startswith('position outside of the region')]
     assert len(outside) > 0.95 * len(reasons)
+    inside = simulate_pairs(scenario, shipped, 300, 5)[1]
+    assert estimator.estimate(inside).fix.mean() > 0.98

@@ -24,7 +24,7 @@ _MAX_COUNTS = 12
 _STEP_LIMITS = np.array([0.02, 0.03, 0.03])
 
 
-class ModelError:
+class ElementErrorModel:
     """Likelihood of modes under the element errors that a scenario declares."""
 
     def __init__(self, model: WhitenedModel) -> None:
