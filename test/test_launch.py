@@ -21,7 +21,7 @@ FILES = ('network.launch.py', 'network.launch.xml')
 TIMEOUT_S = 60.0
 # mcap has no rosdep key.
 RECORDS = importlib.util.find_spec('mcap') is not None
-# A short form of `ros2 launch`.
+# A short form of `ros2 launch --noninteractive`, which passes SIGINT on to the processes.
 LAUNCH = '''
 import sys
 from launch import LaunchDescription, LaunchService
@@ -29,7 +29,7 @@ from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import AnyLaunchDescriptionSource
 
 arguments = [tuple(argument.split(':=')) for argument in sys.argv[2:]]
-service = LaunchService()
+service = LaunchService(noninteractive=True)
 service.include_launch_description(LaunchDescription([
     IncludeLaunchDescription(AnyLaunchDescriptionSource(sys.argv[1]),
                              launch_arguments=arguments)]))
