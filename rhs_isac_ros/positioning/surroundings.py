@@ -6,8 +6,8 @@ the evidence of each is the likelihood averaged over its prior.
 
 Outside, the prior is uniform in range and solid angle, up to a multiple of the region's farthest
 range. The carrier phases of the bands turn within centimetres of range; the average over them has
-a closed form, the product over the bands of ``I_0(2 |t_i^H y_i|)``. What remains is smooth, so that
-a coarse grid suffices.
+a closed form, the product over the bands of ``I_0(2 |t_i^H y_i|)``. What remains is smooth, so
+that a coarse grid suffices.
 """
 
 from collections.abc import Iterable, Mapping
