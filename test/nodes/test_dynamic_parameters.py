@@ -185,7 +185,8 @@ def test_failed_elements_are_switched_on_and_off(running):
     n_before = len(running.watch.received[m.FeedSignals])
     running.watch.until(lambda: len(running.watch.received[m.FeedSignals]) > n_before + 20,
                         'feed signals', [running.process])
-    assert frame_change(running) < 1e-3
+    # Doppler changes the multipath by about 1e-3 from frame to frame.
+    assert frame_change(running) < 5e-3
     assert running.set('channel', failed_element_share=-1.0).successful
     running.until_reported('channel', parameter__failed_element_share='-1.0',
                            pending__failed_element_share=None)
