@@ -22,13 +22,13 @@ from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
-from ros_domain import claim_domain
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.processes import claim_domain
 
 # Set before rclpy reads them; the child processes inherit them.
 os.environ['ROS_DOMAIN_ID'] = claim_domain()

@@ -27,7 +27,7 @@ PIP_ONLY = {
 # Modules of the repository.
 OWN = {
     'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest', 'in_memory_network',
-    'node_processes', 'ros_domain', 'system', 'test_installation'}
+    'node_processes', 'system', 'test_installation'}
 
 
 @functools.cache

@@ -1,7 +1,9 @@
 """Executables of the package as child processes, which never outlive their parent."""
 
+import atexit
 import os
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +18,8 @@ from rhs_isac_ros.executables import PARENT_ID
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
 _PROCESSES_PER_CORE = 40
+# Above domain 101, the ports may collide with the ephemeral ports of Linux.
+_DOMAINS = 101
 _MEMORY_FILE = Path('/proc/meminfo')
 # Signals sent in order to end a process, each with the time to wait for its exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
@@ -27,14 +31,35 @@ def private_domain() -> dict[str, str]:
     Returns
     -------
     dict
-        ``ROS_DOMAIN_ID``, different for most processes, and ``ROS_AUTOMATIC_DISCOVERY_RANGE``.
+        ``ROS_DOMAIN_ID``, see `claim_domain`, and ``ROS_AUTOMATIC_DISCOVERY_RANGE``.
     """
     return {
-        # Above 101, the ports of a domain may collide with the ephemeral ports of Linux.
-        'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', str(1 + os.getpid() % 101)),
+        'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID') or claim_domain(),
         'ROS_AUTOMATIC_DISCOVERY_RANGE':
             os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'),
     }
+
+
+def claim_domain() -> str:
+    """Return a ROS domain that no other process has claimed; the claim ends with this process.
+
+    Raises
+    ------
+    RuntimeError
+        If all domains are claimed.
+    """
+    for offset in range(_DOMAINS):
+        domain = 1 + (os.getpid() + offset) % _DOMAINS
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            # An abstract name of Linux; it disappears with the socket.
+            claim.bind(f'\0rhs_isac_ros.domain.{domain}')
+        except OSError:
+            claim.close()
+        else:
+            atexit.register(claim.close)
+            return str(domain)
+    raise RuntimeError(f'all {_DOMAINS} ROS domains are claimed by other processes')
 
 
 def max_processes() -> int:

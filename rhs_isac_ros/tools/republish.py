@@ -27,7 +27,7 @@ _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
 # Period of looking for subscribers; maximum time to discover an optimizer [s].
 _POLL_PERIOD_S = 0.05
-_DISCOVERY_TIMEOUT_S = 1.0
+_DISCOVERY_TIMEOUT_S = 2.0
 _ACK_TIMEOUT = Duration(seconds=5)
 
 

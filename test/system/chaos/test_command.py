@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from ros_domain import claim_domain
 
+from rhs_isac_ros.ros.processes import claim_domain
 from system.chaos.command import main
 
 # The parent directory of the package `system`.
