@@ -8,7 +8,7 @@ from rclpy.node import Node
 
 from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.ros.subscriptions import subscribe_messages
 
@@ -49,7 +49,8 @@ class CycleObserver(Node):
             recorder.record_topics(self, lambda name, message: self._on_recorded(
                 kinds.get(name), message))
             return
-        subscribe_messages(self, receives, sizes, self._on_message, on_malformed)
+        subscribe_messages(self, receives, sizes, self._on_message, on_malformed,
+                           exchange=qos.OBSERVATION)
 
     def observe(self, message: m.Message, now_s: float) -> None:
         """Process a message that arrived at `now_s` [s]; subclasses may extend this."""

@@ -17,6 +17,12 @@ EXCHANGE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)
 
+# For the same messages, received by an observer of the whole network: its queue must hold those
+# of several seconds in which a busy machine does not run the observer.
+OBSERVATION = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=4096, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+
 # For a current value, which late joiners receive as well.
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -37,6 +43,6 @@ LATCHED_WITH_LEASE = QoSProfile(
 _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
-def profile_for(kind: type[m.Message]) -> QoSProfile:
-    """Return `LATCHED` for messages that represent a current value, otherwise `EXCHANGE`."""
-    return LATCHED if kind in _LATCHED_MESSAGES else EXCHANGE
+def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSProfile:
+    """Return `LATCHED` for messages that represent a current value, otherwise `exchange`."""
+    return LATCHED if kind in _LATCHED_MESSAGES else exchange

@@ -35,7 +35,7 @@ def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         on_message: Callable[[m.Message], None],
         on_error: Callable[[m.MessageError], None] | None = None,
-        scenario_id: str = '') -> None:
+        scenario_id: str = '', exchange: QoSProfile = qos.EXCHANGE) -> None:
     """Subscribe to messages of the protocol; malformed ones are dropped.
 
     Parameters
@@ -46,6 +46,8 @@ def subscribe_messages(
         Called with the reason why a message was dropped; by default, the node logs it.
     scenario_id
         If given, messages of other scenarios are ignored.
+    exchange
+        Quality of service for messages that are not latched.
     """
     def log(error: m.MessageError) -> None:
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
@@ -62,4 +64,4 @@ def subscribe_messages(
             on_message(plain)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
-                  functools.partial(receive, kind), qos.profile_for(kind), raw=True)
+                  functools.partial(receive, kind), qos.profile_for(kind, exchange), raw=True)
