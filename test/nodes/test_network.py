@@ -48,12 +48,15 @@ def test_each_network_serves_its_users_and_none_of_the_other(networks):
     positions = [{tuple(truth.position) for truth in network.watch.received[m.GroundTruth]}
                  for network in (networks.a, networks.b)]
     assert not positions[0] & positions[1]
-    nodes = networks.a.watch.node.get_node_names_and_namespaces()
     names = {'network', 'bs', 'channel', 'rhs_controller', 'positioner', 'transmission',
-             'optimizer', 'user_1'}
-    assert {name for name, namespace in nodes if namespace == '/a'} == names | {'watch'}
-    assert {name for name, namespace in nodes if namespace == '/b'} == {
-        *names, 'watch', 'user_2'}
+             'optimizer', 'user_1', 'watch'}
+    expected = {'/a': names, '/b': {*names, 'user_2'}}
+
+    def nodes():
+        found = networks.a.watch.node.get_node_names_and_namespaces()
+        return {space: {name for name, where in found if where == space} for space in expected}
+    # The names of nodes arrive independently of their messages.
+    networks.a.watch.until(lambda: nodes() == expected, 'the names of the nodes')
 
 
 def test_a_new_codebook_is_used_from_one_cycle_to_the_next(networks):
