@@ -1,9 +1,11 @@
 """An error at the start ends an executable with one clear line and exit code 2."""
 
+import gc
 import importlib
 import signal
 
 import pytest
+from rclpy.node import Node
 
 from rhs_isac_ros.ros import run
 
@@ -90,6 +92,22 @@ def assert_clear(code, log, name, crashed):
     assert 'error: ' in lines[0]
     for word in CASES[name][2]:
         assert word in lines[0], log
+
+
+def existing_nodes():
+    gc.collect()
+    return {id(node) for node in gc.get_objects() if isinstance(node, Node)}
+
+
+@pytest.fixture(scope='module', autouse=True)
+def no_node_is_left():
+    """Collect the nodes that were created before an error.
+
+    The end of the process would destroy them. Here they would take part in later tests.
+    """
+    before = existing_nodes()
+    yield
+    assert existing_nodes() <= before
 
 
 @pytest.fixture
