@@ -95,7 +95,9 @@ class InvariantChecker:
         self._results: collections.deque[tuple[float, m.PositionEstimate | m.Capacity]] = (
             collections.deque())
         # At first, no publisher has been discovered.
-        self._undiscovered: set[type[m.Message]] = set(RECEIVES)
+        self._undiscovered: dict[type[m.Message], int] = dict.fromkeys(RECEIVES, 0)
+        # The latest sender of each type.
+        self._senders: dict[type[m.Message], int] = {}
         self.checked = self.unverified = 0
         self.violations: list[str] = []
 
@@ -104,18 +106,22 @@ class InvariantChecker:
         self._codebooks[codebook.id] = codebook
         self._models.setdefault(codebook.id, MeasurementModel(self._scenario, codebook))
 
-    def expect_rediscovery(self, kinds: Iterable[type[m.Message]]) -> None:
+    def expect_rediscovery(
+            self, kinds: Iterable[type[m.Message]], by_another: bool = False) -> None:
         """Tolerate missing messages of some types until the first of each type arrives.
 
-        Call this when a publisher has terminated or is unreachable, because other nodes may
-        discover its successor earlier than this one.
+        Call this when a publisher has terminated or is unreachable, or before another node
+        replaces it, because other nodes may discover its successor earlier than this one.
 
         Parameters
         ----------
         kinds
             Types of the messages that it publishes.
+        by_another
+            Whether the first message of each type must be from another node than the latest one.
         """
-        self._undiscovered |= set(kinds)
+        self._undiscovered |= {
+            kind: self._senders.get(kind, 0) if by_another else 0 for kind in kinds}
 
     def add(self, message: m.Message, now_s: float) -> None:
         """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s].
@@ -123,8 +129,11 @@ class InvariantChecker:
         Results that are due by then are checked.
         """
         cycle = self._messages_of(message.cycle_id)
-        cycle.undiscovered |= self._undiscovered
-        self._undiscovered.discard(type(message))
+        cycle.undiscovered |= self._undiscovered.keys()
+        kind = type(message)
+        if message.sender == 0 or message.sender != self._undiscovered.get(kind, 0):
+            self._undiscovered.pop(kind, None)
+        self._senders[kind] = message.sender
         cycle.add(message)
         if isinstance(message, m.PositionEstimate | m.Capacity):
             self._results.append((now_s + CHECK_DELAY_S, message))

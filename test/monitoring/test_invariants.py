@@ -141,6 +141,18 @@ def test_messages_of_an_undiscovered_publisher_may_be_missing(net):
         f'Capacity of cycle 5, user 2, codebook {next(iter(net.codebooks))}: no such estimate']
 
 
+def test_a_node_that_replaces_another_may_be_discovered_late(net):
+    """Messages of the node that is to be replaced do not end the tolerance."""
+    checker = InvariantChecker(net.scenario)
+    older, newer = 1, 2
+    for cycle_id, sender in ((1, older), (2, older), (4, newer)):
+        if cycle_id == 2:
+            checker.expect_rediscovery([m.Grant], by_another=True)
+        checker.add(m.Grant(cycle_id=cycle_id, user=1, sender=sender), 0.0)
+        tolerated = m.Grant in checker._undiscovered
+        assert tolerated == (cycle_id == 2)
+
+
 def test_old_cycles_are_discarded(net):
     checker = InvariantChecker(net.scenario)
     for cycle_id in range(1000):

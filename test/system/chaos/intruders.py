@@ -135,7 +135,8 @@ def _intrude(
     log_lengths = {name: len(processes.log(name)) for name in processes.names}
     log_lengths[_PROCESS] = 0
     observer.warnings.clear()
-    observer.invariants.expect_rediscovery(PUBLISHES[node or executable])
+    observer.invariants.expect_rediscovery(
+        PUBLISHES[node or executable], by_another=True)
     first = len(observer.log.ended)
     processes.start(executable, node, _PROCESS, **parameters)
     # A process takes seconds to start on a loaded machine.
@@ -144,7 +145,8 @@ def _intrude(
     served = sum(record.outcome == 'served' for record in observer.log.ended[first:])
     processes.kill(_PROCESS)
     # The older node creates its publishers again.
-    observer.invariants.expect_rediscovery(PUBLISHES[node or executable])
+    observer.invariants.expect_rediscovery(
+        PUBLISHES[node or executable], by_another=True)
     user, end_s = 1 if intruder == USER else None, time.monotonic()
 
     def is_served() -> bool:
