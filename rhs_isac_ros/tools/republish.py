@@ -28,6 +28,9 @@ _ESTIMATES = topics.NAMES[m.PositionEstimate]
 # Period of looking for subscribers; maximum time to discover an optimizer [s].
 _POLL_PERIOD_S = 0.05
 _DISCOVERY_TIMEOUT_S = 2.0
+# Time without a new endpoint after which the publishers and subscribers of a network are taken as
+# complete [s]. Another publisher may be discovered after the first subscriber.
+_SETTLING_TIME_S = 1.0
 _ACK_TIMEOUT = Duration(seconds=5)
 
 
@@ -70,6 +73,9 @@ class RepublisherNode(Node):
         self._next: tuple[str, Any, float] | None = None
         # Time on the steady clock at the recorded time 0 [s]; None before the first message.
         self._origin_s: float | None = None
+        # Endpoints at the last poll, and the time since when they are the same [s].
+        self._endpoints: list[tuple[int, int]] = []
+        self._unchanged_since_s = time.monotonic()
         kinds = recorded_topics()
         self._message_publishers = {
             name: self.create_publisher(kinds[name][0], name, kinds[name][1]) for name in names}
@@ -78,11 +84,21 @@ class RepublisherNode(Node):
     def _poll_subscribers(self) -> None:
         self.waits_for = next(
             (name for name in self._message_publishers if not self._has_subscribers(name)), '')
-        if not self.waits_for:
+        if self._endpoints_settled() and not self.waits_for:
             self._timer.cancel()
             self._next = next(self._messages, None)
             self._timer = steady_timer(self, _POLL_PERIOD_S, self._publish_due)
             self._publish_due()
+
+    def _endpoints_settled(self) -> bool:
+        """Return whether no endpoint of the topics has appeared or gone for some time."""
+        now_s = time.monotonic()
+        endpoints = [
+            (self.count_publishers(name), self.count_subscribers(name))
+            for name in (*self._message_publishers, _ESTIMATES)]
+        if endpoints != self._endpoints:
+            self._endpoints, self._unchanged_since_s = endpoints, now_s
+        return now_s >= self._unchanged_since_s + _SETTLING_TIME_S
 
     def _has_subscribers(self, name: str) -> bool:
         """Return whether the subscribers of a topic are present."""
