@@ -114,6 +114,12 @@ class Presences:
         return self._superseded_by is not None
 
     @property
+    def rival(self) -> int:
+        """The newest other instance of the same role; 0 if there is none."""
+        rivals = self._rivals()
+        return rivals[0].sender if rivals else 0
+
+    @property
     def in_conflict(self) -> bool:
         """Whether any node is in conflict with this one."""
         return bool(self._others)

@@ -32,14 +32,14 @@ class PresenceClient:
     role
         Role of the node.
     on_change
-        Called with whether the node stands by, at each change and whenever a node with the same
-        role has appeared or gone.
+        Called with whether the node stands by whenever the newest other node with the same role
+        has appeared or gone.
     """
 
     def __init__(
             self, node: Node, role: str, instance: int, scenario: Scenario,
             on_change: Callable[[bool], None]) -> None:
-        self._node, self._on_change = node, on_change
+        self._node, self._on_change, self._rival = node, on_change, 0
         self._presences = Presences(Presence(
             instance, scenario.id, role, node.get_fully_qualified_name(), scenario.fields()))
         self._publisher = node.create_publisher(
@@ -77,7 +77,7 @@ class PresenceClient:
             self._timer.cancel()
 
     def _handle(self, messages: list[LogMessage]) -> bool:
-        """Log messages and report the change that they describe; return whether there is one."""
+        """Log messages and report a change; return whether there is either."""
         logger = self._node.get_logger()
         for message in messages:
             # Not one line: rclpy requires a single severity for each line that logs.
@@ -85,6 +85,9 @@ class PresenceClient:
                 logger.warning(message.text)
             else:
                 logger.info(message.text)
-        if messages:
+        # An older node that returns is not logged again, but it may have served meanwhile.
+        previous, self._rival = self._rival, self._presences.rival
+        changed = self._rival != previous
+        if changed:
             self._on_change(self._presences.stands_by)
-        return bool(messages)
+        return changed or bool(messages)

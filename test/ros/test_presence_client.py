@@ -129,3 +129,43 @@ def test_the_newer_of_two_optimizers_is_followed_until_it_has_gone(bench, small_
     bench.remove(newer)
     bench.until(lambda: got[-1].id == late[-1].id == first, 'the codebook of the older one')
     assert [codebook.id for codebook in got] == [first, second, first]
+
+
+def test_the_serving_optimizer_announces_again_after_an_older_one_has_returned(
+        bench, probe, small_files, small):
+    """A process that was suspended serves for a moment, because it misses the newer one."""
+    first, second = (Codebook.load(small_files / f'{name}.yaml') for name in ('first', 'second'))
+    newer = bench.add(OptimizerNode, parameter_overrides=[
+        Parameter('scenario_file', value=str(small_files / 'scenario.yaml')),
+        Parameter('codebook_file', value=str(small_files / 'first.yaml'))])
+    got = []
+    CodebookClient(bench.add(Node, 'client'), small.scenario,
+                   lambda codebook: got.append(codebook.id))
+    bench.until(lambda: got == [first.id], 'the codebook of the newer one')
+    presences = probe.create_publisher(ros.Presence, topics.PRESENCE, qos.LATCHED)
+    codebooks = probe.create_publisher(ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
+    bench.until(lambda: presences.get_subscription_count() and codebooks.get_subscription_count(),
+                'the subscriptions')
+    older = ros.Presence(sender=newer._instance - 1, scenario_id=small.scenario.id,
+                         role='optimizer', node='/older', scenario='{}')
+    presences.publish(older)
+    bench.until(newer._presence.conflicts, 'the older one')
+    bench.until(lambda: not newer._presence.conflicts(), 'its silence')
+    codebooks.publish(convert.codebook_to_ros(
+        second, probe.get_clock().now().to_msg(), older.sender, older.scenario_id))
+    bench.until(lambda: got == [first.id, second.id], 'the codebook of the older one')
+    presences.publish(older)
+    bench.until(lambda: got == [first.id, second.id, first.id], 'the codebook of the newer one')
+
+
+def test_a_node_of_another_scenario_changes_nothing(bench, probe, add_channel):
+    node, changes = add_channel(), []
+    client = PresenceClient(
+        bench.add(Node, 'other'), 'optimizer', new_instance(), node.scenario, changes.append)
+    publisher = probe.create_publisher(ros.Presence, topics.PRESENCE, qos.LATCHED)
+    bench.until(publisher.get_subscription_count, 'the subscription')
+    publisher.publish(ros.Presence(
+        sender=1, scenario_id='sc2', role='optimizer', node='/stranger', scenario='{}'))
+    bench.until(lambda: 'conflict.sc2' in client.conflicts(), 'the stranger')
+    bench.until(lambda: not client.conflicts(), 'its silence')
+    assert changes == []
