@@ -55,13 +55,14 @@ def subscribe_messages(
     def receive(kind: type[m.Message], serialized: bytes) -> None:
         try:
             plain = convert.from_bytes(kind, serialized)
+            if scenario_id and plain.scenario_id not in ('', scenario_id):
+                return
             if sizes is not None:
                 m.check(plain, sizes)
         except m.MessageError as error:
             (on_error or log)(error)
             return
-        if not scenario_id or plain.scenario_id in ('', scenario_id):
-            on_message(plain)
+        on_message(plain)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
                   functools.partial(receive, kind), qos.profile_for(kind, exchange), raw=True)

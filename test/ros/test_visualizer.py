@@ -72,6 +72,24 @@ def test_the_board_has_the_colours_of_its_configuration(bench, probe, shown, sma
     bench.until(lambda: shown and shown['board', 0].colors[0].r == 1.0, 'the colours')
 
 
+def test_messages_of_another_scenario_are_ignored_without_a_warning(bench, probe, shown, capfd):
+    publisher, stamp = bench.publisher(probe, m.Beam), probe.get_clock().now().to_msg()
+    beam = m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(9),
+                  digital=np.ones((1, 1), complex), expected_bps=1.0)
+    publisher.publish(convert.to_ros(beam, stamp, (7, 'sc2')))
+    truths = bench.publisher(probe, m.GroundTruth)
+    truths.publish(convert.to_ros(ground_truth(1, 9.0), stamp, (7, 'sc2')))
+    truths.publish(convert.to_ros(ground_truth(2, 9.0), stamp))
+    bench.until(lambda: ('truth', 2) in shown, 'the other user')
+    assert ('truth', 1) not in shown
+    assert 'dropped' not in capfd.readouterr().err
+    # The same message of an unknown scenario is an error.
+    publisher.publish(convert.to_ros(beam, stamp))
+    log = []
+    bench.until(lambda: log.append(capfd.readouterr().err) or 'Beam.analog' in ''.join(log),
+                'the warning')
+
+
 @pytest.mark.parametrize('shown', [0.5], indirect=True)
 def test_a_user_without_messages_is_removed(bench, probe, shown, small):
     """Its beam and its topics are removed as well; the other user stays."""
