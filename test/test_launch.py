@@ -162,7 +162,8 @@ def test_a_failure_ends_the_launch_unless_the_process_is_restarted(respawn, code
     ('network.launch.xml', [f'config:={ROOT}/config/quick.yaml'],
      ['config/codebook.yaml', 'config/quick.yaml', 'codebook:=', 'network-1 ended'])])
 def test_an_error_ends_the_launch_and_is_named(file, arguments, expected, monkeypatch, tmp_path):
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    from rhs_isac_ros.ros.processes import claim_domain
+    monkeypatch.setenv('ROS_DOMAIN_ID', claim_domain())
     done = subprocess.run(
         [sys.executable, '-c', LAUNCH, ROOT / 'launch' / file, *arguments], check=False,
         stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TIMEOUT_S,
@@ -183,7 +184,8 @@ def exists(group):
 @pytest.fixture
 def observer(monkeypatch):
     """Return an observer of the cycles in the namespace /launched, and its executor."""
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    from rhs_isac_ros.ros.processes import claim_domain
+    monkeypatch.setenv('ROS_DOMAIN_ID', claim_domain())
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     import rclpy
     from rclpy.context import Context
