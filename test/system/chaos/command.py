@@ -32,6 +32,7 @@ from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo import load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
+from system.chaos.trial import ChaosError, Trial
 from system.observer import NetworkObserver
 
 # Pause between cycles [s]; a longer one during fuzzing leaves room for messages in the queues.
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     rest_s=_FUZZING_REST_S if options.fuzz else _REST_S, first_cycle=0,
                     impairments=soaking.IMPAIRMENTS if options.soak else None)
                 figures = _run(observer, processes, scenario, options, Path(logs), codebook_file)
-        except crashes.ChaosError as error:
+        except ChaosError as error:
             print(f'error: {error}', file=sys.stderr)
             return 1
         except (KeyboardInterrupt, ExternalShutdownException):
@@ -96,7 +97,7 @@ def _run(
         return _soak(observer, processes, options)
     if options.fuzz:
         return _fuzz(observer, processes, scenario, options)
-    trials: list[crashes.CrashTrial | intruders.IntrusionTrial] = []
+    trials: list[Trial] = []
     if options.intruders is None:
         trials += _crash(observer, processes, options)
     if options.nodes is None and options.phases is None:

@@ -12,6 +12,14 @@ from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros.processes import Processes
+from system.chaos.trial import (
+    TIMEOUT_S,
+    ChaosError,
+    Trial,
+    measure_recovery,
+    wait_for_service,
+    warnings_since,
+)
 from system.observer import NetworkObserver
 
 # Messages that each node publishes.
@@ -26,21 +34,14 @@ PUBLISHES = {
 }
 NODES = tuple(PUBLISHES)
 PHASES = tuple(m.Phase)
-# Maximum time to recover [s].
-RECOVERY_LIMIT_S = 3.0
-_TIMEOUT_S = 30.0
 # A killed node is restarted after this time [s]. Until then, the other nodes must report that it
 # is missing: users wait 1.5 s for a beacon, and diagnostics are published once a second.
 _DOWNTIME_S = 3.0
 
 
-class ChaosError(RuntimeError):
-    """The network does not reach the state in which a trial can begin."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CrashTrial:
-    """Result of one trial.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CrashTrial(Trial):
+    """Result of one trial, whose fault ends with the restart of the node.
 
     Attributes
     ----------
@@ -48,38 +49,11 @@ class CrashTrial:
         The node that was killed, and the phase.
     kill_delay_s
         Time from the observed start of the phase to the end of the process [s].
-    recovery_s
-        Time from the restart of the process to the end of the first cycle that was served after
-        it, for a user of one of its own cycles [s]; infinite if there was none.
-    others_running
-        Whether all other processes kept running.
-    logged
-        Warnings that other nodes logged about the missing node, each as ``<node>: <text>``.
-    diagnosed
-        Nodes whose diagnostics reported a fault while the node was missing.
-    violations
-        Results that violate an invariant.
     """
 
     node: str
     phase: str
     kill_delay_s: float
-    recovery_s: float
-    others_running: bool
-    logged: tuple[str, ...]
-    diagnosed: tuple[str, ...]
-    violations: tuple[str, ...]
-
-    @property
-    def recovered(self) -> bool:
-        """Whether cycles were served in time and all other processes kept running."""
-        return self.recovery_s <= RECOVERY_LIMIT_S and self.others_running
-
-    @property
-    def reported(self) -> bool:
-        """Whether logs and diagnostics reported the missing node, without repeated warnings."""
-        return bool(self.logged and self.diagnosed
-                    and len(set(self.logged)) == len(self.logged))
 
 
 def crash_all(
@@ -131,31 +105,13 @@ def crash(
     restart_s = time.monotonic()
     processes.restart(node)
     user = int(node.removeprefix('user_')) if node.startswith('user_') else None
-
-    def served() -> bool:
-        found = any(record.outcome == 'served' and record.began_s > restart_s
-                    and user in (None, record.user) for record in observer.log.ended[-20:])
-        return found and (node != 'optimizer' or observer.n_codebooks > n_codebooks)
-    recovered = observer.spin_until(served, _TIMEOUT_S)
-    recovery_s = time.monotonic() - restart_s if recovered else float('inf')
+    recovery_s = measure_recovery(
+        observer, restart_s, user,
+        lambda: node != 'optimizer' or observer.n_codebooks > n_codebooks)
     return CrashTrial(
-        node, phase.name.lower(), kill_delay_s, recovery_s, not processes.ended(), logged,
-        diagnosed, tuple(observer.invariants.violations[n_violations:]))
-
-
-def both_served(observer: NetworkObserver, first: int) -> bool:
-    """Return whether users 1 and 2 were served in the cycles from the index `first` on."""
-    return {1, 2} <= {
-        record.user for record in observer.log.ended[first:] if record.outcome == 'served'}
-
-
-def wait_for_service(observer: NetworkObserver) -> None:
-    """Wait until both users have been served in cycles that end from now on."""
-    first = len(observer.log.ended)
-    if not observer.spin_until(lambda: both_served(observer, first), _TIMEOUT_S):
-        outcomes = [record.outcome for record in observer.log.ended[first:]]
-        raise ChaosError(f'the users were not served within {_TIMEOUT_S:g} s; outcomes of the '
-                         f'cycles: {outcomes or "none"}')
+        node=node, phase=phase.name.lower(), kill_delay_s=kill_delay_s, recovery_s=recovery_s,
+        others_running=not processes.ended(), logged=logged, diagnosed=diagnosed,
+        violations=tuple(observer.invariants.violations[n_violations:]))
 
 
 def _kill_in(
@@ -170,22 +126,8 @@ def _kill_in(
             delays_s.append(time.monotonic() - begin_s)
     observer.on_phase = kill
     try:
-        if not observer.spin_until(lambda: bool(delays_s), _TIMEOUT_S):
-            raise ChaosError(f'no cycle entered the phase {phase.name} within {_TIMEOUT_S:g} s')
+        if not observer.spin_until(lambda: bool(delays_s), TIMEOUT_S):
+            raise ChaosError(f'no cycle entered the phase {phase.name} within {TIMEOUT_S:g} s')
     finally:
         observer.on_phase = lambda entered: None
     return delays_s[0]
-
-
-def warnings_since(
-        processes: Processes, log_lengths: dict[str, int], excluded: str = '') -> list[str]:
-    """Return new warnings in the logs of all nodes but one, each with the name of its node.
-
-    Parameters
-    ----------
-    log_lengths
-        Length of each log at the beginning, by name of the process.
-    """
-    return [f'{name}: {line.split("]: ", 1)[-1]}'
-            for name, length in log_lengths.items() if name != excluded
-            for line in processes.log(name)[length:].splitlines() if '[WARN]' in line]

@@ -18,8 +18,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.subscriptions import subscribe
-from system.chaos.crashes import ChaosError, both_served
 from system.chaos.mutations import mutate
+from system.chaos.trial import ChaosError, both_served
 from system.observer import NetworkObserver
 
 # Mutations in a row on one topic; the queues of the nodes hold four times as many messages.

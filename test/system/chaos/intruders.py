@@ -11,7 +11,14 @@ import yaml
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import Processes
-from system.chaos.crashes import PUBLISHES, RECOVERY_LIMIT_S, wait_for_service, warnings_since
+from system.chaos.crashes import PUBLISHES
+from system.chaos.trial import (
+    TIMEOUT_S,
+    Trial,
+    measure_recovery,
+    wait_for_service,
+    warnings_since,
+)
 from system.observer import NetworkObserver
 
 # A channel of another scenario, a node with the number of user 1, and a second node of each role.
@@ -21,14 +28,13 @@ INTRUDERS = (
 SECONDS = 4.0
 _PROCESS = 'intruder'
 _USER_NODE = 'user_1'
-_TIMEOUT_S = 30.0
 # Texts that name a conflict.
 _NAMES_OF_CONFLICTS = ('two nodes', 'another scenario', 'serves instead of', 'stands by for')
 
 
-@dataclasses.dataclass(frozen=True)
-class IntrusionTrial:
-    """Result of one trial.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class IntrusionTrial(Trial):
+    """Result of one trial, whose fault ends with the intruder.
 
     Attributes
     ----------
@@ -36,37 +42,10 @@ class IntrusionTrial:
         Which node was started in addition.
     served
         Number of cycles served while it was present.
-    recovery_s
-        Time from the end of the intruder to the end of the first cycle that was served after it,
-        for a user of one of its own cycles [s]; infinite if there was none.
-    others_running
-        Whether all other processes kept running.
-    logged
-        Warnings that name the conflict, each as ``<node>: <text>``.
-    diagnosed
-        Nodes whose diagnostics named the conflict.
-    violations
-        Results that violate an invariant.
     """
 
     intruder: str
     served: int
-    recovery_s: float
-    others_running: bool
-    logged: tuple[str, ...]
-    diagnosed: tuple[str, ...]
-    violations: tuple[str, ...]
-
-    @property
-    def recovered(self) -> bool:
-        """Whether cycles were served in time and all other processes kept running."""
-        return self.recovery_s <= RECOVERY_LIMIT_S and self.others_running
-
-    @property
-    def reported(self) -> bool:
-        """Whether logs and diagnostics named the conflict, without repeated warnings."""
-        return bool(self.logged and self.diagnosed
-                    and len(set(self.logged)) == len(self.logged))
 
 
 def intrude_all(
@@ -140,25 +119,21 @@ def _intrude(
     first = len(observer.log.ended)
     processes.start(executable, node, _PROCESS, **parameters)
     # A process takes seconds to start on a loaded machine.
-    observer.spin_until(lambda: bool(_diagnosed(observer)), _TIMEOUT_S)
+    observer.spin_until(lambda: bool(_diagnosed(observer)), TIMEOUT_S)
     observer.spin_for(seconds)
     served = sum(record.outcome == 'served' for record in observer.log.ended[first:])
     processes.kill(_PROCESS)
     # The older node creates its publishers again.
     observer.invariants.expect_rediscovery(
         PUBLISHES[node or executable], by_another=True)
-    user, end_s = 1 if intruder == USER else None, time.monotonic()
-
-    def is_served() -> bool:
-        return any(record.outcome == 'served' and record.began_s > end_s
-                   and user in (None, record.user) for record in observer.log.ended[-20:])
-    recovered = observer.spin_until(is_served, _TIMEOUT_S)
-    recovery_s = time.monotonic() - end_s if recovered else float('inf')
+    recovery_s = measure_recovery(
+        observer, time.monotonic(), 1 if intruder == USER else None)
     logged = tuple(line for line in warnings_since(processes, log_lengths)
                    if any(text in line for text in _NAMES_OF_CONFLICTS))
     return IntrusionTrial(
-        intruder, served, recovery_s, not processes.ended(), logged, _diagnosed(observer),
-        tuple(observer.invariants.violations[n_violations:]))
+        intruder=intruder, served=served, recovery_s=recovery_s,
+        others_running=not processes.ended(), logged=logged, diagnosed=_diagnosed(observer),
+        violations=tuple(observer.invariants.violations[n_violations:]))
 
 
 def _diagnosed(observer: NetworkObserver) -> tuple[str, ...]:

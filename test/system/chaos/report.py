@@ -1,7 +1,6 @@
 """Results of the chaos trials as text and as JSON figures."""
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,8 @@ from system.chaos.crashes import CrashTrial
 from system.chaos.fuzzing import FuzzResult
 from system.chaos.intruders import IntrusionTrial
 from system.chaos.soaking import SoakResult
+from system.chaos.trial import Trial
+from system.recovery import finite
 
 CRASH_HEAD = (
     'killed          in phase       recovered   others   reported by (log; diagnostics)')
@@ -17,24 +18,21 @@ CRASH_HEAD = (
 
 def crash_line(trial: CrashTrial) -> str:
     """Return a trial as a row of the table, followed by its violations."""
-    row = f'{trial.node:15s} {trial.phase:14s} {_columns(trial)}'
-    return '\n'.join([row, *(f'  VIOLATION: {text}' for text in trial.violations)])
+    return _row(f'{trial.node:15s} {trial.phase:14s}', trial)
 
 
-def trial_figures(
-        trials: Sequence[CrashTrial | IntrusionTrial], invariants: InvariantChecker
-) -> dict[str, Any]:
+def trial_figures(trials: Sequence[Trial], invariants: InvariantChecker) -> dict[str, Any]:
     """Return the figures of all trials, for JSON."""
     worst_s = max((trial.recovery_s for trial in trials), default=0.0)
     return {
         'trials': len(trials),
         'trials_recovered': sum(trial.recovered for trial in trials),
         'trials_reported': sum(trial.reported for trial in trials),
-        'worst_recovery_s': _finite(worst_s),
+        'worst_recovery_s': finite(worst_s),
         'wrong_publications': len(invariants.violations),
         'checked_publications': invariants.checked,
         'unverified_publications': invariants.unverified,
-        'table': [{**dataclasses.asdict(trial), 'recovery_s': _finite(trial.recovery_s)}
+        'table': [{**dataclasses.asdict(trial), 'recovery_s': finite(trial.recovery_s)}
                   for trial in trials],
         'passed': (all(trial.recovered and trial.reported for trial in trials)
                    and not invariants.violations),
@@ -58,18 +56,18 @@ INTRUSION_HEAD = (
 
 def intrusion_line(trial: IntrusionTrial) -> str:
     """Return a trial as a row of the table, followed by its violations."""
-    row = f'{trial.intruder:15s} {trial.served:7d} {_columns(trial)}'
-    return '\n'.join([row, *(f'  VIOLATION: {text}' for text in trial.violations)])
+    return _row(f'{trial.intruder:15s} {trial.served:7d}', trial)
 
 
-def _columns(trial: CrashTrial | IntrusionTrial) -> str:
-    """Return the columns that both kinds of trials have."""
+def _row(first: str, trial: Trial) -> str:
+    """Return the first columns and those that all trials have, followed by the violations."""
     loggers = sorted({line.partition(':')[0] for line in trial.logged})
     reporters = f'{", ".join(loggers) or "-"}; {", ".join(trial.diagnosed) or "-"}'
     others = 'running' if trial.others_running else 'ENDED'
     marks = ('' if trial.recovered else '  NOT IN TIME') + (
         '' if trial.reported else '  NOT REPORTED ONCE')
-    return f'{trial.recovery_s:7.2f} s   {others:7s}  {reporters}{marks}'
+    row = f'{first} {trial.recovery_s:7.2f} s   {others:7s}  {reporters}{marks}'
+    return '\n'.join([row, *(f'  VIOLATION: {text}' for text in trial.violations)])
 
 
 def soak_figures(result: SoakResult, invariants: InvariantChecker) -> dict[str, Any]:
@@ -108,7 +106,7 @@ def soak_text(result: SoakResult, figures: Mapping[str, Any]) -> str:
 def fuzz_figures(result: FuzzResult) -> dict[str, Any]:
     """Return the figures of fuzzing, for JSON."""
     return {**dataclasses.asdict(result), 'mutations': sum(result.sent.values()),
-            'recovery_s': _finite(result.recovery_s), 'passed': result.passed}
+            'recovery_s': finite(result.recovery_s), 'passed': result.passed}
 
 
 def fuzz_text(result: FuzzResult) -> str:
@@ -122,10 +120,6 @@ def fuzz_text(result: FuzzResult) -> str:
               f'both users served {result.recovery_s:.1f} s after the last mutation']
     return '\n'.join([*lines, *(f'ENDED: {name}' for name in result.ended),
                       *(f'TRACE: {line}' for line in result.traces)])
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.ros.processes import Processes
-from system.chaos.crashes import ChaosError
+from system.chaos.trial import ChaosError
 from system.observer import NetworkObserver
 
 IMPAIRMENTS = Impairments(

@@ -29,8 +29,9 @@ from rhs_isac_ros.tools.demo import check_users, load_files, start_network
 from system.hosts import plan
 from system.hosts.namespaces import Hosts, NamespacesUnavailable, interruptible
 from system.hosts.trial import NetworkBroken, Trial
-from system.hosts.verdict import RECOVERY_LIMIT_S, Outage, figures, table
+from system.hosts.verdict import Outage, figures, table
 from system.observer import NetworkObserver
+from system.recovery import RECOVERY_LIMIT_S
 
 # Exit code of a skipped test, as test drivers define it.
 SKIPPED = 77

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rhs_isac_ros.monitoring.cycle_log import CycleTimes
+from system.recovery import RECOVERY_LIMIT_S, finite
 
-# Maximum time from the return of a link to the end of the next cycle [s].
-RECOVERY_LIMIT_S = 3.0
 _WARNING, _WAITING = '[WARN]', 'waiting for '
 # Messages that were sent before an outage have arrived after this time [s].
 _IN_FLIGHT_S = 0.2
@@ -121,13 +120,9 @@ def evaluate(
 def figures(outages: Sequence[Outage]) -> dict[str, Any]:
     """Return the figures of at least one outage for JSON, with None for infinite times."""
     worst_s = max(outage.recovery_s for outage in outages)
-    return {'outages': [{**dataclasses.asdict(outage), 'recovery_s': _finite(outage.recovery_s)}
+    return {'outages': [{**dataclasses.asdict(outage), 'recovery_s': finite(outage.recovery_s)}
                         for outage in outages],
-            'worst_recovery_s': _finite(worst_s)}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+            'worst_recovery_s': finite(worst_s)}
 
 
 def table(outages: Sequence[Outage]) -> str:

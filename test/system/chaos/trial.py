@@ -1,0 +1,110 @@
+"""What crash trials and intrusion trials have in common: service before, recovery after."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+from rhs_isac_ros.ros.processes import Processes
+from system.observer import NetworkObserver
+from system.recovery import RECOVERY_LIMIT_S
+
+TIMEOUT_S = 30.0
+# Number of latest cycles among which a served one is sought.
+_N_LATEST = 20
+
+
+class ChaosError(RuntimeError):
+    """The network does not reach the state in which a trial can begin."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trial:
+    """Result of one trial.
+
+    Attributes
+    ----------
+    recovery_s
+        Time from the end of the fault to the end of the first cycle that was served after it,
+        for a user of one of its own cycles [s]; infinite if there was none.
+    others_running
+        Whether all other processes kept running.
+    logged
+        Warnings that name the fault, each as ``<node>: <text>``.
+    diagnosed
+        Nodes whose diagnostics reported the fault.
+    violations
+        Results that violate an invariant.
+    """
+
+    recovery_s: float
+    others_running: bool
+    logged: tuple[str, ...]
+    diagnosed: tuple[str, ...]
+    violations: tuple[str, ...]
+
+    @property
+    def recovered(self) -> bool:
+        """Whether cycles were served in time and all other processes kept running."""
+        return self.recovery_s <= RECOVERY_LIMIT_S and self.others_running
+
+    @property
+    def reported(self) -> bool:
+        """Whether logs and diagnostics reported the fault, without repeated warnings."""
+        return bool(self.logged and self.diagnosed
+                    and len(set(self.logged)) == len(self.logged))
+
+
+def both_served(observer: NetworkObserver, first: int) -> bool:
+    """Return whether users 1 and 2 were served in the cycles from the index `first` on."""
+    return {1, 2} <= {
+        record.user for record in observer.log.ended[first:] if record.outcome == 'served'}
+
+
+def wait_for_service(observer: NetworkObserver) -> None:
+    """Wait until both users have been served in cycles that end from now on.
+
+    Raises
+    ------
+    ChaosError
+        If they are not.
+    """
+    first = len(observer.log.ended)
+    if not observer.spin_until(lambda: both_served(observer, first), TIMEOUT_S):
+        outcomes = [record.outcome for record in observer.log.ended[first:]]
+        raise ChaosError(f'the users were not served within {TIMEOUT_S:g} s; outcomes of the '
+                         f'cycles: {outcomes or "none"}')
+
+
+def measure_recovery(
+        observer: NetworkObserver, end_s: float, user: int | None,
+        also: Callable[[], bool] = lambda: True) -> float:
+    """Return the time from the end of a fault until a cycle was served [s]; infinite: never.
+
+    Parameters
+    ----------
+    end_s
+        End of the fault on the clock `time.monotonic` [s].
+    user
+        User that must be served; None: any.
+    also
+        A further condition.
+    """
+    def recovered() -> bool:
+        return also() and any(
+            record.outcome == 'served' and record.began_s > end_s and user in (None, record.user)
+            for record in observer.log.ended[-_N_LATEST:])
+    return time.monotonic() - end_s if observer.spin_until(recovered, TIMEOUT_S) else float('inf')
+
+
+def warnings_since(
+        processes: Processes, log_lengths: dict[str, int], excluded: str = '') -> list[str]:
+    """Return new warnings in the logs of all nodes but one, each with the name of its node.
+
+    Parameters
+    ----------
+    log_lengths
+        Length of each log at the beginning, by name of the process.
+    """
+    return [f'{name}: {line.split("]: ", 1)[-1]}'
+            for name, length in log_lengths.items() if name != excluded
+            for line in processes.log(name)[length:].splitlines() if '[WARN]' in line]
