@@ -4,17 +4,6 @@ from rhs_isac_ros.protocol import base_station_table
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_states import State
 from rhs_isac_ros.protocol.base_station_steps import BaseStationSteps
-from rhs_isac_ros.protocol.events import (
-    CodebookOffered,
-    PauseRequested,
-    PeersChanged,
-    Resumed,
-    ResumeRequested,
-    SettingsOffered,
-    StepRequested,
-    StoodBy,
-    Timeout,
-)
 
 
 class BaseStation(BaseStationSteps):
@@ -39,10 +28,5 @@ class BaseStation(BaseStationSteps):
 
     STATES = State
     TABLE = base_station_table.TABLE
-    EVENT_NAMES = {
-        CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
-        PauseRequested: 'pause', ResumeRequested: 'resume', StepRequested: 'step',
-        StoodBy: 'stood_by', Resumed: 'resumed', Timeout: 'timeout', m.Ack: 'ack',
-        m.RhsConfiguration: 'configured', m.FeedSignals: 'frame', m.PositionEstimate: 'estimate',
-        m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
+    EVENT_NAMES = base_station_table.EVENT_NAMES
     BLOCKED_STATES = frozenset({State.WAITING})

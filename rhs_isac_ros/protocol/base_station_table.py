@@ -39,6 +39,13 @@ def give_up(
                outcome=outcome)
 
 
+EVENT_NAMES = {
+    CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
+    PauseRequested: 'pause', ResumeRequested: 'resume', StepRequested: 'step',
+    StoodBy: 'stood_by', Resumed: 'resumed', Timeout: 'timeout', m.Ack: 'ack',
+    m.RhsConfiguration: 'configured', m.FeedSignals: 'frame', m.PositionEstimate: 'estimate',
+    m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
+
 TABLE = (
     # Offers and presence. A new codebook and new settings take effect with the next cycle.
     Row(source=(State.WAITING,), event=CodebookOffered, guard=Steps.peers_present,
