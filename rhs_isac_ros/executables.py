@@ -59,11 +59,11 @@ def __getattr__(name: str) -> Callable[[], int]:
             missing = str(error.name).partition('.')[0]
             if missing == 'rhs_isac_ros':
                 raise
-            print(f'error: {name} needs {_what_provides(missing)}', file=sys.stderr)
+            print_error(f'needs {_what_provides(missing)}', name)
             return 1
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        return exit_code_of(module.main)
+        return exit_code_of(module.main, program=name)
     return main
 
 
@@ -97,8 +97,29 @@ def _end_with_parent() -> None:
             os._exit(0)
 
 
+def print_error(error: object, program: str = '') -> None:
+    """Print an error as argparse does.
+
+    Parameters
+    ----------
+    error
+        The error or its text.
+    program
+        Name of the program; by default that of the process.
+    """
+    print(f'{program or _program()}: error: {error}', file=sys.stderr)
+
+
+def _program() -> str:
+    spec = getattr(sys.modules['__main__'], '__spec__', None)
+    if spec is None:
+        return os.path.basename(sys.argv[0])
+    return f'python -m {spec.name.removesuffix(".__main__")}'
+
+
 def exit_code_of(
-        main: Callable[[], int | None], errors: tuple[type[Exception], ...] = ()) -> int:
+        main: Callable[[], int | None], errors: tuple[type[Exception], ...] = (),
+        program: str = '') -> int:
     """Run a main function, and handle the standard streams of the process.
 
     Parameters
@@ -107,6 +128,8 @@ def exit_code_of(
         Returns an exit code; None is 0.
     errors
         Exceptions whose messages are errors of the user.
+    program
+        Name of the program, see `print_error`.
 
     Returns
     -------
@@ -128,14 +151,14 @@ def exit_code_of(
         discard_stdout()
         return 0
     except errors as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, program)
         return 2
     except OSError as error:
         # The errors of files name one.
         if error.filename is not None:
             raise
         discard_stdout()
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, program)
         return 1
 
 

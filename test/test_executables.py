@@ -68,10 +68,10 @@ def without(module, monkeypatch):
 
 
 @pytest.mark.parametrize(('module', 'present', 'expected'), [
-    ('rclpy', False, 'error: bs needs ROS 2 Jazzy, '),
-    ('rhs_isac_msgs', False, 'error: bs needs ROS 2 Jazzy, '),
+    ('rclpy', False, 'bs: error: needs ROS 2 Jazzy, '),
+    ('rhs_isac_msgs', False, 'bs: error: needs ROS 2 Jazzy, '),
     ('rhs_isac_msgs.msg', True, 'run `ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`'),
-    ('scipy.linalg', True, 'error: bs needs scipy, which is not installed')])
+    ('scipy.linalg', True, 'bs: error: needs scipy, which is not installed')])
 def test_a_missing_package_is_named_in_one_line(
         module, present, expected, monkeypatch, signal_handlers, capsys):
     without(module, monkeypatch)
@@ -79,6 +79,24 @@ def test_a_missing_package_is_named_in_one_line(
     assert executables.bs() == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert expected in line
+
+
+@pytest.mark.parametrize(('spec', 'expected'), [
+    (None, 'fig4.py: error: x\n'),
+    (types.SimpleNamespace(name='lab.__main__'), 'python -m lab: error: x\n'),
+    (types.SimpleNamespace(name='lab.tool'), 'python -m lab.tool: error: x\n')])
+def test_an_error_names_the_program_of_the_process_by_default(spec, expected, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, '__main__', types.SimpleNamespace(__spec__=spec))
+    monkeypatch.setattr(sys, 'argv', ['/lab/fig4.py', 'x'])
+    executables.print_error('x')
+    assert capsys.readouterr().err == expected
+
+
+def test_an_error_of_the_user_names_the_program(capsys):
+    def fail():
+        raise LookupError('no such place')
+    assert executables.exit_code_of(fail, (LookupError,), 'lab') == 2
+    assert capsys.readouterr().err == 'lab: error: no such place\n'
 
 
 def test_a_missing_module_of_the_package_itself_is_not_hidden(monkeypatch, signal_handlers):

@@ -107,7 +107,7 @@ def test_an_executable_without_ros_fails_with_one_line(installation, name):
     done = installation.run(name)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f'error: {name} needs ROS 2 Jazzy, which is not sourced')
+    assert line.startswith(f'{name}: error: needs ROS 2 Jazzy, which is not sourced')
 
 
 def test_the_extra_all_is_the_union_of_the_optional_features():

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from rhs_isac_ros.codebook.command import ERRORS, add_options, check, run
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model.arguments import ArgumentParser
 
 
@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         run(options)
     except ERRORS as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     return 0
 

@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 
+from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.experiments.jobs import JobError
 from rhs_isac_ros.model.arguments import ArgumentParser, integer, output_folder
 from rhs_isac_ros.model.optional import MissingLibraryError
@@ -75,7 +76,6 @@ def run_command(experiment: Callable[[], None]) -> int:
               file=sys.stderr)
         return _INTERRUPTED
     except (JobError, MissingLibraryError, OSError) as error:
-        print(f'error: {error}; finished jobs are kept; repeat the command to resume',
-              file=sys.stderr)
+        print_error(f'{error}; finished jobs are kept; repeat the command to resume')
         return 1
     return 0

@@ -17,6 +17,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options, check
 from rhs_isac_ros.codebook.command import run as run_command
+from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model.arguments import ArgumentParser, HelpFormatter, input_file
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
@@ -180,7 +181,7 @@ def main(args: Sequence[str] | None = None) -> int:
             return _push(Codebook.load(options.push_file), args)
         codebook, reason = run_command(options)
     except ERRORS as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, topics.OPTIMIZER_NODE)
         return 2
     if options.push:
         return _push(codebook, args)
@@ -213,7 +214,7 @@ def _push(codebook: Codebook, args: Sequence[str]) -> int:
     try:
         push(node, codebook)
     except PushError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, topics.OPTIMIZER_NODE)
         return 1
     except KeyboardInterrupt:
         return 0

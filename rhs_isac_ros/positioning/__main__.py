@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     # Errors of scenario and codebook are ValueErrors.
     except (ValueError, OSError, MemoryError, MissingLibraryError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     return 0
 

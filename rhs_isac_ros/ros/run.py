@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.ros import command_line, parameters
 from rhs_isac_ros.ros.parameter import ParameterError
@@ -49,7 +50,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     make
         Creates the nodes.
     args
-        Command line; by default that of the process.
+        Command line with the name of the program; by default that of the process.
     done
         Polled; the nodes stop spinning when it returns True.
 
@@ -59,6 +60,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         Exit code: 0 after a signal, a shutdown or when done; 2 if a parameter or a file is
         invalid.
     """
+    program = os.path.basename(args[0]) if args else ''
     # A list, because a handler may interrupt the other one and must not take a lock.
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -68,7 +70,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         rclpy.init(args=None if args is None else list(args),
                    signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, program)
         return 2
     nodes: Sequence[Node] = ()
     executor = None
@@ -84,7 +86,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     except ExternalShutdownException:
         pass
     except (ParameterError, ParameterException, ScenarioError, CodebookError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, program)
         return 2
     finally:
         for node in nodes:

@@ -15,7 +15,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
@@ -64,16 +64,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except ScenarioError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     except CodebookError as error:
-        print(f'error: {error}; to create a codebook for a scenario: python -m '
-              'rhs_isac_ros.codebook --scenario FILE --output FILE', file=sys.stderr)
+        print_error(f'{error}; to create a codebook for a scenario: python -m '
+                    'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
         return 2
     try:
         recorder = Recorder(options.record, scenario) if options.record else None
     except RecordingError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     os.environ.update(private_domain())
     use_discovery_profile()
@@ -252,7 +252,7 @@ def _report(
     if options.record:
         print(f'recording: {options.record}')
     if problem:
-        print(f'error: {problem}', file=sys.stderr)
+        print_error(problem, 'demo')
     return 1 if problem or given_up else 0
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import ArgumentParser, check_distinct, input_file, output_file
 from rhs_isac_ros.ros.command_line import parse
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
         recorder = Recorder(options.file, scenario)
     except (ScenarioError, RecordingError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     try:
         code = run(lambda: [RecorderNode(recorder)], ['record', *arguments])

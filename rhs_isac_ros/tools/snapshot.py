@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
@@ -24,6 +24,7 @@ from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.subscriptions import subscribe_messages
 from rhs_isac_ros.tools.scene_picture import draw
 
+_PROGRAM = 'snapshot'
 # Within this time [s], every user publishes its true position; within twice this time, the
 # surface publishes its configuration.
 _REPORT_PERIOD_S = 0.5
@@ -91,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
     except ScenarioError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, _PROGRAM)
         return 2
     nodes: list[SnapshotNode] = []
     end_s = time.monotonic() + options.timeout
@@ -103,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def done() -> bool:
         return (nodes[0].complete or nodes[0].has_other_scenario
                 or time.monotonic() > end_s)
-    code = run(create, ['snapshot', *arguments], done)
+    code = run(create, [_PROGRAM, *arguments], done)
     if not nodes or not done():
         return code
     return write_picture(nodes[0].scene, nodes[0].mismatch, scenario, options)
@@ -126,12 +127,12 @@ def write_picture(
         Exit code: 0 or 1, as for `main`.
     """
     if mismatch and scene.configuration is None:
-        print(f'error: {mismatch}; if the network uses another scenario, pass it with '
-              '--config FILE', file=sys.stderr)
+        print_error(f'{mismatch}; if the network uses another scenario, pass it with '
+                    '--config FILE', _PROGRAM)
         return 1
     if not scene.users:
-        print(f'error: no user found within {options.timeout:g} s, in the domain '
-              f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace', file=sys.stderr)
+        print_error(f'no user found within {options.timeout:g} s, in the domain '
+                    f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace', _PROGRAM)
         return 1
     missing = sorted(user for user, state in scene.users.items() if not state.estimate)
     if missing:
@@ -140,7 +141,7 @@ def write_picture(
     try:
         draw(scene, scenario, options.output)
     except OSError as error:
-        print(f'error: {options.output}: cannot be written: {error.strerror}', file=sys.stderr)
+        print_error(f'{options.output}: cannot be written: {error.strerror}', _PROGRAM)
         return 1
     print(options.output)
     return 0
@@ -148,7 +149,7 @@ def write_picture(
 
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
-        prog='snapshot', description='Draw the scene of a network when every user has an '
+        prog=_PROGRAM, description='Draw the scene of a network when every user has an '
         'estimate. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('--output', type=picture_file, default='scene.png', metavar='FILE',
                         help='picture to write: PNG, PDF or SVG (default: scene.png)')

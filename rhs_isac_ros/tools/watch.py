@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import discard_stdout, exit_code_of
+from rhs_isac_ros.executables import discard_stdout, exit_code_of, print_error
 from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
@@ -25,6 +25,7 @@ from rhs_isac_ros.tools.watch_view import render
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+_PROGRAM = 'watch'
 _REFRESH_PERIOD_S = 0.25
 # Refresh period when the output is not a terminal [s].
 _PRINT_PERIOD_S = 1.0
@@ -72,12 +73,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = parse(_parser(), arguments)
     try:
-        with optional_import('watch', extra='watch'):
+        with optional_import('watch', extra=_PROGRAM):
             import rich  # noqa: F401
     except MissingLibraryError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, _PROGRAM)
         return 1
-    arguments = ['watch', *arguments]
+    arguments = [_PROGRAM, *arguments]
     try:
         return _print_once(options.timeout, arguments) if options.once else _show_live(arguments)
     except BrokenPipeError:
@@ -138,8 +139,8 @@ def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
     if nodes and nodes[0].overview.fixes:
         Console().print(render(nodes[0].overview, time.monotonic()))
     elif time.monotonic() - began_s > timeout_s:
-        print(f'error: no complete cycle within {timeout_s:g} s, in the domain '
-              f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace', file=sys.stderr)
+        print_error(f'no complete cycle within {timeout_s:g} s, in the domain '
+                    f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace', _PROGRAM)
         return 1
     return code
 
@@ -151,7 +152,7 @@ def _create(nodes: list[WatchNode]) -> list[WatchNode]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
-        prog='watch', description='Show phase, users, losses and faults of a network until '
+        prog=_PROGRAM, description='Show phase, users, losses and faults of a network until '
         'Ctrl-C. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('--once', action='store_true',
                         help='wait for one complete cycle, print the view, and exit')

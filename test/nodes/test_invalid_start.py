@@ -89,7 +89,7 @@ def assert_clear(code, log, name, crashed):
     # The log lines of ROS begin with a severity.
     lines = [line for line in log.splitlines() if not line.startswith('[')]
     assert len(lines) == 1, log
-    assert 'error: ' in lines[0]
+    assert lines[0].startswith(f'{CASES[name][0]}: error: ')
     for word in CASES[name][2]:
         assert word in lines[0], log
 

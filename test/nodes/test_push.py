@@ -61,7 +61,7 @@ def test_a_codebook_of_another_scenario_is_rejected(
     table1.codebook.save(tmp_path / 'large.yaml')
     code, log = call(processes, network, '--push-file', tmp_path / 'large.yaml')
     assert code == 1, log
-    assert 'error: /push/optimizer: codebook rejected: analog: shape' in log
+    assert 'optimizer: error: /push/optimizer: codebook rejected: analog: shape' in log
     assert ids[-1] == before
     assert process.running
 

@@ -45,5 +45,5 @@ def test_without_a_network_it_is_an_error(capsys):
     assert write_picture(SceneState(), '', Scenario(), options) == 1
     out, err = capsys.readouterr()
     assert out == ''
-    assert err.startswith('error: no user found within 0.5 s, in the domain ')
+    assert err.startswith('snapshot: error: no user found within 0.5 s, in the domain ')
     assert not options.output.exists()

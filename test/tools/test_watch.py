@@ -19,7 +19,8 @@ SCRIPT = ROOT / 'scripts' / 'watch'
 
 
 def test_once_prints_a_cycle_and_every_node(network, run_script):
-    text = run_script(f'{SCRIPT} --once')
+    # Wide enough for the faults of a loaded machine in one line.
+    text = run_script(f'env COLUMNS=200 {SCRIPT} --once')
     codebook = Codebook.load(ROOT / 'config' / 'codebook_quick.yaml')
     assert f'codebook {codebook.id}' in text
     row = r'^ +[12] +(-?\d+\.\d\d +){3}\d+\.\d\d +\d+\.\d\d +\d+\.\d\d +\d+\.\d{3} +\d+\.\d *$'
@@ -58,11 +59,12 @@ def test_once_without_a_network_is_an_error(built_scripts):
         [SCRIPT, '--once', '--timeout', '0.3', '--ros-args', '-r', '__ns:=/nobody'],
         capture_output=True, text=True, timeout=30, check=False)
     assert (done.returncode, done.stdout) == (1, '')
-    assert done.stderr.startswith('error: no complete cycle within 0.3 s, in the domain ')
+    assert done.stderr.startswith('watch: error: no complete cycle within 0.3 s, in the domain ')
 
 
 def test_a_missing_library_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'rich', None)
     assert main(['--once']) == 1
     assert capsys.readouterr().err == (
-        "error: watch needs rich, which is not installed (pip install 'rhs_isac_ros[watch]')\n")
+        'watch: error: watch needs rich, which is not installed '
+        "(pip install 'rhs_isac_ros[watch]')\n")

@@ -14,6 +14,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
@@ -62,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     os.environ.update(private_domain())
     use_discovery_profile()
@@ -78,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     impairments=soaking.IMPAIRMENTS if options.soak else None)
                 figures = _run(observer, processes, scenario, options, Path(logs), codebook_file)
         except ChaosError as error:
-            print(f'error: {error}', file=sys.stderr)
+            print_error(error, parser.prog)
             return 1
         except (KeyboardInterrupt, ExternalShutdownException):
             return 0

@@ -12,6 +12,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
@@ -59,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
     except (ScenarioError, CodebookError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     profile = None if options.usual_discovery else discovery_profile_file()
     try:
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'hosts: skipped: no network namespaces: {error}', file=sys.stderr)
         return SKIPPED
     except NetworkBroken as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 1
     except KeyboardInterrupt:
         return 130
