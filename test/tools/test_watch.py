@@ -27,7 +27,7 @@ def test_once_prints_a_cycle_and_every_node(network, run_script):
     assert re.search(row, text, re.MULTILINE), text
     for node in ('bs', 'channel', 'optimizer', 'positioner', 'rhs_controller', 'transmission',
                  'user_1', 'user_2'):
-        assert re.search(f'^ {node} .*(no fault|new faults) ', text, re.MULTILINE), text
+        assert re.search(f'^ {node} .*(no fault +|new faults: )', text, re.MULTILINE), text
 
 
 def test_watch_refreshes_the_terminal_until_it_is_interrupted(built_scripts, network):
