@@ -21,7 +21,7 @@ from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model.arguments import ArgumentParser, HelpFormatter, input_file
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
-from rhs_isac_ros.ros.command_line import parameter_help, parse
+from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.parameter_service import GroupParameterService
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
@@ -171,6 +171,7 @@ def main(args: Sequence[str] | None = None) -> int:
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
     parser = _parser()
     options = parse(parser, args[1:])
+    check_parameters(parser, topics.OPTIMIZER_NODE, args[1:])
     if not remove_ros_args(args)[1:]:
         return run(lambda: [OptimizerNode()], args)
     if options.push_file and options.push:

@@ -1,9 +1,10 @@
 """Command lines with ROS arguments, and the help of the nodes."""
 
 import argparse
+import itertools
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from rclpy.utilities import remove_ros_args
 
@@ -67,15 +68,55 @@ def node_parser(executable: str, description: str) -> ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
+def check_parameters(
+        parser: argparse.ArgumentParser, executable: str, arguments: Sequence[str]) -> None:
+    """Exit with a usage error if ``-p`` sets a parameter that only other executables have.
+
+    A parameter file may set it, because several nodes may share the file. Parameters that no
+    executable has are left to `parameters.check_overrides`.
+    """
+    accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
+    for name in _assigned(arguments):
+        owners = [owner for owner in NODES if name in _names(owner)]
+        if owners and name not in accepted:
+            parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '
+                         f'expected one of {executable}')
+
+
+def _names(executable: str) -> list[str]:
+    """Return the names of the parameters of an executable, without those of composed nodes."""
+    names = [parameter.name for parameter in NODES[executable]]
+    return [*names, *CODEBOOK] if executable == 'optimizer' else names
+
+
+def _assigned(arguments: Sequence[str]) -> Iterator[str]:
+    """Yield the parameters that options set for all nodes of the process."""
+    in_ros_arguments = False
+    for word, following in itertools.pairwise(arguments):
+        if word in ('--ros-args', '--'):
+            in_ros_arguments = word == '--ros-args'
+        elif in_ros_arguments and word in ('-p', '--param'):
+            name, _, _ = following.partition(':=')
+            # A name with a colon begins with the name of the node that it is for.
+            if ':' not in name:
+                yield name
+
+
+def _composed(executable: str) -> list[str]:
+    """Return the other executables whose nodes run in the process of an executable."""
+    return [name for name in NODES if name not in ('network', 'visualizer')
+            ] if executable == 'network' else []
+
+
 def parameter_help(executable: str) -> str:
     """Return a description of the parameters of an executable, with an example."""
     own = list(NODES[executable])
     lines = ['ROS parameters:', *(_describe(parameter) for parameter in own)]
     if executable == 'optimizer':
         lines += [f'  {name}\n      {text}' for name, text in CODEBOOK.items()]
-    elif executable == 'network':
-        others = {parameter.name: parameter for name, parameters in NODES.items()
-                  if name not in (executable, 'visualizer') for parameter in parameters
+    elif composed := _composed(executable):
+        # The network numbers its users itself.
+        others = {parameter.name: parameter for name in composed for parameter in NODES[name]
                   if parameter.name != 'user_id'}
         lines += ['', 'ROS parameters of the composed nodes:', *map(_describe, others.values())]
     example = _example(own)

@@ -126,7 +126,7 @@ def check_overrides(node: Node) -> None:
     """Check that the values given to a node at its start belong to known parameters.
 
     Values of parameters that only other executables declare are permitted, because several nodes
-    may share a parameter file.
+    may share a parameter file; `command_line.check_parameters` rejects them after ``-p``.
 
     Raises
     ------

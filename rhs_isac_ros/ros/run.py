@@ -119,6 +119,8 @@ def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., 
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)
         first_line = (sys.modules[make.__module__].__doc__ or '').partition('\n')[0]
-        command_line.parse(command_line.node_parser(executable, first_line), arguments)
+        parser = command_line.node_parser(executable, first_line)
+        command_line.parse(parser, arguments)
+        command_line.check_parameters(parser, executable, arguments)
         return run(make, [executable, *arguments])
     return main
