@@ -79,7 +79,7 @@ class BaseStationSteps(BaseStationGuards):
         self._set_pausing(True)
 
     def resume(self, event: ResumeRequested, now_s: float) -> list[Action]:
-        """Store that no pause is requested any more, and log that cycles resume."""
+        """Store that no pause is requested, and log that cycles resume."""
         self._set_pausing(False)
         return [LogMessage('resumed')]
 

@@ -101,11 +101,14 @@ def _run(
     trials: list[Trial] = []
     if options.intruders is None:
         trials += _crash(observer, processes, options)
+        print(report.trial_summary('crashes', trials))
     if options.nodes is None and options.phases is None:
-        trials += _intrude(observer, processes, scenario, options, folder, codebook_file)
+        intrusions = _intrude(observer, processes, scenario, options, folder, codebook_file)
+        print(report.trial_summary('second nodes', intrusions))
+        trials += intrusions
     observer.spin_for(CHECK_DELAY_S)
     figures = report.trial_figures(trials, observer.invariants)
-    print(report.trial_summary(figures))
+    print(report.publication_summary(figures))
     return figures
 
 

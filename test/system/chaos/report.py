@@ -1,6 +1,7 @@
 """Results of the chaos trials as text and as JSON figures."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,13 +40,18 @@ def trial_figures(trials: Sequence[Trial], invariants: InvariantChecker) -> dict
     }
 
 
-def trial_summary(figures: Mapping[str, Any]) -> str:
-    """Return the figures of `trial_figures` as one line."""
-    worst_s = figures['worst_recovery_s']
-    worst = 'never' if worst_s is None else f'{worst_s:.2f} s'
-    return (f'{figures["trials_reported"]} of {figures["trials"]} reported once; '
-            f'{figures["trials_recovered"]} of {figures["trials"]} recovered within the limit, '
-            f'slowest: {worst}; {figures["wrong_publications"]} wrong publications among '
+def trial_summary(kind: str, trials: Sequence[Trial]) -> str:
+    """Return a line about the trials of one kind."""
+    worst_s = max((trial.recovery_s for trial in trials), default=0.0)
+    worst = f'{worst_s:.2f} s' if math.isfinite(worst_s) else 'never'
+    return (f'{kind}: {sum(trial.reported for trial in trials)} of {len(trials)} reported once; '
+            f'{sum(trial.recovered for trial in trials)} of {len(trials)} recovered within the '
+            f'limit, slowest: {worst}')
+
+
+def publication_summary(figures: Mapping[str, Any]) -> str:
+    """Return the publications that `trial_figures` counted as one line."""
+    return (f'{figures["wrong_publications"]} wrong publications among '
             f'{figures["checked_publications"]}, {figures["unverified_publications"]} of which '
             'preceded the discovery of a node by the observer')
 

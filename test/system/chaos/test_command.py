@@ -44,7 +44,7 @@ def test_cycles_are_served_after_a_crash(small_files, tmp_path):
     assert trial['logged'] and 'bs' in trial['diagnosed']
 
 
-def test_the_elder_of_two_base_stations_resumes_when_the_newer_has_gone(small_files, tmp_path):
+def test_the_older_of_two_base_stations_resumes_when_the_newer_has_gone(small_files, tmp_path):
     figures, output = chaos(small_files, tmp_path, '--intruders', 'bs', '--seconds', '1')
     (trial,) = figures['table']
     assert (trial['intruder'], trial['others_running']) == ('bs', True)

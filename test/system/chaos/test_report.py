@@ -33,7 +33,9 @@ def test_trials_with_recovery_and_reports_pass():
     assert (figures['trials'], figures['trials_recovered'], figures['trials_reported']) == (
         2, 2, 2)
     assert (figures['worst_recovery_s'], figures['wrong_publications']) == (2.5, 0)
-    assert '2 of 2 recovered' in report.trial_summary(figures)
+    assert report.trial_summary('crashes', [crash_trial(), crash_trial(recovery_s=2.5)]) == (
+        'crashes: 2 of 2 reported once; 2 of 2 recovered within the limit, slowest: 2.50 s')
+    assert report.publication_summary(figures).startswith('0 wrong publications among 0, 0 of')
     assert report.crash_line(crash_trial()).split() == [
         'rhs_controller', 'positioning', '1.00', 's', 'running', 'bs;', 'bs']
 
@@ -68,7 +70,10 @@ def test_violations_fail_and_are_printed():
 
 
 def test_an_infinite_recovery_is_none_in_json():
-    assert figures_of(crash_trial(recovery_s=math.inf))['worst_recovery_s'] is None
+    trial = crash_trial(recovery_s=math.inf)
+    assert figures_of(trial)['worst_recovery_s'] is None
+    assert report.trial_summary('crashes', [trial]).endswith(
+        '0 of 1 recovered within the limit, slowest: never')
 
 
 def soak_result(**fields):

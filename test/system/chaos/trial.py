@@ -1,4 +1,4 @@
-"""What crash trials and intrusion trials have in common: service before, recovery after."""
+"""The common parts of crash trials and intrusion trials: service before, recovery after."""
 
 import dataclasses
 import time
