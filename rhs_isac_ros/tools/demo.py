@@ -99,6 +99,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
 
 
+def add_network_options(parser: argparse.ArgumentParser) -> None:
+    """Add the seed and the files of a network to the options of a command."""
+    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
+    parser.add_argument('--config', type=input_file, metavar='FILE',
+                        help="scenario file; by default the paper's Table I")
+    parser.add_argument('--codebook', type=input_file, metavar='FILE',
+                        help='codebook file; by default that of the package')
+
+
 def check_users(parser: argparse.ArgumentParser, users: int, instead: str = '') -> None:
     """Exit with a usage error if a process for each user would overload this machine.
 
@@ -216,12 +225,7 @@ def _parser() -> argparse.ArgumentParser:
         'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--users', type=positive_int, default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=20, help='cycles to wait for')
-    parser.add_argument('--seed', type=seed, default=0,
-                        help='seed of all random numbers')
-    parser.add_argument('--config', type=input_file, metavar='FILE',
-                        help="scenario file; by default the paper's Table I")
-    parser.add_argument('--codebook', type=input_file, metavar='FILE',
-                        help='codebook file; by default that of the package')
+    add_network_options(parser)
     parser.add_argument('--record', type=output_file, metavar='FILE',
                         help='recording to write (MCAP)')
     parser.add_argument('--picture', type=picture_file, default='demo.png', metavar='FILE',

@@ -19,11 +19,9 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
     check_distinct,
-    input_file,
     output_file,
     positive_float,
     positive_int,
-    seed,
 )
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.monitoring.invariants import CHECK_DELAY_S
@@ -31,7 +29,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo import load_files, start_network
+from rhs_isac_ros.tools.demo import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.chaos.trial import ChaosError, Trial
 from system.observer import NetworkObserver
@@ -185,11 +183,7 @@ def _parser() -> argparse.ArgumentParser:
                              f'{", ".join(intruders.INTRUDERS)}')
     parser.add_argument('--seconds', type=positive_float, default=intruders.SECONDS,
                         metavar='S', help='duration of each intrusion')
-    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', type=input_file,
-                        help="scenario file; by default the paper's Table I")
-    parser.add_argument('--codebook', type=input_file,
-                        help='codebook file; by default that of the package')
+    add_network_options(parser)
     parser.add_argument('--json', type=output_file, metavar='PATH',
                         help='JSON file for the results')
     return parser

@@ -17,16 +17,14 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
     check_distinct,
-    input_file,
     integer,
     output_file,
     positive_float,
-    seed,
 )
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.resources import discovery_profile_file
-from rhs_isac_ros.tools.demo import check_users, load_files, start_network
+from rhs_isac_ros.tools.demo import add_network_options, check_users, load_files, start_network
 from system.hosts import plan
 from system.hosts.namespaces import Hosts, NamespacesUnavailable, interruptible
 from system.hosts.trial import NetworkBroken, Trial
@@ -154,11 +152,7 @@ def _parser() -> argparse.ArgumentParser:
                         help='duration of each outage')
     parser.add_argument('--users', type=integer(1, 64), metavar='N', default=2,
                         help='number of users')
-    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', type=input_file,
-                        help="scenario file; by default the paper's Table I")
-    parser.add_argument('--codebook', type=input_file,
-                        help='codebook file; by default that of the package')
+    add_network_options(parser)
     parser.add_argument('--usual-discovery', action='store_true',
                         help="use Fast DDS's default settings instead of the package's profile")
     parser.add_argument('--static-peers', action='store_true',
