@@ -122,6 +122,22 @@ def test_the_signals_of_a_cycle_come_from_one_channel(network):
     assert violations(net) == []
 
 
+@pytest.mark.parametrize(('changes', 'accepted'), [
+    ({}, True), ({'user_instance': 0, 'sender': 0}, True),
+    ({'user_instance': 77}, False), ({'sender': 77}, False)])
+def test_signals_of_another_instance_are_rejected(network, example, changes, accepted):
+    net = network()
+    net.run_to(State.SOUNDING)
+    station, first = net['bs'], net.sent(m.Grant)[-1]
+    signals = [example(m.FeedSignals, cycle_id=first.cycle_id, user=1, frame=frame,
+                       user_instance=first.user_instance, sender=net.instances['channel'])
+               for frame in (0, 1)]
+    station.handle(signals[0], net.now_s)
+    station.handle(dataclasses.replace(signals[1], **changes), net.now_s)
+    assert (station.state is State.SOUNDING) != accepted
+    assert station.counters['wrong_instance'] == (not accepted)
+
+
 def test_signals_of_several_channels_are_a_violation(network):
     net = network()
     net.run_cycles(1)
