@@ -14,7 +14,7 @@ from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.events import SettingsOffered
-from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 
 PLACE = np.array([8.0, -2.0, 0.5])
 
@@ -33,8 +33,7 @@ def configuration(codebooks):
 
 @pytest.fixture
 def pilots():
-    return [m.Pilot(
-        cycle_id=3, user=1, band=0, frame=frame, symbol_re=1.0, symbol_im=0.0) for frame in (0, 1)]
+    return pilots_of(3, 1)
 
 
 @pytest.fixture
@@ -120,6 +119,28 @@ def test_a_pilot_of_another_user_is_not_answered(scenario, truth, configuration,
     assert channel.counters == {'wrong_user': 1}
 
 
+def test_a_pilot_of_another_node_with_the_number_is_not_answered(
+        scenario, truth, configuration, pilots):
+    channel = Channel(scenario, 0)
+    known, foreign, by_hand = (dataclasses.replace(pilots[0], sender=sender)
+                               for sender in (5, 6, 0))
+    sent = feed(channel, [dataclasses.replace(truth, sender=5), configuration, foreign, known,
+                          by_hand])
+    assert [len(batch) for batch in sent] == [0, 0, 0, 1, 1]
+    assert channel.counters == {'wrong_instance': 1}
+
+
+def test_the_first_beam_of_a_cycle_stands(scenario, truth, beam, applied, downlink):
+    """A second node may steer as well; data are delivered with the beam of the first."""
+    channel = Channel(scenario, 0)
+    first = dataclasses.replace(beam, sender=5)
+    second = dataclasses.replace(beam, sender=6, digital=1e-3 * beam.digital)
+    *_, (delivered,) = feed(channel, [truth, applied, first, second, downlink])
+    *_, (expected,) = feed(Channel(scenario, 0), [truth, applied, first, downlink])
+    assert delivered.bits == expected.bits > 0
+    assert channel.counters == {'wrong_instance': 1}
+
+
 @pytest.mark.parametrize('cycle_id', [2, 4])
 def test_a_pilot_of_another_cycle_is_discarded_with_the_next_cycle(
         scenario, truth, configuration, example, cycle_id):
@@ -193,9 +214,13 @@ def received(channel, codebook, user, cycle_id):
         m.GroundTruth(cycle_id=cycle_id, user=user, position=PLACE, velocity=np.zeros(3)),
         m.RhsConfiguration(cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0,
                            codebook_id='x', analog=codebook.analog[0]),
-        *(m.Pilot(cycle_id=cycle_id, user=user, band=0, frame=frame, symbol_re=1.0,
-                  symbol_im=0.0) for frame in (0, 1))]
+        *pilots_of(cycle_id, user)]
     return np.array([feeds.signals for sent in feed(channel, events) for feeds in sent])
+
+
+def pilots_of(cycle_id, user):
+    return [m.Pilot(cycle_id=cycle_id, user=user, band=0, frame=frame, symbol_re=1.0,
+                    symbol_im=0.0) for frame in (0, 1)]
 
 
 def make_deviating(scenario, **impairments):
@@ -220,6 +245,16 @@ def test_a_deviation_changes_the_signals_and_can_be_switched_off(scenario, codeb
     declared.handle(SettingsOffered(Impairments()), 0.0)
     np.testing.assert_allclose(received(impaired, codebooks[0], 1, 4), plain, rtol=1e-6)
     assert not np.allclose(received(declared, codebooks[0], 1, 4), plain, rtol=1e-3)
+
+
+def test_a_new_deviation_of_the_impaired_channel_applies_from_the_next_cycle(scenario, codebooks):
+    channel = ImpairedChannel(
+        make_deviating(scenario), Impairments(), np.random.default_rng(0))
+    before = received(channel, codebooks[0], 1, 1)
+    channel.handle(SettingsOffered(Impairments(phase_std_rad=7.0)), 0.0)
+    again = [feeds.signals for sent in feed(channel, pilots_of(1, 1)) for feeds in sent]
+    np.testing.assert_array_equal(again, before)
+    assert not np.allclose(received(channel, codebooks[0], 1, 2), before, rtol=1e-3)
 
 
 @pytest.mark.parametrize(('name', 'same_user', 'same_surface'), [

@@ -8,7 +8,7 @@ import pytest
 from rhs_isac_ros.monitoring.invariants import RECEIVES, InvariantChecker
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_states import State
-from rhs_isac_ros.protocol.events import PeersChanged, Resumed, StoodBy
+from rhs_isac_ros.protocol.events import PauseRequested, PeersChanged, Resumed, StoodBy
 
 
 def violations(net):
@@ -185,14 +185,38 @@ def test_the_older_of_two_base_stations_stands_by_and_resumes(network):
     assert {outcome for _, _, outcome in net.outcomes()[-3:]} == {'served'}
     net.remove('bs_twin')
     last = max(beacon.cycle_id for beacon in net.sent(m.Beacon))
+    since = len(net.log)
     net.dispatch('bs', Resumed(last + 1000))
     net.dispatch('bs', PeersChanged(()))
     net.run_cycles(6)
     assert {outcome for _, _, outcome in net.outcomes()[-5:]} == {'served'}
-    ids = [beacon.cycle_id for beacon in net.sent(m.Beacon, len(net.log) - 1)]
-    assert all(cycle_id > last for cycle_id in ids)
+    own = [beacon.cycle_id for beacon in net.sent(m.Beacon, since)
+           if beacon.sender == net.instances['bs']]
+    assert own[0] == min(own) == last + 1000
     net.verify()
     assert violations(net) == []
+
+
+def test_a_station_that_stands_by_begins_no_cycle(network, codebooks):
+    net = network()
+    net.run_cycles(1)
+    net.dispatch('bs', StoodBy())
+    since = len(net.log)
+    net.offer(codebooks[1])
+    net.run(limit_s=10.0)
+    assert net['bs'].state is State.WAITING
+    assert net.sent(m.Beacon, since) == []
+
+
+def test_a_pause_outlasts_a_time_as_the_older_station(network):
+    net = network()
+    net.run_cycles(1)
+    net.dispatch('bs', PauseRequested())
+    net.dispatch('bs', StoodBy())
+    net.dispatch('bs', Resumed(1))
+    net.dispatch('bs', PeersChanged(()))
+    net.run(limit_s=10.0)
+    assert net['bs'].state is State.PAUSED
 
 
 def test_a_station_that_resumes_never_reuses_its_own_cycle_ids(network):
