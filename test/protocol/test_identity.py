@@ -96,6 +96,18 @@ def test_results_of_two_users_with_one_number_are_never_mixed(network, places, n
     assert violations(net) == []
 
 
+def test_a_repeated_ack_is_a_duplicate(network):
+    net = network(2)
+    net.run_cycles(1)
+    net.run_to(State.BEACONING)
+    (beacon,) = net.sent(m.Beacon)[-1:]
+    ack = m.Ack(cycle_id=beacon.cycle_id, user=1, sender=net.instances['user1'])
+    for expected in (0, 1):
+        net['bs'].handle(ack, net.now_s)
+        assert net['bs'].counters['duplicate'] == expected
+    assert net['bs'].state is State.BEACONING
+
+
 def test_a_number_without_an_instance_remains_usable(network):
     """A station without the field, or a message sent by hand, addresses every node."""
     net = network(absent=('bs',))
@@ -212,11 +224,13 @@ def test_a_pause_outlasts_a_time_as_the_older_station(network):
     net = network()
     net.run_cycles(1)
     net.dispatch('bs', PauseRequested())
+    since = len(net.log)
     net.dispatch('bs', StoodBy())
     net.dispatch('bs', Resumed(1))
     net.dispatch('bs', PeersChanged(()))
     net.run(limit_s=10.0)
     assert net['bs'].state is State.PAUSED
+    assert net.sent(m.Beacon, since) == []
 
 
 def test_a_station_that_resumes_never_reuses_its_own_cycle_ids(network):
