@@ -14,7 +14,7 @@ import numpy as np
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError, plugins
 from rhs_isac_ros.model.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
@@ -144,10 +144,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _compare(options)
     except (RecordingError, ScenarioError, CodebookError, ModelError, plugins.PluginError,
             OSError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     except RepublishError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 1
     return 0
 

@@ -113,7 +113,7 @@ def test_another_codebook_is_assumed_with_a_warning(run, random_beams, tmp_path,
 def test_a_mismatch_is_named(run, capsys, arguments, error):
     assert main([str(run.path), *map(str, arguments)]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith('error: ')
+    assert line.startswith('replay: error: ')
     assert error in line
 
 
@@ -170,7 +170,7 @@ def test_topics_of_a_running_network_are_not_published(built_scripts, run, share
         text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout) == (1, '')
     assert done.stderr.splitlines()[-1] == (
-        'error: received_signals: already published by another node')
+        'replay: error: received_signals: already published by another node')
 
 
 @pytest.mark.parametrize('arguments, error', [
