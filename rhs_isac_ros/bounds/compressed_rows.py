@@ -40,7 +40,9 @@ class CompressedRows:
         n_subbands, n_elements = scenario.n_subbands, scenario.n_elements
 
         def flat_rows(block: slice, band: int) -> np.ndarray:
-            return source(block, band).reshape(-1, n_subbands * n_elements)
+            # A single item can have another memory layout, of which a view as real numbers fails.
+            return np.ascontiguousarray(
+                source(block, band).reshape(-1, n_subbands * n_elements))
 
         self.coefficients: list[np.ndarray] = []
         self.bases: list[np.ndarray] = []

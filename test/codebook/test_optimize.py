@@ -432,6 +432,12 @@ def test_numbers_below_one_are_errors(scenario, method, name, value):
         optimize(scenario, method=method, **{name: value})
 
 
+@pytest.mark.parametrize('objective', OBJECTIVES)
+def test_a_single_position_suffices(scenario, objective):
+    result = optimize(scenario, n_positions=1, objective=objective, max_steps=3)
+    assert result.history[-1].value_m2 < result.history[0].value_m2
+
+
 def test_a_start_that_does_not_fit_is_an_error(scenario, table1, small):
     with pytest.raises(CodebookError, match=r'^analog: shape .*, expected \[N_B, F, N_E\] = '):
         optimize(scenario, start=table1.codebook, max_steps=1)
