@@ -24,13 +24,15 @@ def minimize_levels(search: Search) -> str:
     exchanges single amplitudes for neighbouring levels, in the order of the gradient, as long as
     that lowers the objective. L-BFGS-B minimises over continuous variables.
     """
-    relaxed = max(int(_RELAXED * search.max_steps), 1)
-    variables = _penalised(search, search.start, 0.0, relaxed)
-    share = max(int(_PENALISED * search.max_steps / len(_WEIGHTS)), 1)
-    for weight in _WEIGHTS:
-        variables = _penalised(search, variables, weight, share)
-    steps = search.max_steps - relaxed - share * len(_WEIGHTS)
-    return _exchange(search, variables, steps)
+    share = _PENALISED / len(_WEIGHTS)
+    variables, left = search.start, search.max_steps
+    for weight, part in ((0.0, _RELAXED), *((weight, share) for weight in _WEIGHTS)):
+        # At least one step in each round, unless none is left.
+        steps = min(max(int(part * search.max_steps), 1), left)
+        if steps:
+            variables = _penalised(search, variables, weight, steps)
+        left -= steps
+    return _exchange(search, variables, left)
 
 
 def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int) -> np.ndarray:
@@ -51,35 +53,50 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
-    """Sweep over exchanges of single amplitudes until none lowers the objective."""
+    """Exchange single amplitudes until none lowers the objective; return why it stopped."""
     levels = search.amplitude_levels - 1
     variables = np.array(variables)
     variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels
     while max_steps > 0:
         used, variables = _digital(search, variables, min(_DIGITAL_STEPS, max_steps))
         max_steps -= used
-        value, gradient = search.value_and_gradient(variables)
-        by_analog = gradient[:search.n_analog]
-        target = variables[:search.n_analog] - np.sign(by_analog) / levels
-        # Exchanges with the largest expected decrease first; a level outside is none.
-        allowed = np.flatnonzero((target > -0.5 / levels) & (target < 1 + 0.5 / levels))
-        exchanged = failures = 0
-        for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
-            if failures == _MAX_FAILURES or exchanged >= max_steps:
-                break
-            candidate = np.array(variables)
-            candidate[entry] = np.rint(target[entry] * levels) / levels
-            lower = search.value(candidate)
-            if lower < value:
-                value, variables = lower, candidate
-                exchanged, failures = exchanged + 1, 0
-                search.on_step()
-            else:
-                failures += 1
-        max_steps -= exchanged
-        if not exchanged:
-            return 'no exchange of an amplitude lowers the objective'
+        if max_steps:
+            variables, exchanged, n_failed, n_allowed = _sweep(search, variables, max_steps)
+            max_steps -= exchanged
+            if not exchanged:
+                return ('no exchange of an amplitude lowers the objective'
+                        if n_failed == n_allowed else
+                        f'none of the {n_failed} most promising exchanges lowers the objective')
     return 'max_steps reached'
+
+
+def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
+           ) -> tuple[np.ndarray, int, int, int]:
+    """Exchange amplitudes in the order of the expected decrease.
+
+    Returns the variables, the number of exchanges, that of failures since the last one, and that
+    of the amplitudes that have a level in the direction of descent.
+    """
+    levels = search.amplitude_levels - 1
+    value, gradient = search.value_and_gradient(variables)
+    by_analog = gradient[:search.n_analog]
+    target = variables[:search.n_analog] - np.sign(by_analog) / levels
+    # A level outside of [0, 1] does not exist.
+    allowed = np.flatnonzero((target > -0.5 / levels) & (target < 1 + 0.5 / levels))
+    exchanged = failures = 0
+    for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
+        if failures == _MAX_FAILURES or exchanged == max_exchanges:
+            break
+        candidate = np.array(variables)
+        candidate[entry] = np.rint(target[entry] * levels) / levels
+        lower = search.value(candidate)
+        if lower < value:
+            value, variables = lower, candidate
+            exchanged, failures = exchanged + 1, 0
+            search.on_step()
+        else:
+            failures += 1
+    return variables, exchanged, failures, len(allowed)
 
 
 def _digital(search: Search, start: np.ndarray, max_steps: int) -> tuple[int, np.ndarray]:

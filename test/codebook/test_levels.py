@@ -82,6 +82,19 @@ def test_every_step_holds_a_codebook_of_levels():
         codebook.check(scenario)
 
 
+@pytest.mark.parametrize('max_steps', [1, 3, 6, 30])
+def test_the_limit_of_steps_holds_in_every_phase(max_steps):
+    result = optimize(with_levels(2), POSITIONS[:4], max_steps=max_steps)
+    assert result.history[-1].step == max_steps
+    assert result.reason == 'max_steps reached'
+
+
+def test_the_reason_does_not_claim_exchanges_that_were_not_tried(monkeypatch):
+    monkeypatch.setattr('rhs_isac_ros.codebook.levels._MAX_FAILURES', 2)
+    result = optimize(with_levels(2), POSITIONS[:4], max_steps=200)
+    assert result.reason == 'none of the 2 most promising exchanges lowers the objective'
+
+
 def test_starts_use_the_levels():
     scenario = with_levels(2)
     for codebook in (random_codebook(scenario, np.random.default_rng(0)),
