@@ -17,6 +17,7 @@ from rhs_isac_ros.codebook.optimize import (
     INTERRUPTED,
     METHODS,
     OptimizeResult,
+    check_start,
     optimize,
 )
 from rhs_isac_ros.codebook.plot import plot_optimization
@@ -111,7 +112,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     start = _start(options.start, scenario, options.seed)
     resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
     for codebook in filter(None, (start, resumed)):
-        codebook.check(scenario)
+        check_start(codebook, scenario)
     with _progress_bar(options) as show:
         result = optimize(
             scenario, method=options.method, objective=options.objective,

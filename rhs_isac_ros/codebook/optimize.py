@@ -128,10 +128,11 @@ def optimize(
             raise ValueError(f'{name}: {value!r}, expected one of {sorted(known)}')
     if max_steps is None:
         max_steps = METHODS[method].steps or 1
-    for name, limit in (('n_positions', n_positions), ('max_evaluations', max_evaluations),
-                        ('max_steps', max_steps)):
-        if limit is not None and limit < 1:
-            raise ValueError(f'{name}: {limit}, expected at least 1')
+    for name, number, low in (('n_positions', n_positions, 1), ('seed', seed, 0),
+                              ('max_evaluations', max_evaluations, 1),
+                              ('max_steps', max_steps, 1)):
+        if number is not None and number < low:
+            raise ValueError(f'{name}: {number}, expected at least {low}')
     if positions is None:
         positions = SAMPLINGS[sampling](
             scenario, n_positions, streams.generator(seed, streams.SAMPLES))
@@ -145,8 +146,7 @@ def optimize(
     done = provenance.resumed(resume) if resume else provenance
     first = resume or start or STARTS.get(method, random_codebook)(
         scenario, streams.generator(seed, streams.START))
-    # A start with continuous amplitudes is the better one.
-    first.check(dataclasses.replace(scenario, amplitude_levels=0))
+    check_start(first, scenario)
     problem = Problem(scenario, OBJECTIVES[objective](
         scenario, positions, streams.generator(seed, streams.PAIRS)))
 
@@ -165,6 +165,15 @@ def optimize(
         _PeriodicCall(progress, lambda: keep(result('not finished'))) if keep else progress,
         (done.steps, done.evaluations))
     return result(_run(search, minimize))
+
+
+def check_start(codebook: Codebook, scenario: Scenario) -> None:
+    """Raise CodebookError if a search for a scenario cannot start from a codebook.
+
+    Its amplitudes may be continuous even if those of the scenario are not, because the search
+    over levels begins with continuous amplitudes.
+    """
+    codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
 
 
 def _minimizer(scenario: Scenario, method: str) -> Callable[[Search], str] | None:

@@ -1,6 +1,7 @@
 """The optimiser as a command: its files, also after errors and interrupts."""
 
 import argparse
+import dataclasses
 import errno
 import os
 import subprocess
@@ -78,6 +79,14 @@ def test_the_start_is_a_name_or_a_file(call, files, scenario):
         assert call('--method', 'random', '--start', start) == 0
         codebook = Codebook.load(files / 'codebook.yaml')
         np.testing.assert_array_equal(codebook.analog, expected.analog)
+
+
+def test_a_start_with_continuous_amplitudes_suits_levels(call, files, scenario, small):
+    small.codebook.save(files / 'start.yaml')
+    levels = dataclasses.replace(scenario, amplitude_levels=2)
+    (files / 'scenario.yaml').write_text(yaml.safe_dump(levels.changes()), encoding='utf-8')
+    assert call('--steps', 1, '--start', files / 'start.yaml') == 0
+    Codebook.load(files / 'codebook.yaml').check(levels)
 
 
 def test_ctrl_c_writes_the_best_codebook_and_reports_it(

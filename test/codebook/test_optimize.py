@@ -471,6 +471,11 @@ def test_a_tiny_region_is_accepted(scenario, objective):
     result.codebook.check(tiny)
 
 
+def test_a_negative_seed_is_an_error(scenario):
+    with pytest.raises(ValueError, match='^seed: -1, expected at least 0$'):
+        optimize(scenario, seed=-1)
+
+
 def test_a_seed_may_be_large(scenario):
     result = optimize(scenario, n_positions=4, seed=2**31 - 1, max_steps=1)
     assert Provenance.parse(result.codebook.provenance).seed == 2**31 - 1
