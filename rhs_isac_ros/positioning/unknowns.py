@@ -16,6 +16,9 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 UNIFORM_STD_RAD = 2.0
 # Standard deviation of a Gaussian whose density at its centre is that of the uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
+# Smallest standard deviation, in the unit of the parameter: without effect, but its inverse
+# square is finite in single precision.
+_MIN_STD = 1e-15
 # Parameters that move the signals out of the nulls of the multipath, so that they must be known
 # before the search.
 _SHARP = ('carrier_offset', 'timing')
@@ -58,11 +61,11 @@ class Unknowns:
                 if parameter.name != 'phase' or np.isfinite(self.band_phase_std_rad)]
         self.names = [parameters[q].name for q in kept]
         self.patterns = nuisance_patterns(scenario)[kept]
-        std = np.array([parameters[q].std for q in kept])
+        std = np.array([max(parameters[q].std, _MIN_STD) for q in kept])
         uniform = np.array([name in ('phase', 'band_phase') for name in self.names], bool)
         uniform &= std > UNIFORM_STD_RAD
         self.std = np.where(uniform, _UNIFORM_EQUIVALENT, std)
-        self.precision = np.where(uniform, 0.0, 1 / np.maximum(std, 1e-300)**2)
+        self.precision = np.where(uniform, 0.0, 1 / std**2)
         self.gain = self.names.index('gain') if 'gain' in self.names else None
         self.sharp = [q for q, name in enumerate(self.names) if name in _SHARP]
 
@@ -140,4 +143,6 @@ class Alignment:
 
 
 def _phase_std(std: float) -> float:
-    return np.inf if std > UNIFORM_STD_RAD else std
+    if std == 0:
+        return 0.0
+    return np.inf if std > UNIFORM_STD_RAD else max(std, _MIN_STD)
