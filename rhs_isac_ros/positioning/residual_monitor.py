@@ -28,20 +28,32 @@ class ResidualMonitor:
     ----------
     n_measurements
         Complex measurements of a positioning phase, N_B N_SB F.
+    window
+        Number of fixes in the mean, at least `MIN_FIXES`.
+
+    Raises
+    ------
+    ValueError
+        If the window is smaller, so that no residuals would be judged.
     """
 
     def __init__(self, n_measurements: int, window: int = WINDOW) -> None:
+        if window < MIN_FIXES:
+            raise ValueError(f'window: {window}, expected at least {MIN_FIXES}')
         self._energies: deque[float] = deque(maxlen=window)
         # Half a chi-square variable of 2 k degrees of freedom is a gamma variable of shape k.
         self._shape = max(n_measurements - _N_FITTED / 2, 0.5)
 
     def add(self, energy: float) -> None:
-        """Add the energy of the residual of a fix; NaN, from an estimator without one, is not."""
+        """Add the energy of the residual of a fix.
+
+        NaN, from an estimator that computes no residual, is ignored.
+        """
         if not np.isnan(energy):
             self._energies.append(energy)
 
     def clear(self) -> None:
-        """Forget all residuals, for example after a change of the scenario or codebook."""
+        """Remove all residuals, for example after a change of the scenario or codebook."""
         self._energies.clear()
 
     @property

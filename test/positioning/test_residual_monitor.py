@@ -41,6 +41,13 @@ def test_few_residuals_are_not_judged():
     assert filled([1e6] * MIN_FIXES).warning != ''
 
 
+@pytest.mark.parametrize('window', [-1, 0, MIN_FIXES - 1])
+def test_a_window_without_verdicts_is_an_error(window):
+    with pytest.raises(ValueError, match=f'^window: {window}, expected at least {MIN_FIXES}$'):
+        ResidualMonitor(64, window)
+    assert ResidualMonitor(64, MIN_FIXES).warning == ''
+
+
 def test_old_residuals_are_forgotten():
     monitor = filled([*energies(WINDOW, 2.0), *energies(WINDOW)])
     assert monitor.warning == ''
