@@ -34,7 +34,13 @@ class SurfaceImperfection:
     stuck: np.ndarray
 
     def applied(self, analog: np.ndarray) -> np.ndarray:
-        """Return the coefficients in effect, complex128, for configurations [..., N_E]."""
+        """Return the coefficients in effect, complex128, for configurations [..., N_E].
+
+        Raise ValueError if the surface has another number of elements.
+        """
+        if analog.shape[-1:] != self.gains.shape:
+            raise ValueError(f'surface: {len(self.gains)} elements, expected N_E = '
+                             f'{analog.shape[-1]} as in the configurations')
         coefficients: np.ndarray = np.where(np.isnan(self.stuck), analog, self.stuck) * self.gains
         return coefficients
 

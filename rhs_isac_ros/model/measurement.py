@@ -106,7 +106,7 @@ class MeasurementModel:
     Raises
     ------
     ValueError
-        If the beamforming does not have the sizes of the scenario.
+        If the beamforming or the surface does not have the sizes of the scenario.
     """
 
     def __init__(self, scenario: Scenario, beamforming: Beamforming,

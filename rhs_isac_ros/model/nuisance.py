@@ -77,8 +77,17 @@ def nuisance_factors(scenario: Scenario, values: np.ndarray) -> np.ndarray:
 
     Takes float64 [N, Q], in the order and units of `nuisance_parameters`; returns complex128
     [N, N_B, N_SB F].
+
+    Raises
+    ------
+    ValueError
+        If there is not one value for each parameter.
     """
-    factors: np.ndarray = np.exp(np.tensordot(values, nuisance_patterns(scenario), axes=1))
+    patterns = nuisance_patterns(scenario)
+    if np.ndim(values) != 2 or np.shape(values)[1] != len(patterns):
+        raise ValueError(f'values: shape {np.shape(values)}, expected [N, Q] with Q = '
+                         f'{len(patterns)}')
+    factors: np.ndarray = np.exp(np.tensordot(values, patterns, axes=1))
     return factors
 
 

@@ -58,7 +58,8 @@ def simulate_received(
     Raises
     ------
     ValueError
-        If `positions` is not a finite [N, 3] array.
+        If `positions` is not a finite [N, 3] array, or the codebook or the surface does not have
+        the sizes of the scenario.
     """
     positions = checked_positions(positions)
     drawn, factors = draw_deviations(scenario, len(positions), rng)

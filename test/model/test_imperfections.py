@@ -115,3 +115,13 @@ def test_a_given_surface_is_used(small, uncertain):
         silent, small.codebook, positions, np.random.default_rng(0), surface)
     model = MeasurementModel(silent, small.codebook, surface)
     np.testing.assert_allclose(received, model.mean(positions), rtol=1e-6)
+
+
+def test_a_surface_of_another_size_is_an_error(small):
+    other = draw_surface(Scenario(), np.random.default_rng(9))
+    positions = small.scenario.sample_positions(2, np.random.default_rng(10))
+    with pytest.raises(ValueError, match='^surface: 100 elements, expected N_E = 16 as in '):
+        MeasurementModel(small.scenario, small.codebook, other)
+    with pytest.raises(ValueError, match='^surface: 100 elements, expected N_E = 16 as in '):
+        simulate_received(
+            small.scenario, small.codebook, positions, np.random.default_rng(0), other)

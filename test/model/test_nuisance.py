@@ -54,6 +54,12 @@ def test_factors_written_out_for_one_measurement(uncertain):
     assert factor[1, 6, 3] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize('shape', [(6,), (2, 5), (2, 7)])
+def test_values_of_another_shape_are_an_error(uncertain, shape):
+    with pytest.raises(ValueError, match=r'^values: shape \(.*\), expected \[N, Q\] with Q = 6$'):
+        nuisance_factors(uncertain, np.zeros(shape))
+
+
 def test_directions_match_finite_differences(uncertain, shipped):
     model = MeasurementModel(uncertain, shipped)
     mean = model.mean(uncertain.sample_positions(3, np.random.default_rng(1)))
