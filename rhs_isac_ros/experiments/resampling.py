@@ -111,8 +111,18 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
     seed
         Seed of the resampled members; different for results with other members.
     quantiles
-        Quantiles to compute instead of the mean.
+        Quantiles to compute instead of the mean, from 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        If `results` has another shape or no finite value, or a quantile is out of range.
     """
+    if results.ndim != 2 or not np.isfinite(results).any():
+        raise ValueError(f'results: shape {results.shape}, expected [members, cases] with a '
+                         'finite value')
+    if not all(0 <= quantile <= 1 for quantile in quantiles):
+        raise ValueError(f'quantiles: {quantiles}, expected 0 to 1')
     n_members, n_cases = results.shape
     rng, drawn = np.random.default_rng([1, seed]), max(n_members - 1, 1)
     members = np.vstack([

@@ -58,6 +58,18 @@ def test_statistics_without_resampling_are_those_of_the_results():
     assert middle.minus(quarter).values[0] == middle.values[0] - quarter.values[0]
 
 
+@pytest.mark.parametrize('results', [
+    np.ones(3), np.ones((0, 3)), np.ones((2, 0)), np.full((2, 3), np.nan)])
+def test_results_without_a_value_are_an_error(results):
+    with pytest.raises(ValueError, match=r'^results: shape .*, expected \[members, cases\]'):
+        replicate(results, 0)
+
+
+def test_quantiles_out_of_range_are_an_error():
+    with pytest.raises(ValueError, match=r'^quantiles: \(0.5, 1.5\), expected 0 to 1$'):
+        replicate(np.ones((2, 3)), 0, (0.5, 1.5))
+
+
 def test_cases_that_a_member_did_not_serve_do_not_count():
     results = np.tile([[1.0, np.nan, 3.0, np.nan], [np.nan, 5.0, np.nan, 6.0]], 10)
     assert replicate(results, 0)[0].values[0] == pytest.approx(15 / 4)
