@@ -17,8 +17,7 @@ from rhs_isac_ros.model.multipath import (
     multipath_covariance,
 )
 from rhs_isac_ros.positioning.modes import find_modes
-from rhs_isac_ros.positioning.polar import jacobian, to_positions
-from rhs_isac_ros.positioning.region import likelihood_loss
+from rhs_isac_ros.positioning.samples import draw_samples
 from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.templates import tabulate
 
@@ -115,24 +114,11 @@ def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray
     Every mode of the likelihood contributes with the mass of its Gaussian inside the region.
     """
     table = TemplateTable(receiver.scenario, tabulate(receiver))
-    low, high = receiver.scenario.roi_bounds_m
     means = []
     for signals in received:
         modes = find_modes(receiver, table, signals)
-        factors = np.linalg.inv(np.swapaxes(np.linalg.cholesky(modes.curvature), 1, 2))
-        # Sampled around the point where the Gaussian enters the region; the weights correct for
-        # the shift.
-        shift = np.linalg.solve(factors, modes.roi_offset[..., None])[..., 0]
-        log_weights = (
-            modes.log_likelihood + np.log(np.linalg.det(jacobian(modes.points)))
-            - np.log(np.linalg.det(modes.curvature)) / 2
-            - likelihood_loss(modes.roi_offset, modes.curvature))[:, None] - shift @ table.normal.T
-        positions = to_positions(
-            (modes.points + modes.roi_offset)[:, None]
-            + np.matmul(table.normal, np.swapaxes(factors, 1, 2)))
-        inside = ((positions >= low) & (positions <= high)).all(axis=-1)
-        if not inside.any():
-            positions, inside = np.clip(positions, low, high), ~inside
-        weights = np.where(inside, np.exp(log_weights - log_weights[inside].max()), 0.0).ravel()
+        positions, log_weights, _ = draw_samples(
+            modes, table.normal, receiver.scenario.roi_bounds_m)
+        weights = np.exp(log_weights - log_weights.max()).ravel()
         means.append(weights @ positions.reshape(-1, 3) / weights.sum())
     return np.array(means)
