@@ -24,6 +24,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import argparse
 import dataclasses
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,8 +33,11 @@ from parts.array_receiver import ArrayReceiver, posterior_means
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.directional import SCANS
-from rhs_isac_ros.experiments import markdown_table, positive_int
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.experiments import markdown_table
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int, seed
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import radiation_matrix
 
@@ -104,14 +108,15 @@ def receivers(scenario: Scenario, seed: int) -> dict[str, Callable[[], ArrayRece
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = ArgumentParser(
+        prog='scripts/benchmark baselines', description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--positions', type=positive_int, default=1000,
                         help='number of positions (default: %(default)s)')
     parser.add_argument('--multipath', type=float, default=0.0, metavar='DB',
                         help='level of the multipath [dB] (default: %(default)s)')
-    parser.add_argument('--seed', type=int, default=1, help='seed (default: %(default)s)')
-    parser.add_argument('--json', type=Path, help='JSON file for the results')
+    parser.add_argument('--seed', type=seed, default=1, help='seed (default: %(default)s)')
+    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario(multipath_to_los_db=options.multipath)
     positions = scenario.sample_positions(
@@ -131,8 +136,8 @@ def main() -> None:
     print(markdown_table(['receiver', 'average CRLB [m²]', 'mean squared error [m²]',
                           'standard error', 'median'], rows))
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(exit_code_of(main, (ScenarioError,)))
