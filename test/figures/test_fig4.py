@@ -119,7 +119,10 @@ def test_the_report_has_tables_picture_and_data(fig4, results, tmp_path, capsys)
     fig4.fig4_report.write(results, options)
     out = capsys.readouterr().out
     assert '10000 test positions; 3 trainings with 7 pairs' in out
-    assert '| scan-grid     | 4.' in out or '| scan-grid ' in out
+    tables = [cells(line) for line in out.splitlines() if line.startswith('| scan-grid ')]
+    assert [row[0] for row in tables] == ['scan-grid']
+    assert float(tables[0][1].split()[0]) == pytest.approx(4.0, rel=0.05)
+    assert tables[0][3] == '3'
     assert (tmp_path / 'fig4.png').read_bytes().startswith(b'\x89PNG')
     rows = list(csv.DictReader((tmp_path / 'fig4b.csv').read_text().splitlines()))
     assert len(rows) == len(LEVELS) * 60
