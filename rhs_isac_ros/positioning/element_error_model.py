@@ -69,9 +69,10 @@ class ElementErrorModel:
             value[k] = self._log_weights[k] - residual[k] - volume + self._log_volume
             curvature[k] = quadratic_form(white[:, 1:])
             gradient[k] = 2 * np.einsum('mgs,ms->mg', white[:, 1:].conj(), white[:, 0]).real
-        weights = np.exp(value - value.max(axis=0))
+        highest = value.max(axis=0)
+        weights = np.exp(value - highest)
+        total = highest + np.log(weights.sum(axis=0))
         weights /= weights.sum(axis=0)
-        total = value.max(axis=0) + np.log(np.sum(np.exp(value - value.max(axis=0)), axis=0))
         best = np.take_along_axis(residual, value.argmax(axis=0)[None], axis=0)[0]
         if not step:
             # The modes keep their terms of the nuisance parameters.

@@ -9,8 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.positioning.joint_search import COARSE_STD_RAD, find_starts
-from rhs_isac_ros.positioning.modes import Modes
+from rhs_isac_ros.positioning.modes import (
+    MAX_MODES,
+    MIN_GAIN,
+    STEP_LIMITS,
+    TABLE_MARGIN,
+    Modes,
+)
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable
@@ -18,12 +25,10 @@ from rhs_isac_ros.positioning.unknowns import Unknowns
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 _MAX_STARTS = 96
-_MAX_MODES = 32
-_TABLE_MARGIN = 10.0
+# Maximum difference between the best log-likelihood and that of a mode, after an exact step.
 _EXACT_MARGIN = 9.0
 _N_STEPS = 5
-_MIN_GAIN = 0.02
-_STEP_LIMITS = np.array([0.02, 0.05, 0.05])
+# Limit of a step in range if the phases of the bands carry no information about it.
 _COARSE_STEP_M = 0.7
 # Squared distance, in units of the curvature, below which modes have converged to the same one.
 _SAME_MODE = 0.5
@@ -65,11 +70,11 @@ def find_joint_modes(
         Values [Q] of the parameters that `Alignment` determines, 0 for the others.
     """
     whitened = model.whiten((received * unknowns.factors(aligned))[None])[0]
-    starts = find_starts(table, unknowns, whitened, _MAX_STARTS, _TABLE_MARGIN)
+    starts = find_starts(table, unknowns, whitened, _MAX_STARTS, TABLE_MARGIN)
     joint, gain = _step(model, unknowns, received, starts.points, starts.values + aligned)
     for _ in range(_N_STEPS - 1):
         joint, gain = _prune(joint, gain)
-        (moving,) = np.nonzero(gain > _MIN_GAIN)
+        (moving,) = np.nonzero(gain > MIN_GAIN)
         if not len(moving):
             break
         moved, gain[moving] = _step(
@@ -92,7 +97,7 @@ def _prune(joint: JointModes, gain: np.ndarray) -> tuple[JointModes, np.ndarray]
         distance = np.einsum('mp,pq,mq->m', offset, curvature[index], offset)
         if not (distance < _SAME_MODE).any():
             kept.append(index)
-        if len(kept) == _MAX_MODES:
+        if len(kept) == MAX_MODES:
             break
     chosen = np.array(kept)
     return joint.select(chosen), gain[chosen]
@@ -109,7 +114,7 @@ def _step(
     marginal = curvature[:, :3, :3] - np.matmul(curvature[:, :3, 3:], coupling)
     marginal = (marginal + np.swapaxes(marginal, 1, 2)) / 2
     reduced = gradient[:, :3] - np.einsum('mqp,mq->mp', coupling, gradient[:, 3:])
-    limits = _STEP_LIMITS.copy()
+    limits = STEP_LIMITS.copy()
     if unknowns.band_phase_std_rad >= COARSE_STD_RAD:
         limits[0] = _COARSE_STEP_M
     step = np.linalg.solve(marginal, reduced[..., None])[..., 0]
@@ -140,8 +145,8 @@ def _local_model(
     by_point = np.matmul(np.swapaxes(jacobian(points), 1, 2), by_position.reshape(n, 3, -1))
     whitened = model.whiten(received * unknowns.factors(values))
     residual = (whitened - mean).reshape(n, -1)
-    expected = np.concatenate([by_point, unknowns.whitened_slopes(mean)], axis=1).view(float)
-    information = 2 * np.matmul(expected, np.swapaxes(expected, 1, 2))
+    expected = np.concatenate([by_point, unknowns.whitened_slopes(mean)], axis=1)
+    information = quadratic_form(expected)
     information += np.diag(np.concatenate([MIN_CURVATURE, unknowns.precision]))
     information[:, 3:, 3:] += unknowns.information
     slopes = np.concatenate([by_point, unknowns.whitened_slopes(whitened)], axis=1).view(float)

@@ -53,19 +53,17 @@ class MarginalSearch:
         """Find the modes for the signals of one positioning phase, [N_B, N_SB F]."""
         aligned = self._alignment.values(received)
         joint = find_joint_modes(self._model, self._table, self.unknowns, received, aligned)
-        signals = received * self.unknowns.factors(aligned)
+        whitened = self._model.whiten((received * self.unknowns.factors(aligned))[None])[0]
         modes, residual = joint.modes, joint.residual
         if self._error:
             divided = received * self.unknowns.factors(joint.values)
             modes, residual = self._error.refine(modes, divided, step=False)
         best = int(np.argmax(modes.roi_log_likelihood))
-        return Found(modes, float(residual[best]), self._model.whiten(signals[None])[0],
-                     self._outside(received, aligned))
+        return Found(modes, float(residual[best]), whitened, self._outside(whitened, aligned))
 
-    def _outside(self, received: np.ndarray, aligned: np.ndarray) -> float:
+    def _outside(self, whitened: np.ndarray, aligned: np.ndarray) -> float:
+        """Compute the evidence outside, with the sharp parameters by Laplace's method."""
         unknowns, sharp = self.unknowns, self.unknowns.sharp
-        divided = received * unknowns.factors(aligned)
-        whitened = self._model.whiten(divided[None])[0]
         evidence = self._over_gain(whitened)
         if sharp:
             precision = unknowns.precision[sharp]

@@ -10,16 +10,18 @@ from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable, separate
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
-_MAX_MODES = 32
+# Largest number of modes.
+MAX_MODES = 32
 # Maximum difference between the best log-likelihood and that of a mode: on the table, which is
 # accurate to one Gauss-Newton step, and after the first exact step.
-_TABLE_MARGIN = 10.0
+TABLE_MARGIN = 10.0
 _EXACT_MARGIN = 8.0
 # Modes closer than this in all of (r [m], u, v) have converged to the same maximum.
 _MIN_SEPARATION = np.array([0.01, 0.02, 0.02])
-_STEP_LIMITS = np.array([0.02, 0.05, 0.05])
+# The linear model of a step in (r [m], u, v) does not hold beyond these.
+STEP_LIMITS = np.array([0.02, 0.05, 0.05])
 # A mode has converged when its last step gained less log-likelihood than this.
-_MIN_GAIN = 0.02
+MIN_GAIN = 0.02
 # Maximum number of exact steps, in a short and in a long search.
 _SHORT_SEARCH_STEPS = 2
 LONG_SEARCH_STEPS = 12
@@ -71,22 +73,22 @@ def find_modes(
     The whitened signals of one positioning phase, complex128 [N_B, N_SB F], give at least one
     mode. The most likely in the region comes first. At least one exact step is taken.
     """
-    points = table.modes(whitened, _MAX_MODES, _TABLE_MARGIN)
+    points = table.modes(whitened, MAX_MODES, TABLE_MARGIN)
     modes, gain = _gauss_newton_step(model, points, whitened)
     value = modes.roi_log_likelihood
     order = np.argsort(-value)
     order = order[value[order] >= value[order[0]] - _EXACT_MARGIN]
-    chosen = order[separate(modes.points[order] / _MIN_SEPARATION, _MAX_MODES)]
+    chosen = order[separate(modes.points[order] / _MIN_SEPARATION, MAX_MODES)]
     modes, gain = modes.select(chosen), gain[chosen]
     for _ in range(max_steps - 1):
-        (moving,) = np.nonzero(gain > _MIN_GAIN)
+        (moving,) = np.nonzero(gain > MIN_GAIN)
         if not len(moving):
             break
         moved, gain[moving] = _gauss_newton_step(model, modes.roi_points[moving], whitened)
         for field, new in zip(modes, moved, strict=True):
             field[moving] = new
     order = np.argsort(-modes.roi_log_likelihood)
-    return modes.select(order[separate(modes.roi_points[order] / _MIN_SEPARATION, _MAX_MODES)])
+    return modes.select(order[separate(modes.roi_points[order] / _MIN_SEPARATION, MAX_MODES)])
 
 
 def _gauss_newton_step(
@@ -95,7 +97,7 @@ def _gauss_newton_step(
     """Return the modes after one step, and the gain of log-likelihood in the region, [M]."""
     curvature, gradient, value = _local_model(model, points, whitened)
     step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
-    step = np.clip(step, -_STEP_LIMITS, _STEP_LIMITS)
+    step = np.clip(step, -STEP_LIMITS, STEP_LIMITS)
     predicted = value + np.sum(gradient * step, axis=1) - likelihood_loss(step, curvature)
     points = points + step
     roi_offset = offset_to_roi(points, curvature, model.scenario.roi_bounds_m)
