@@ -101,7 +101,7 @@ def test_templates_cover_all_ranges():
 
 @pytest.mark.parametrize('name', ['bayes', 'ml'])
 def test_users_around_the_region_get_no_fix_and_nearly_all_inside_do(name, shipped):
-    """The shell extends from 0.5 m to 20 m; more users make the share 2 %."""
+    """The shell extends from 0.5 m to 20 m, as in `scripts/benchmark robustness`."""
     scenario, rng = Scenario(), np.random.default_rng(2)
     low, high = scenario.roi_bounds_m
     positions = rng.uniform([0, -25, -21], [35, 25, 21], (600, 3))
