@@ -64,6 +64,30 @@ def test_optimised_levels_beat_rounding(continuous, levels):
     assert result.codebook.average_crlb_m2 == pytest.approx(found, rel=2e-3)
 
 
+def test_the_penalty_moves_the_amplitudes_to_the_levels(monkeypatch):
+    rounds = []
+
+    def recording(objective, *arguments):
+        result = run_lbfgs(objective, *arguments)
+        rounds.append((objective, result.x))
+        return result
+
+    monkeypatch.setattr('rhs_isac_ros.codebook.levels.run_lbfgs', recording)
+    optimize(with_levels(3), POSITIONS, max_steps=100)
+    n_analog = random_codebook(SCENARIO, np.random.default_rng(0)).analog.size
+
+    def distance(variables):
+        return np.abs(2 * variables[:n_analog] - np.rint(2 * variables[:n_analog])).mean()
+
+    (_, relaxed), (objective, penalised) = rounds[0], rounds[5]
+    assert distance(penalised) < 0.5 * distance(relaxed)
+    point = relaxed.copy()
+    point[:n_analog] = np.clip(point[:n_analog], 0.01, 0.99)
+    step = 1e-6 * np.random.default_rng(0).normal(size=len(point))
+    difference = objective(point + step)[0] - objective(point - step)[0]
+    assert difference == pytest.approx(2 * objective(point)[1] @ step, rel=1e-4)
+
+
 def test_the_result_is_a_local_minimum_over_single_exchanges():
     scenario = Scenario(n_subbands=2, n_frames=2, n_feeds=2, elements_per_side=3,
                         center_frequencies_hz=(3e9,), amplitude_levels=2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario, element_error
 from rhs_isac_ros.model.element_error import error_factors
 from rhs_isac_ros.model.imperfections import draw_surface
 
@@ -59,6 +59,16 @@ def test_the_average_is_that_over_the_region(table1):
     scale = np.sqrt(np.einsum('brr->br', average).real)
     difference = (model.covariance() - average) / (scale[:, :, None] * scale[:, None, :])
     assert np.abs(difference).max() < 0.01
+
+
+def test_the_quadrature_over_the_region_has_converged(monkeypatch):
+    """A near, wide region and wide sub-bands need more nodes than Table I."""
+    scenario = Scenario(elements_per_side=4, n_subbands=4, subband_width_hz=5e6,
+                        roi_center_m=(3, 0, 0), roi_size_m=(4, 8, 4))
+    found = element_error.element_correlation(scenario, 0)
+    monkeypatch.setattr(element_error, '_ROI_NODES', 24)
+    expected = element_error.element_correlation.__wrapped__(scenario, 0)
+    assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
 def test_without_errors_the_covariance_is_the_same_everywhere(case):

@@ -117,6 +117,18 @@ def test_a_given_surface_is_used(small, uncertain):
     np.testing.assert_allclose(received, model.mean(positions), rtol=1e-6)
 
 
+def test_a_known_surface_is_that_of_the_samples(small, uncertain):
+    surface = draw_surface(uncertain, np.random.default_rng(9))
+    quiet = dataclasses.replace(
+        small.scenario, element_error_rms=0.3, failed_element_share=0.2, noise_psd_dbm_hz=-200,
+        multipath_to_los_db=-100)
+    positions = quiet.sample_positions(2, np.random.default_rng(10))
+    model = MeasurementModel(quiet, small.codebook, surface)
+    mean = model.mean(positions)
+    received = model.sample(positions, np.random.default_rng(0))
+    assert np.abs(received - mean).max() < 1e-3 * np.abs(mean).max()
+
+
 def test_a_surface_of_another_size_is_an_error(small):
     other = draw_surface(Scenario(), np.random.default_rng(9))
     positions = small.scenario.sample_positions(2, np.random.default_rng(10))

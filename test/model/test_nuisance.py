@@ -79,6 +79,8 @@ def test_draws_have_the_declared_deviations(uncertain):
     np.testing.assert_allclose(values.std(axis=0), stds, rtol=0.03)
     scaled = values / stds
     np.testing.assert_allclose(scaled.T @ scaled / 20_000, np.eye(6), atol=0.04)
+    other = draw_nuisance(uncertain, 20_000, np.random.default_rng(3))
+    assert not (other == values).any()
 
 
 def test_a_phase_with_the_deviation_of_a_turn_is_uniform():

@@ -28,6 +28,16 @@ def test_residuals_of_the_model_cause_no_warning():
         assert monitor.warning == ''
 
 
+def test_a_single_measurement_can_be_judged():
+    monitor = ResidualMonitor(1)
+    for value in gamma(0.5).rvs(WINDOW, random_state=np.random.default_rng(0)):
+        monitor.add(float(value))
+        assert monitor.warning == ''
+    for _ in range(WINDOW):
+        monitor.add(10.0)
+    assert monitor.warning != ''
+
+
 def test_slightly_larger_residuals_cause_a_warning_after_some_fixes():
     values = energies(WINDOW, 1.1)
     assert filled(values[:MIN_FIXES]).warning == ''
