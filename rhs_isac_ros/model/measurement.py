@@ -6,7 +6,6 @@ scenario declares add to the covariance; `nuisance` describes unknown gains and 
 """
 
 import functools
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,18 +14,13 @@ from rhs_isac_ros.model.element_error import (
     error_covariance_at,
     expected_beams,
 )
-from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.model.element_sums import ElementSums
 from rhs_isac_ros.model.imperfections import (
     SurfaceImperfection,
     draw_deviations,
     has_element_errors,
 )
-from rhs_isac_ros.model.los import (
-    checked_positions,
-    los_derivative,
-    los_derivative_terms,
-    los_gain,
-)
+from rhs_isac_ros.model.los import checked_positions, los_derivative, los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     measurement_correlation,
@@ -207,7 +201,7 @@ class MeasurementModel:
         for start in range(0, len(positions), _BLOCK):
             block = slice(start, start + _BLOCK)
             for band in range(len(self.radiation)):
-                mean[block, band], by_position = self._band_mean_and_jacobian(
+                mean[block, band], by_position = self._weights.mean_and_jacobian(
                     positions[block], band)
                 jacobian[block, :, band] = np.swapaxes(by_position, 0, 1)
         return mean, jacobian
@@ -243,52 +237,8 @@ class MeasurementModel:
         return received
 
     @functools.cached_property
-    def _weights(self) -> '_Weights':
-        scenario = self.scenario
-        shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
-        frames = np.ascontiguousarray(np.swapaxes(self.radiation.reshape(shape), 2, 3))
-        coordinates = np.hstack([np.ones((shape[3], 1)), element_positions(scenario)])
-        moments = coordinates[:, :, None] * frames[..., None, :]
-        return _Weights(frames, moments.reshape(*frames.shape[:3], -1))
-
-    def _band_mean_and_jacobian(
-            self, positions: np.ndarray, band: int) -> tuple[np.ndarray, np.ndarray]:
-        """Mean [N, N_SB F] and its derivative [3, N, N_SB F] from sums over the elements.
-
-        Each sum over elements of a T_i (p - p_m) is p times the sum of a T_i, minus the sum of
-        a T_i p_m: four sums of N_E terms that need no array of N_E by 3.
-        """
-        n, n_measurements = len(positions), self.shape[1]
-        gain, radial, boresight_term = los_derivative_terms(self.scenario, positions, band)
-        frames, moments = self._weights.frames[band], self._weights.moments[band]
-
-        def combine(elements: np.ndarray) -> np.ndarray:
-            products = np.matmul(elements.transpose(1, 0, 2), frames)
-            combined: np.ndarray = products.transpose(1, 0, 2).reshape(n, n_measurements)
-            return combined
-
-        sums = np.matmul(radial.transpose(1, 0, 2), moments)
-        sums = sums.reshape(-1, n, 4, frames.shape[2]).transpose(2, 1, 0, 3)
-        sums = sums.reshape(4, n, n_measurements)
-        by_position = positions.T[:, :, None] * sums[0] - sums[1:]
-        if boresight_term is not None:
-            by_position[0] += combine(boresight_term)
-        return combine(gain), by_position
-
-
-class _Weights(NamedTuple):
-    """Weights of the elements for `mean_and_jacobian`.
-
-    Attributes
-    ----------
-    frames
-        T_i, complex128 [N_B, N_SB, N_E, F].
-    moments
-        T_i times (1, x, y, z) of the element [m], complex128 [N_B, N_SB, N_E, 4 F].
-    """
-
-    frames: np.ndarray
-    moments: np.ndarray
+    def _weights(self) -> ElementSums:
+        return ElementSums(self.scenario, self.radiation)
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
