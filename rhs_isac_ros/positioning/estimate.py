@@ -12,8 +12,6 @@ from rhs_isac_ros.model import Scenario
 # Far above any received amplitude [sqrt(W)]; after whitening, its square is still finite in single
 # precision.
 _MAX_MAGNITUDE = 1e3
-
-
 # Mean [3], covariance [3, 3], reason, and optionally the energy of the residual.
 Located: TypeAlias = (
     tuple[np.ndarray, np.ndarray, str] | tuple[np.ndarray, np.ndarray, str, float])

@@ -38,8 +38,7 @@ class Network:
 
     The input x consists of the real and imaginary parts of the received signals, [D] =
     [2 N_B N_SB F], or of their magnitudes, [D] = [N_B N_SB F], each scaled to zero mean and unit
-    variance; the position is p = center +
-    w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
+    variance. The position is p = center + w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
 
     Attributes
     ----------

@@ -35,7 +35,8 @@ class SearchEstimator(abc.ABC):
     ----------
     reject_outside
         Whether signals that are more probably from outside of the region give no fix either; see
-        `surroundings`. Few users inside then lose theirs: the fewer measurements, the more.
+        `surroundings`. Some users inside then get no fix; their share grows as the number of
+        measurements falls.
 
     Raises
     ------

@@ -2,10 +2,10 @@
 
 The "256 nodes" that the paper mentions in its description of Fig. 4 are read as the units of the
 hidden layer. The paper does not specify the rest. This implementation uses the real and imaginary
-parts of the signals as inputs, the ReLU activation, the squared position error as the loss, and
-Adam with a learning rate of 10^-3. When the validation error has not decreased for some epochs,
-the batch size grows, which reduces the noise of the steps. Training stops after the largest
-batches, and the weights of the best epoch are used.
+parts of the signals or their magnitudes as inputs, the ReLU activation, the squared position error
+as the loss, and Adam with a learning rate of 10^-3. When the validation error has not decreased
+for some epochs, the batch size grows, which reduces the noise of the steps. Training stops after
+the largest batches, and the weights of the best epoch are used.
 """
 
 import copy

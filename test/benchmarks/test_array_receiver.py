@@ -11,6 +11,10 @@ from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import make_estimator
 
+# A small system and region.
+SCENARIO = Scenario(
+    n_subbands=2, n_frames=4, elements_per_side=4, angular_spread_deg=2.0, roi_center_m=(3, 0, 0),
+    roi_size_m=(1, 1, 0.5))
 FILE = Path(__file__).parents[2] / 'scripts' / 'benchmarks' / 'parts' / 'array_receiver.py'
 
 
@@ -23,49 +27,42 @@ def array_receiver():
 
 
 @pytest.fixture(scope='module')
-def scenario():
-    """A small system and region."""
-    return Scenario(n_subbands=2, n_frames=4, elements_per_side=4, angular_spread_deg=2.0,
-                    roi_center_m=(3, 0, 0), roi_size_m=(1, 1, 0.5))
+def codebook(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(0))
 
 
 @pytest.fixture(scope='module')
-def codebook(scenario, random_beams):
-    return random_beams(scenario, np.random.default_rng(0))
-
-
-@pytest.fixture(scope='module')
-def weights(scenario, codebook):
+def weights(codebook):
     """The weights of the elements in the signals of the surface."""
-    return radiation_matrix(scenario, codebook).reshape(2, 2, 4, 16)
+    return radiation_matrix(SCENARIO, codebook).reshape(2, 2, 4, 16)
 
 
 @pytest.fixture(scope='module')
-def surface(array_receiver, scenario, weights):
-    return array_receiver.ArrayReceiver(scenario, weights, np.arange(4))
+def surface(array_receiver, weights):
+    return array_receiver.ArrayReceiver(SCENARIO, weights, np.arange(4))
 
 
-def test_the_bound_of_the_surface_is_that_of_the_library(surface, scenario, codebook):
-    positions = scenario.sample_positions(20, np.random.default_rng(1))
+def test_the_bound_of_the_surface_is_that_of_the_library(surface, codebook):
+    positions = SCENARIO.sample_positions(20, np.random.default_rng(1))
     np.testing.assert_allclose(
-        surface.crlb(positions), crlb(scenario, codebook, positions), rtol=1e-4)
+        surface.crlb(positions), crlb(SCENARIO, codebook, positions), rtol=1e-4)
 
 
-def test_the_posterior_mean_is_as_accurate_as_bayes(array_receiver, surface, scenario, codebook):
-    positions = scenario.sample_positions(150, np.random.default_rng(1))
+def test_the_posterior_mean_is_as_accurate_as_bayes(array_receiver, surface, codebook):
+    positions = SCENARIO.sample_positions(150, np.random.default_rng(1))
     received = surface.simulate(positions, np.random.default_rng(2))
     own = np.sum((array_receiver.posterior_means(surface, received) - positions)**2, axis=1)
-    signals = simulate_received(scenario, codebook, positions, np.random.default_rng(3))
-    estimate = make_estimator('bayes', scenario, codebook).estimate(signals)
+    signals = simulate_received(SCENARIO, codebook, positions, np.random.default_rng(3))
+    estimate = make_estimator('bayes', SCENARIO, codebook).estimate(signals)
     other = np.sum((estimate.mean - positions)[estimate.fix]**2, axis=1)
     spread = np.hypot(own.std(), other.std()) / np.sqrt(150)
     assert abs(own.mean() - other.mean()) < 4 * spread
-    assert own.mean() < 0.5 * np.sum(np.array(scenario.roi_size_m)**2) / 12
+    assert own.mean() < 0.5 * np.sum(np.array(SCENARIO.roi_size_m)**2) / 12
 
 
 def test_all_elements_have_a_lower_bound_than_any_of_their_combinations(
-        array_receiver, surface, scenario, weights):
+        array_receiver, surface, weights):
     everything = array_receiver.ArrayReceiver(
-        scenario, np.abs(weights).max() * np.eye(16), np.zeros(16, int), 4)
-    positions = scenario.sample_positions(20, np.random.default_rng(1))
+        SCENARIO, np.abs(weights).max() * np.eye(16), np.zeros(16, int), 4)
+    positions = SCENARIO.sample_positions(20, np.random.default_rng(1))
     assert (everything.crlb(positions) < surface.crlb(positions)).all()
