@@ -4,14 +4,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
+from scipy.stats import binom, norm
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.nuisance import nuisance_factors
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
-from rhs_isac_ros.positioning.joint_modes import _local_model
+from rhs_isac_ros.positioning.joint_modes import _local_model, find_joint_modes
+from rhs_isac_ros.positioning.marginal import MarginalSearch
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.polar import to_polar, to_positions
+from rhs_isac_ros.positioning.surroundings import Surroundings, tabulate_surroundings
+from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.templates import tabulate
 from rhs_isac_ros.positioning.unknowns import Alignment, Unknowns
 from rhs_isac_ros.positioning.whitened import WhitenedModel
@@ -94,6 +99,27 @@ def test_the_gradient_is_that_of_the_log_likelihood(codebook):
         assert difference == pytest.approx(gradient[0, index], rel=1e-3, abs=1e-3 / scale[index])
 
 
+@pytest.mark.parametrize('changes', [{'user_gain_std_db': 1.0}, {'phase_std_rad': 0.5}], ids=str)
+def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, changes):
+    """The reference integrates numerically at the position of the mode."""
+    scenario, rng = declaring(**changes), np.random.default_rng(5)
+    model = WhitenedModel(scenario, codebook)
+    unknowns = Unknowns(model)
+    received = MeasurementModel(scenario, codebook).sample(np.array([[4.2, 0.3, -0.1]]), rng)[0]
+    found = find_joint_modes(
+        model, TemplateTable(scenario, tabulate(model)), unknowns, received, np.zeros(1))
+    step = unknowns.std[0] / 500
+    values = found.values[0] + step * np.arange(-1500, 1501)[:, None]
+    points = np.repeat(found.modes.points[:1], len(values), axis=0)
+    _, _, log_likelihood, _ = _local_model(model, unknowns, received, points, values)
+    highest = log_likelihood.max()
+    average = highest + np.log(
+        np.sum(np.exp(log_likelihood - highest)) * step / unknowns.std[0])
+    # The factors 2 pi of the integral and of the prior cancel.
+    expected = average - np.log(2 * np.pi) / 2
+    assert found.modes.log_likelihood[0] == pytest.approx(expected, abs=0.1)
+
+
 def test_the_information_is_the_covariance_of_the_gradient(codebook):
     """Averaged over signals at the true parameters, without the prior."""
     scenario, rng = declaring(**ALL), np.random.default_rng(4)
@@ -110,6 +136,22 @@ def test_the_information_is_the_covariance_of_the_gradient(codebook):
     scale = np.sqrt(np.diag(information))
     found = np.cov(gradients.T) / np.outer(scale, scale)
     np.testing.assert_allclose(found, information / np.outer(scale, scale), atol=0.15)
+
+
+def test_the_evidence_outside_is_the_average_over_the_gain(codebook):
+    scenario = declaring(user_gain_std_db=0.5)
+    model = WhitenedModel(scenario, codebook)
+    table = Surroundings(scenario, tabulate_surroundings(model))
+    search = MarginalSearch(
+        model, TemplateTable(scenario, tabulate(model)), table, None)
+    received = MeasurementModel(SCENARIO, codebook).sample(
+        np.array([[8.0, 1.0, 0.5]]), np.random.default_rng(6))[0]
+    gains = np.linspace(-6, 6, 601) * search.unknowns.std[0]
+    signals = model.whiten(received * np.exp(-gains)[:, None, None])
+    exponent = np.array([table.log_evidence(one)[0] for one in signals])
+    exponent += norm(scale=search.unknowns.std[0]).logpdf(gains) - 2 * received.size * gains
+    expected = logsumexp(exponent) + np.log(gains[1] - gains[0])
+    assert search.find(received).log_evidence_outside == pytest.approx(expected, abs=0.1)
 
 
 def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
@@ -145,3 +187,48 @@ def test_weights_of_modes_follow_the_covariance_at_their_position(codebook):
         searched = np.sum(np.abs(model.whiten(difference[None]))**2)
         value[n] = searched - energy - np.sum(np.linalg.slogdet(covariance)[1])
     assert np.diff(weighed.log_likelihood)[0] == pytest.approx(np.diff(value)[0], rel=1e-6)
+
+
+def failing_modes(codebook, user):
+    """The model of a surface with failures, the modes of a user there and nearby, and signals."""
+    scenario = declaring(element_error_rms=0.02, failed_element_share=0.02)
+    received = MeasurementModel(scenario, codebook).sample(user, np.random.default_rng(7))
+    modes = Modes(to_polar(user + [[0.001, 0.002, 0], [0, 0, 0.003]]),
+                  np.tile(np.eye(3), (2, 1, 1)), np.zeros(2), np.zeros((2, 3)))
+    return scenario, modes, np.repeat(received, 2, axis=0)
+
+
+def test_the_likelihood_is_the_average_over_the_number_of_failures(codebook):
+    scenario, modes, signals = failing_modes(codebook, np.array([[4.2, 0.3, -0.1]]))
+    model = WhitenedModel(scenario, codebook)
+    positions = to_positions(modes.points)
+    exact = MeasurementModel(scenario, codebook)
+    average = exact.covariance_at(positions)
+    intact = MeasurementModel(
+        dataclasses.replace(scenario, failed_element_share=0.0), codebook).covariance_at(positions)
+    residuals = signals - exact.mean(positions)
+    # The probability of more than six failures is below 1e-5.
+    counts, expected = np.arange(7), np.empty(2)
+    for n in range(2):
+        values = binom.logpmf(counts, 36, 0.02)
+        for count in counts:
+            for d, first, second in zip(residuals[n], intact[n], average[n], strict=True):
+                covariance = first + count / (36 * 0.02) * (second - first)
+                values[count] -= np.vdot(d, np.linalg.solve(covariance, d)).real
+                values[count] -= np.linalg.slogdet(covariance)[1]
+        expected[n] = logsumexp(values) + np.sum(np.abs(model.whiten(residuals[n:n + 1]))**2)
+    weighed, _ = ElementErrorModel(model).refine(modes, signals, step=False)
+    assert np.diff(weighed.log_likelihood)[0] == pytest.approx(np.diff(expected)[0], abs=0.01)
+
+
+def test_a_step_predicts_the_likelihood_after_it(codebook):
+    scenario, modes, signals = failing_modes(codebook, np.array([[4.2, 0.3, -0.1]]))
+    errors = ElementErrorModel(WhitenedModel(scenario, codebook))
+    start = modes.select(np.array([0]))
+    start = start._replace(points=start.points + [0.002, 0.005, 0.005])
+    found = [errors.refine(start, signals[:1], step=True)[0]]
+    for _ in range(3):
+        found.append(errors.refine(found[-1], signals[:1], step=True)[0])
+    first, *_, last = (float(mode.log_likelihood[0]) for mode in found)
+    assert first == pytest.approx(last, abs=0.5)
+    np.testing.assert_allclose(found[3].points, found[2].points, atol=1e-4)
