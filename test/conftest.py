@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -86,6 +87,18 @@ def own_cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('XDG_CACHE_HOME', str(tmp_path_factory.mktemp('cache')))
         yield
+
+
+@pytest.fixture(scope='session')
+def built_scripts():
+    """Skip the test if the scripts have no build, as in a colcon workspace.
+
+    Under ``scripts/test``, they have one.
+    """
+    done = subprocess.run(['bash', '-c', '. scripts/env.sh'], cwd=HERE.parent,
+                          capture_output=True, text=True, timeout=60, check=False)
+    if done.returncode:
+        pytest.skip(f'a test of the scripts: {done.stderr.strip()}')
 
 
 @pytest.fixture(scope='session')

@@ -13,18 +13,6 @@ CONFIG = Path(__file__).parents[2] / 'config'
 TIMEOUT_S = 60.0
 
 
-@pytest.fixture(scope='session')
-def built_scripts():
-    """Skip the test if the scripts have no build, as in a colcon workspace.
-
-    Under ``scripts/test``, they have one.
-    """
-    done = subprocess.run(['bash', '-c', '. scripts/env.sh'], cwd=CONFIG.parent,
-                          capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
-    if done.returncode:
-        pytest.skip(f'a test of the scripts: {done.stderr.strip()}')
-
-
 @pytest.fixture(scope='module')
 def network(tmp_path_factory):
     """A running network of the small scenario, two users in one process."""
