@@ -28,11 +28,13 @@ from rhs_isac_ros.positioning.training import train
 
 ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
     kind.name: kind for kind in (BayesEstimator, MlEstimator, NeuralEstimator)}
+# Estimators with the option ``reject_outside``.
+REGION_ESTIMATORS = (BayesEstimator.name, MlEstimator.name)
 
 __all__ = [
-    'ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator', 'ModelError',
-    'Network', 'NeuralEstimator', 'SignalError', 'estimate_each', 'exhaustive_posterior',
-    'file_options', 'make_estimator', 'simulate_pairs', 'train',
+    'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator',
+    'ModelError', 'Network', 'NeuralEstimator', 'SignalError', 'estimate_each',
+    'exhaustive_posterior', 'file_options', 'make_estimator', 'simulate_pairs', 'train',
 ]
 
 
@@ -46,8 +48,8 @@ def make_estimator(
         A key of `ESTIMATORS`, or an entry point of the group `plugins.ESTIMATORS`.
     **options
         ``table_folder``, a folder for tables, and ``reject_outside``, whether users outside of
-        the region get no fix, for `bayes` and `ml`; ``model_file``, a `Network` or its file, for
-        `neural`. Plug-ins define their own options.
+        the region get no fix, for `REGION_ESTIMATORS`; ``model_file``, a `Network` or its file,
+        for `neural`. Plug-ins define their own options.
 
     Raises
     ------

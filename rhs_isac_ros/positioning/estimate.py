@@ -12,9 +12,11 @@ from rhs_isac_ros.model import Scenario
 # Far above any received amplitude [sqrt(W)]; after whitening, its square is still finite in single
 # precision.
 _MAX_MAGNITUDE = 1e3
-# Mean [3], covariance [3, 3], reason, and optionally the energy of the residual.
+# Mean [3], covariance [3, 3], reason, and optionally the energy of the residual, and the expected
+# energy.
 Located: TypeAlias = (
-    tuple[np.ndarray, np.ndarray, str] | tuple[np.ndarray, np.ndarray, str, float])
+    tuple[np.ndarray, np.ndarray, str] | tuple[np.ndarray, np.ndarray, str, float]
+    | tuple[np.ndarray, np.ndarray, str, float, float])
 
 
 class SignalError(ValueError):
@@ -36,12 +38,16 @@ class Estimate:
     residual
         Energy of the whitened residual at the best position, float64 [] or [N]; NaN from
         estimators that compute none.
+    expected_residual
+        Its mean for signals that match the model, given the modes of the posterior, float64 [] or
+        [N]; NaN without a residual, and if the user may be outside of the region.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
     reason: str | tuple[str, ...] = ''
     residual: float | np.ndarray = np.nan
+    expected_residual: float | np.ndarray = np.nan
 
     @property
     def fix(self) -> np.ndarray:
@@ -75,8 +81,8 @@ def estimate_each(
         Complex128 [N_B, N_SB F] or [N, N_B, N_SB F]; the codebook determines the sizes.
     locate
         Callable that takes checked signals [N, N_B, N_SB F] and yields mean [3], covariance
-        [3, 3] and reason for each phase, and optionally the energy of the residual. If the reason
-        is not empty, mean and covariance are ignored.
+        [3, 3] and reason for each phase, and optionally the energy of the residual, and then the
+        expected energy. If the reason is not empty, mean and covariance are ignored.
 
     Raises
     ------
@@ -85,15 +91,15 @@ def estimate_each(
     """
     batch = checked_received(scenario, codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
-    reasons, residual = [], np.full(len(batch), np.nan)
+    reasons, residuals = [], np.full((2, len(batch)), np.nan)
     for row, (position, spread, reason, *energy) in enumerate(locate(batch)):
-        residual[row:row + 1] = energy or np.nan
+        residuals[:len(energy), row] = energy
         reasons.append(reason)
         if not reason:
             mean[row], covariance[row] = position, spread
     if np.ndim(received) == 2:
-        return Estimate(mean[0], covariance[0], reasons[0], float(residual[0]))
-    return Estimate(mean, covariance, tuple(reasons), residual)
+        return Estimate(mean[0], covariance[0], reasons[0], *residuals[:, 0].tolist())
+    return Estimate(mean, covariance, tuple(reasons), *residuals)
 
 
 def checked_received(scenario: Scenario, codebook: Codebook, received: np.ndarray) -> np.ndarray:

@@ -4,8 +4,8 @@ Whitened signals y from a position with the whitened mean t differ from t by noi
 variance: ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
 measurement. Signals beyond its quantiles at the probability `FALSE_ALARM` do not fit any position
 of the region. Possible causes are a user elsewhere, another codebook, or a silent or defective
-receiver. Such signals give no position, and neither do signals that are more probably from
-outside of the region.
+receiver. Such signals give no position, and neither do signals that are from outside of the region
+with the probability `CONFIDENCE`.
 """
 
 import math
@@ -13,7 +13,9 @@ import math
 # Share of valid signals that each test may reject.
 FALSE_ALARM = 1e-9
 # Prior probability that a user is in the region of interest rather than outside.
-REGION_PROBABILITY = 0.75
+REGION_PROBABILITY = 0.5
+# Probability with which a user is considered to be outside, or inside.
+CONFIDENCE = 0.95
 
 
 class FitTest:
@@ -60,14 +62,19 @@ class FitTest:
                 f'{self.max_residual:.3g}')
 
 
-def outside_test(log_bayes_factor: float) -> str:
-    """Reject signals that are more probably from outside of the region than from inside.
+def outside_probability(log_bayes_factor: float) -> float:
+    """Compute the probability of a user outside of the region.
 
-    Takes the logarithm of the evidence for the region relative to that for its surroundings, and
-    returns a reason, which is empty if the signals pass.
+    Takes the logarithm of the evidence for the region relative to that for its surroundings.
     """
     log_odds = log_bayes_factor + math.log(REGION_PROBABILITY / (1 - REGION_PROBABILITY))
-    if log_odds >= 0:
+    # The exponential of larger numbers overflows; the result is 0 or 1 anyway.
+    return 1 / (1 + math.exp(min(max(log_odds, -700.0), 700.0)))
+
+
+def outside_test(probability: float) -> str:
+    """Reject signals of a user who is outside of the region with this probability."""
+    if probability <= CONFIDENCE:
         return ''
-    return (f'position outside of the region: log odds of the region {log_odds:.3g}, expected at '
-            'least 0')
+    return (f'position outside of the region: probability {probability:.6g}, expected at most '
+            f'{CONFIDENCE:g}')

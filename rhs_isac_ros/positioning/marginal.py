@@ -25,18 +25,21 @@ class Found(NamedTuple):
     ----------
     modes
         Modes of the posterior.
-    residual
-        Energy of the whitened residual at the best mode.
+    residuals
+        Energy of the whitened residual at each mode, float64 [M].
     whitened
         Whitened signals without the offsets of carrier and timing, complex128 [N_B, N_SB F].
     log_evidence_outside
         Evidence for a user outside of the region.
+    scale_outside
+        Factor of the signals, from the gain, that is most probable outside.
     """
 
     modes: Modes
-    residual: float
+    residuals: np.ndarray
     whitened: np.ndarray
     log_evidence_outside: float
+    scale_outside: float = 1.0
 
 
 class MarginalSearch:
@@ -54,30 +57,35 @@ class MarginalSearch:
         aligned = self._alignment.values(received)
         joint = find_joint_modes(self._model, self._table, self.unknowns, received, aligned)
         whitened = self._model.whiten((received * self.unknowns.factors(aligned))[None])[0]
-        modes, residual = joint.modes, joint.residual
+        modes, residuals = joint.modes, joint.residual
         if self._error:
             divided = received * self.unknowns.factors(joint.values)
-            modes, residual = self._error.refine(modes, divided, step=False)
-        best = int(np.argmax(modes.roi_log_likelihood))
-        return Found(modes, float(residual[best]), whitened, self._outside(whitened, aligned))
+            modes, residuals = self._error.refine(modes, divided, step=False)
+        return Found(modes, residuals, whitened, *self._outside(whitened, aligned))
 
-    def _outside(self, whitened: np.ndarray, aligned: np.ndarray) -> float:
-        """Compute the evidence outside, with the sharp parameters by Laplace's method."""
+    def _outside(self, whitened: np.ndarray, aligned: np.ndarray) -> tuple[float, float]:
+        """Compute the evidence outside, with the sharp parameters by Laplace's method.
+
+        Returns
+        -------
+        evidence, scale
+            Logarithm of the evidence, and the most probable factor of the signals.
+        """
         unknowns, sharp = self.unknowns, self.unknowns.sharp
-        evidence = self._over_gain(whitened)
+        evidence, scale = self._over_gain(whitened)
         if sharp:
             precision = unknowns.precision[sharp]
             curvature = unknowns.information[np.ix_(sharp, sharp)] + np.diag(precision)
             evidence -= float(
                 aligned[sharp]**2 @ precision / 2 + np.linalg.slogdet(curvature)[1] / 2
                 + np.sum(np.log(unknowns.std[sharp])))
-        return evidence
+        return evidence, scale
 
-    def _over_gain(self, whitened: np.ndarray) -> float:
-        """Average the evidence outside over the gain."""
+    def _over_gain(self, whitened: np.ndarray) -> tuple[float, float]:
+        """Average the evidence outside over the gain; also return the most probable scale."""
         unknowns = self.unknowns
         if unknowns.gain is None:
-            return float(self._surroundings.log_evidence(whitened)[0])
+            return float(self._surroundings.log_evidence(whitened)[0]), 1.0
         std = unknowns.std[unknowns.gain]
         n_points = 2 * int(np.ceil(_GAIN_REACH * std / _GAIN_STEP)) + 3
         gain = std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
@@ -85,4 +93,6 @@ class MarginalSearch:
         prior -= np.log(np.sum(np.exp(prior)))
         evidence = self._surroundings.log_evidence(whitened, np.exp(-gain))
         evidence += prior - 2 * whitened.size * gain
-        return float(evidence.max() + np.log(np.sum(np.exp(evidence - evidence.max()))))
+        best = int(np.argmax(evidence))
+        total = evidence[best] + np.log(np.sum(np.exp(evidence - evidence[best])))
+        return float(total), float(np.exp(-gain[best]))

@@ -11,8 +11,13 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.imperfections import has_element_errors
 from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
-from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
-from rhs_isac_ros.positioning.fit import FitTest, outside_test
+from rhs_isac_ros.positioning.estimate import Estimate, Located, estimate_each
+from rhs_isac_ros.positioning.fit import (
+    CONFIDENCE,
+    FitTest,
+    outside_probability,
+    outside_test,
+)
 from rhs_isac_ros.positioning.marginal import Found, MarginalSearch
 from rhs_isac_ros.positioning.modes import LONG_SEARCH_STEPS, Modes, find_modes
 from rhs_isac_ros.positioning.samples import Samples, draw_samples
@@ -23,6 +28,8 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 # Standard deviations of the user's gain that the test of the energy admits.
 _GAIN_REACH = 6
+# Coordinates fitted to the signals of each phase.
+_N_COORDINATES = 3
 
 
 class SearchEstimator(abc.ABC):
@@ -34,9 +41,10 @@ class SearchEstimator(abc.ABC):
     Parameters
     ----------
     reject_outside
-        Whether signals that are more probably from outside of the region give no fix either; see
-        `surroundings`. Some users inside then get no fix; their share grows as the number of
-        measurements falls.
+        Whether the user may also be outside of the region; see `surroundings`. If this is almost
+        certain (`fit.CONFIDENCE`), there is no fix either. If it is merely possible, the
+        covariance includes the positions outside, while the position remains that of a user
+        inside.
 
     Raises
     ------
@@ -52,7 +60,8 @@ class SearchEstimator(abc.ABC):
         arrays = load_table(self._model, table_folder)
         self._table = TemplateTable(scenario, arrays)
         self._surroundings = Surroundings(scenario, arrays)
-        self._test = FitTest(int(np.prod(self._model.shape)))
+        n_measurements = int(np.prod(self._model.shape))
+        self._test = FitTest(n_measurements)
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
         self._error = ElementErrorModel(self._model) if has_element_errors(scenario) else None
@@ -62,53 +71,84 @@ class SearchEstimator(abc.ABC):
         if nuisance_parameters(scenario):
             self._marginal = MarginalSearch(
                 self._model, self._table, self._surroundings, self._error)
+        n_fitted = _N_COORDINATES + (len(self._marginal.unknowns.names) if self._marginal else 0)
+        # Twice an energy has two degrees of freedom for each complex measurement, less one for
+        # each fitted parameter.
+        self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
 
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals, as `Estimator.estimate` describes."""
         model = self._model
         return estimate_each(model.scenario, model.codebook, received, self._locate)
 
-    def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str, float]]:
+    def _locate(self, batch: np.ndarray) -> Iterator[Located]:
         no_fix = np.full(3, np.nan), np.full((3, 3), np.nan)
         for received, whitened in zip(batch, self._model.whiten(batch), strict=True):
             reason = self._test.min_energy_test(
                 float(np.sum(np.abs(whitened)**2)) * self._max_power)
             if reason:
-                yield *no_fix, reason, np.nan
+                yield *no_fix, reason, np.nan, np.nan
                 continue
             found = (self._marginal.find(received) if self._marginal
                      else self._find(received, whitened))
             samples = draw_samples(found.modes, self._table.normal, self._bounds)
-            reason = self._reason(found, samples)
+            residual = float(found.residuals[np.argmax(found.modes.roi_log_likelihood)])
+            outside = 0.0
+            if self._rejects_outside:
+                inside = samples.log_evidence(self._volume_m3)
+                outside = outside_probability(inside - found.log_evidence_outside)
+            reason = self._reason(found, residual, outside)
             moments = no_fix if reason else self._moments(found.modes, samples)
-            yield *moments, reason, found.residual
+            expected = np.nan
+            if outside <= 1 - CONFIDENCE or self._test.residual_test(residual) == reason != '':
+                expected = self._expected_residual(found.residuals, residual, samples)
+            elif not reason:
+                moments = self._with_outside(moments, found, outside)
+            yield *moments, reason, residual, expected
 
     def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
         modes = find_modes(self._model, self._table, whitened)
         if self._test.residual_test(-modes.roi_log_likelihood.max()):
             # Strong signals may need more steps to reach the maximum.
             modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
-        residual = float(-modes.roi_log_likelihood.max())
+        residuals = -modes.roi_log_likelihood
         if self._error:
             signals = np.broadcast_to(received, (len(modes.points), *received.shape))
             modes, residuals = self._error.refine(modes, signals, step=True)
-            residual = float(residuals[0])
         outside = (float(self._surroundings.log_evidence(whitened)[0])
                    if self._rejects_outside else -np.inf)
-        return Found(modes, residual, whitened, outside)
+        return Found(modes, residuals, whitened, outside)
 
-    def _reason(self, found: Found, samples: Samples) -> str:
+    def _reason(self, found: Found, residual: float, outside: float) -> str:
         """Return why there is no fix, empty if there is one.
 
         If no position of the region explains the signals, one outside has to explain them for
         the user to be there.
         """
-        unexplained = self._test.residual_test(found.residual)
+        unexplained = self._test.residual_test(residual)
         if not self._rejects_outside or unexplained and not self._surroundings.explain(
                 found.whitened, self._test.max_residual):
             return unexplained
-        inside = samples.log_evidence(self._volume_m3)
-        return outside_test(inside - found.log_evidence_outside) or unexplained
+        return outside_test(outside) or unexplained
+
+    def _with_outside(
+            self, moments: tuple[np.ndarray, np.ndarray], found: Found, outside: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Add positions outside, which have this probability, to the covariance."""
+        mean, covariance = moments
+        moment = self._surroundings.second_moment(found.whitened, mean, found.scale_outside)
+        return mean, (1 - outside) * covariance + outside * moment
+
+    def _expected_residual(
+            self, residuals: np.ndarray, residual: float, samples: Samples) -> float:
+        """Expected energy of the residual at the best mode.
+
+        Averaged over the posterior, the energy of a model that holds has the mean of a chi-square
+        variable. At the best of several modes it is smaller, by the difference from the average.
+        """
+        weights = np.exp(samples.log_weights - samples.log_weights.max()).sum(axis=1)
+        average = float(weights @ residuals / weights.sum())
+        return self._mean_residual - (average - residual)
 
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:

@@ -78,7 +78,9 @@ class Surroundings:
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
         self._filters, index = arrays['outer_filters'], arrays['outer_index']
         self._index = index
-        ranges = _ranges(scenario)[:, None]
+        self._ranges = _ranges(scenario)
+        self._units = to_positions(_points(np.ones(1), _directions()))[0]
+        ranges = self._ranges[:, None]
         self._scale = (2 / ranges).astype(np.float32)
         self._energy = (arrays['outer_energy'][index] / ranges**2).astype(np.float32)
         self._possible = arrays['outer_weights'] > 0
@@ -105,11 +107,44 @@ class Surroundings:
                          for scale in scales])
 
     def _log_average(self, argument: np.ndarray) -> float:
-        log_likelihood = np.sum(_log_bessel(argument), axis=0) + self._offset
+        log_likelihood = self._log_likelihood(argument)
         highest = float(log_likelihood.max())
         if np.isneginf(highest):
             return highest
         return highest + float(np.log(np.sum(np.exp(log_likelihood - highest))))
+
+    def _log_likelihood(self, argument: np.ndarray) -> np.ndarray:
+        """Log-likelihood plus log-prior on the grid, up to the signals' energy, [R, V]."""
+        result: np.ndarray = np.sum(_log_bessel(argument), axis=0) + self._offset
+        return result
+
+    def second_moment(
+            self, whitened: np.ndarray, centre: np.ndarray, scale: float = 1.0) -> np.ndarray:
+        """Compute the posterior second moment of a position outside about a point.
+
+        Parameters
+        ----------
+        whitened
+            Whitened signals of one positioning phase, complex128 [N_B, N_SB F].
+        centre
+            The point, float64 [3] [m].
+        scale
+            Factor of the signals.
+
+        Returns
+        -------
+        numpy.ndarray
+            Float64 [3, 3] [m^2].
+        """
+        log_likelihood = self._log_likelihood(
+            self._filter(whitened) * (self._scale * np.float32(scale)))
+        weights = np.exp(log_likelihood - log_likelihood.max()).astype(float)
+        weights /= weights.sum()
+        mean = self._ranges @ weights @ self._units
+        square = (self._units.T * (self._ranges**2 @ weights)) @ self._units
+        cross = np.outer(mean, centre)
+        moment: np.ndarray = square - cross - cross.T + np.outer(centre, centre)
+        return moment
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position outside leaves a residual with at most this energy.

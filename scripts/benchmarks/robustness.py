@@ -7,8 +7,10 @@ it, as an uncertainty or as the true value. Users outside of the region should h
 
 The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a Gaussian.
 Brackets contain 95 % intervals: Wilson's for shares, the percentile bootstrap for mean squared
-errors. With --reference N, rows without nuisance parameters and element errors are compared with
-the posterior over 2^N points.
+errors. The last column is the share of windows in which the monitor of the residuals warns; the
+windows are random draws of phases. The predicted error is that of fixes that are not possibly from
+outside of the region. With --reference N, rows without nuisance parameters and element errors are
+compared with the posterior over 2^N points.
 """
 
 import os
@@ -32,7 +34,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.imperfections import has_element_errors
 from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning import Estimate, exhaustive_posterior, make_estimator
-from rhs_isac_ros.positioning.residual_monitor import ResidualMonitor
+from rhs_isac_ros.positioning.residual_monitor import WINDOW, ResidualMonitor
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
 # Squared Mahalanobis radius of the 95 % region.
@@ -73,16 +75,21 @@ def main() -> None:
     add('--positions', type=positive_int, default=600, help='number of positions of each row')
     add('--seed', type=int, default=1, help='seed of all random numbers')
     add('--estimator', choices=['bayes', 'ml'], default='bayes', help='estimator')
+    add('--config', type=Path, help='scenario file; Table I if omitted')
+    add('--codebook', type=Path, default=DEFAULT_CODEBOOK, help='codebook file')
     add('--only', action='append', default=[], metavar='TEXT',
         help='only rows whose name contains the text; may be repeated')
     add('--reference', type=int, default=0, metavar='N',
         help='compare with the posterior over 2^N points; 0 to omit')
+    add('--windows', type=positive_int, default=200,
+        help='number of windows to which the monitor of the residuals is applied')
     add('--json', type=Path, help='JSON file for the results')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}, estimator {options.estimator}\n')
     print('| signals from | scenario | no fix [%] | MSE [m^2] | predicted | in the 95 % region '
-          '[%] | median residual | warning |\n|---|---|---|---|---|---|---|---|')
-    base, codebook = Scenario(), Codebook.load(DEFAULT_CODEBOOK)
+          '[%] | median residual | warning | warned [%] |\n|---|---|---|---|---|---|---|---|---|')
+    base = Scenario.from_yaml(options.config) if options.config else Scenario()
+    codebook = Codebook.load(options.codebook)
     rows = [inside_rows(name, base, codebook, changes, options)
             for name, changes in DEVIATIONS.items() if wanted(name, options)]
     if wanted(FOUR_BANDS, options):
@@ -114,7 +121,7 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
         estimator = make_estimator(
             options.estimator, scenario, codebook, reject_outside=True)
         estimate = estimator.estimate(received)
-        row = {'signals': name, 'scenario': kind, **figures(estimate, positions, received[0].size)}
+        row = {'signals': name, 'scenario': kind, **figures(estimate, positions, options.windows)}
         plain = not nuisance_parameters(scenario) and not has_element_errors(scenario)
         if options.reference and kind == 'declared' and plain:
             row |= ratio_to_reference(
@@ -140,7 +147,8 @@ def outside_rows(scenario: Scenario, codebook: Codebook,
             received = model.sample(positions, rng)
             rows.append(report({
                 'signals': name, 'scenario': 'silent',
-                **figures(estimator.estimate(received), positions, received[0].size)}))
+                **figures(estimator.estimate(received), positions,
+                          options.windows)}))
     return rows
 
 
@@ -170,8 +178,7 @@ def shell(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     return found[:n]
 
 
-def figures(
-        estimate: Estimate, positions: np.ndarray, n_measurements: int) -> dict[str, Any]:
+def figures(estimate: Estimate, positions: np.ndarray, n_windows: int) -> dict[str, Any]:
     """Compute the figures of a row."""
     fix, n = estimate.fix, len(positions)
     errors, covariance = (estimate.mean - positions)[fix], estimate.covariance[fix]
@@ -181,25 +188,43 @@ def figures(
     covered = int(np.sum(normalised <= REGION_RADIUS))
     n_fixes = len(errors)
     residual = np.asarray(estimate.residual)[fix]
+    # The covariance of users who may be outside includes the positions there.
+    certain = np.isfinite(np.asarray(estimate.expected_residual)[fix])
     return {
         'positions': n, 'no_fix': n - n_fixes, 'no_fix_share': share(n - n_fixes, n),
         'reasons': {text: sum(reason.startswith(text) for reason in estimate.reason)
                     for text in ('position', 'residual', 'energy')},
         'mse_m2': mean_interval(squares), 'covered_share': share(covered, n_fixes),
         'missed_share': share(n_fixes - covered, n),
-        'predicted_mse_m2': float(np.trace(covariance, axis1=1, axis2=2).mean())
-        if n_fixes else None,
+        'predicted_mse_m2': float(np.trace(covariance, axis1=1, axis2=2)[certain].mean())
+        if certain.any() else None,
+        'possibly_outside_share': share(n_fixes - int(certain.sum()), n),
         'median_residual': float(np.median(residual)) if n_fixes else None,
-        'warns_after': warns_after(residual, n_measurements),
+        **warnings(estimate, n_windows),
     }
 
 
-def warns_after(residual: np.ndarray, n_measurements: int) -> int | None:
-    """Return the number of fixes after which the residuals cause a warning; None if never."""
-    monitor = ResidualMonitor(n_measurements)
-    for count, energy in enumerate(residual, 1):
-        monitor.add(float(energy))
-        if monitor.warning:
+def warnings(estimate: Estimate, n_windows: int) -> dict[str, Any]:
+    """Apply the monitor of the positioner to the phases in order, and to random windows of them.
+
+    Returns
+    -------
+    dict
+        ``warns_after``, the number of phases until the first warning, None without one; and
+        ``warned_share``, the share of windows with a warning [%].
+    """
+    residuals = np.stack([estimate.residual, estimate.expected_residual], axis=1)
+    order = np.random.default_rng(0).integers(len(residuals), size=(n_windows, WINDOW))
+    n_warned = sum(first_warning(residuals[window]) is not None for window in order)
+    return {'warns_after': first_warning(residuals), 'warned_share': share(n_warned, n_windows)}
+
+
+def first_warning(residuals: np.ndarray) -> int | None:
+    """Return the number of phases until the monitor warns; None if it does not."""
+    monitor = ResidualMonitor()
+    for count, (energy, expected) in enumerate(residuals.tolist(), 1):
+        monitor.add(energy, expected)
+        if monitor.drifts:
             return count
     return None
 
@@ -243,14 +268,14 @@ def report(row: dict[str, Any]) -> dict[str, Any]:
     def number(value: float | None, digits: int) -> str:
         return '-' if value is None else f'{value:.{digits}f}'
 
-    warning = f'after {row["warns_after"]} fixes' if row['warns_after'] else 'none'
+    warning = f'after {row["warns_after"]} phases' if row['warns_after'] else 'none'
     print(f'| {row["signals"]} | {row["scenario"]} | {interval(row["no_fix_share"], 1)} | '
           f'{interval(row["mse_m2"], 2)} | {number(row["predicted_mse_m2"], 2)} | '
           f'{interval(row["covered_share"], 1)} | {number(row["median_residual"], 0)} | '
-          f'{warning} |', flush=True)
+          f'{warning} | {interval(row["warned_share"], 0)} |', flush=True)
     if 'mse_to_reference' in row:
         print(f'|  | ratio to the posterior | | {interval(row["mse_to_reference"], 3)} '
-              '| | | | |', flush=True)
+              '| | | | | |', flush=True)
     return row
 
 

@@ -6,7 +6,14 @@ from scipy.stats import chi2
 
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
-from rhs_isac_ros.positioning.fit import FALSE_ALARM, REGION_PROBABILITY, FitTest, outside_test
+from rhs_isac_ros.positioning.fit import (
+    CONFIDENCE,
+    FALSE_ALARM,
+    REGION_PROBABILITY,
+    FitTest,
+    outside_probability,
+    outside_test,
+)
 
 
 @pytest.fixture(scope='module', params=['bayes', 'ml'])
@@ -80,12 +87,18 @@ def test_distorted_signals_give_no_fix(setting, change):
     assert_no_fix(estimator.estimate(change(received)), 'residual')
 
 
-def test_the_odds_of_the_region_decide():
+def test_a_user_who_is_almost_certainly_outside_is_rejected():
+    assert outside_test(CONFIDENCE) == ''
+    assert outside_test(0.99) == (
+        'position outside of the region: probability 0.99, expected at most 0.95')
+
+
+def test_the_probability_of_a_user_outside_follows_from_the_bayes_factor():
     even = -np.log(REGION_PROBABILITY / (1 - REGION_PROBABILITY))
-    assert outside_test(even + 1e-6) == ''
-    assert outside_test(even - 2.0) == (
-        'position outside of the region: log odds of the region -2, expected at least 0')
-    assert outside_test(-np.inf).startswith('position outside of the region: ')
+    assert outside_probability(even) == pytest.approx(0.5)
+    assert outside_probability(even - np.log(3)) == pytest.approx(0.75)
+    assert outside_probability(-np.inf) == pytest.approx(1)
+    assert outside_probability(np.inf) == pytest.approx(0, abs=1e-300)
 
 
 def test_valid_signals_are_located_beside_invalid_ones(setting):
