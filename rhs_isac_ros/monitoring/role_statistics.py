@@ -33,10 +33,10 @@ class Report:
         One line that describes the fault: what is missing, or the most frequent new faults.
     values
         Settings: ``parameter.<name>`` (in use), ``pending.<name>`` (not in use yet) and
-        ``failed.<name>`` (why a change failed). Counts: ``cycles.<outcome>``,
-        ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``, ``received.<message>``
-        and ``sent.<message>``. Also ``phase``, ``codebook_id`` and percentiles such as
-        ``handling_ms.p95``.
+        ``failed.<name>`` (why a change failed). Lasting faults: ``warning.<subject>``. Counts:
+        ``cycles.<outcome>``, ``dropped.<reason>``, ``retries.<step>``, ``beacons.<reason>``,
+        ``received.<message>`` and ``sent.<message>``. Also ``phase``, ``codebook_id`` and
+        percentiles such as ``handling_ms.p95``.
     """
 
     fault: bool
@@ -120,7 +120,7 @@ class RoleStatistics:
         blocked
             Whether the role lacks something that it needs in this state.
         status
-            Settings in use and pending, by name.
+            Settings in use and pending, and lasting faults, by name.
         """
         values = {'phase': phase} if phase else {}
         values |= self._codebook_ids(status.get('codebook_id', ''))
@@ -141,6 +141,9 @@ class RoleStatistics:
             return Report(True, f'{", ".join(sorted(self._unavailable))} not available', values)
         if blocked:
             return Report(True, f'blocked: {phase}', values)
+        warnings = [text for name, text in status.items() if name.startswith('warning.')]
+        if warnings:
+            return Report(True, '; '.join(warnings), values)
         if new_faults:
             return Report(True, _summary(new_faults), values)
         return Report(False, 'paused' if phase == State.PAUSED.value else 'no fault', values)

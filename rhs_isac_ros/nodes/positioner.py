@@ -14,6 +14,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import plugins
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
+    REGION_ESTIMATORS,
     Estimator,
     ModelError,
     Network,
@@ -94,6 +95,8 @@ class PositionerNode(RoleNode[Positioner]):
         options = file_options(
             settings.estimator, Path(folder) if folder else default_folder(),
             settings.model_file)
+        if settings.estimator in REGION_ESTIMATORS:
+            options['reject_outside'] = settings.reject_outside
         return make_estimator(settings.estimator, self.scenario, codebook, **options)
 
     def execute(self, action: Action) -> None:

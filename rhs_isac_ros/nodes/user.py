@@ -61,16 +61,19 @@ class UserNode(RoleNode[User]):
             raise ParameterError(f'mobility: {error}') from None
 
     def _points(self, name: str) -> np.ndarray:
-        """Return the points of a parameter, [N, 3], checked to be in the region of interest."""
+        """Return the points of a parameter, [N, 3], checked to be in front of the surface."""
         numbers = np.array(getattr(self.values, name))
         if numbers.size % 3:
             raise ParameterError(f'{name}: {numbers.size} numbers, expected three for each point')
         points = numbers.reshape(-1, 3)
+        if not (points[:, 0] > 0).all():
+            raise ParameterError(
+                f'{name}: {points.tolist()}, expected points in front of the surface, x > 0')
         low, high = self.scenario.roi_bounds_m
         if not ((points >= low) & (points <= high)).all():
-            raise ParameterError(
-                f'{name}: {points.tolist()}, expected points in the region of interest, '
-                f'{low.tolist()} to {high.tolist()}')
+            self.get_logger().warning(  # type: ignore[no-untyped-call]
+                f'{name}: {points.tolist()}: outside of the region of interest, {low.tolist()} to '
+                f'{high.tolist()}; a user there gets no position')
         return points
 
     def _publish_ground_truth(self) -> None:

@@ -1,5 +1,6 @@
 """The positioner, which estimates positions from received signals."""
 
+import collections
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import Estimator, SignalError
+from rhs_isac_ros.positioning import Estimate, Estimator, SignalError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import (
@@ -25,8 +26,12 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
+from rhs_isac_ros.protocol.residual_watch import ResidualWatch
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.protocol.settings import PositionerSettings
+
+# Maximum number of users without a fix to keep track of.
+_MAX_USERS = 1024
 
 
 class _Job(NamedTuple):
@@ -82,9 +87,10 @@ class Positioner(PlainRole):
         self._building: _Job | None = None
         self._next: _Job | None = None
         self._waiting: m.ReceivedSignals | None = None
-        # Whether the last signals yielded no position; only the first of consecutive failures is
-        # logged.
-        self._no_fix_logged = False
+        # Users whose last signals yielded no position; only the first of consecutive failures is
+        # logged. Bounded, because signals may name any user.
+        self._without_fix: collections.OrderedDict[int, None] = collections.OrderedDict()
+        self._residuals = ResidualWatch()
         # The last signals that were answered, and the answer.
         self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
 
@@ -108,7 +114,8 @@ class Positioner(PlainRole):
     def status(self) -> Mapping[str, str]:
         """Return the settings and codebook in use, pending settings and the last failure."""
         failed = {'failed.estimator': self._failure} if self._failure else {}
-        return self._settings.describe() | failed | {'codebook_id': self._estimators.in_use}
+        return (self._settings.describe() | failed | self._residuals.status()
+                | {'codebook_id': self._estimators.in_use})
 
     def _offer_settings(self, settings: PositionerSettings) -> list[Action]:
         self._settings.latest, self._failure = settings, ''
@@ -139,6 +146,7 @@ class Positioner(PlainRole):
         model = MeasurementModel(self._scenario, codebook).prepare()
         self._estimators.put(codebook.id, _Built(job, model, estimator))
         self._settings.in_use = job.settings
+        self._residuals.clear()
         return [LogMessage(
             f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')]
 
@@ -188,25 +196,40 @@ class Positioner(PlainRole):
         except SignalError as error:
             return self._no_fix(received, str(error))
         latency_s = self._stopwatch() - begin
+        residuals = self._residuals.add(received.user, received.codebook_id, estimate)
         if not estimate.fix:
-            return self._no_fix(received, str(estimate.reason))
-        self._no_fix_logged = False
+            return [*self._no_fix(received, str(estimate.reason)), *residuals]
+        return [*self._fix(received, estimate, latency_s), *residuals]
+
+    def _fix(self, received: m.ReceivedSignals, estimate: Estimate,
+             latency_s: float) -> list[Action]:
+        _, model, estimator = self._estimators.take(received.codebook_id)
         bound = float(crlb_of(model, estimate.mean[None])[0])
-        return [Send(m.PositionEstimate(
+        sent = Send(m.PositionEstimate(
             cycle_id=received.cycle_id, user=received.user,
             user_instance=received.user_instance, codebook_id=received.codebook_id,
             position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
-            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))]
+            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))
+        if received.user not in self._without_fix:
+            return [sent]
+        del self._without_fix[received.user]
+        return [sent, LogMessage(
+            f'cycle {received.cycle_id}: user {received.user} has a position again')]
 
     def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
         self.count(Outcome.NO_FIX)
         sent = Send(m.NoFix(
             cycle_id=received.cycle_id, user=received.user, codebook_id=received.codebook_id,
             reason=reason))
-        if self._no_fix_logged:
+        is_known = received.user in self._without_fix
+        self._without_fix[received.user] = None
+        self._without_fix.move_to_end(received.user)
+        if is_known:
             return [sent]
-        self._no_fix_logged = True
-        return [sent, LogMessage(f'cycle {received.cycle_id}: no fix: {reason}', warning=True)]
+        if len(self._without_fix) > _MAX_USERS:
+            self._without_fix.popitem(last=False)
+        text = f'cycle {received.cycle_id}: no fix of user {received.user}: {reason}'
+        return [sent, LogMessage(text, warning=True)]
 
 
 def build_estimator(

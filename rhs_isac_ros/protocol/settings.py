@@ -84,6 +84,9 @@ class PositionerSettings:
     estimator: str = setting(
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
     model_file: str = setting('', 'Trained model; required by the estimator neural.')
+    reject_outside: bool = setting(
+        True, 'Whether users who are almost certainly outside of the region get no fix; only '
+        'bayes and ml.')
 
 
 @dataclasses.dataclass(frozen=True)

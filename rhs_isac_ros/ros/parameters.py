@@ -80,6 +80,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         Parameter('table_folder', '',
                   'Directory in which tables are cached; empty: the cache directory of the user.'),
         _POSITIONER['model_file'],
+        _POSITIONER['reject_outside'],
     ),
     'transmission': (_SCENARIO, *_declared_by(TransmissionSettings).values()),
     'optimizer': (

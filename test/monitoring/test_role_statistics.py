@@ -124,3 +124,14 @@ def test_statistics_of_a_base_station_match_its_messages(network):
     assert (values['cycles.served'], values['cycles.positioner_silent']) == ('3', '1')
     assert int(values['sent.Beacon']) == len(net.sent(m.Beacon)) - 1
     assert 10 < float(values['cycle_ms.p50']) < 50
+
+
+def test_a_lasting_fault_of_the_role_is_in_every_summary():
+    statistics = RoleStatistics()
+    status = {'warning.residual': 'signals deviate', 'residual.ratio': '1.200'}
+    for counters in ({'no_fix': 1}, {'no_fix': 1}):
+        report = statistics.report('', counters, status=status)
+        assert report.fault
+        assert report.summary == 'signals deviate'
+        assert report.values.items() >= status.items()
+    assert not statistics.report('', {'no_fix': 1}).fault

@@ -178,7 +178,8 @@ def test_without_a_fix_the_positioner_reports_the_reason(positioner, codebooks, 
     assert (send.message.cycle_id, send.message.user) == (9, 2)
     assert send.message.codebook_id == codebooks[0].id
     assert send.message.reason == 'received: all wrong'
-    assert note == LogMessage('cycle 9: no fix: received: all wrong', warning=True)
+    assert note == LogMessage(
+        'cycle 9: no fix of user 2: received: all wrong', warning=True)
     assert positioner.counters == {'no_fix': 1}
 
 

@@ -218,12 +218,11 @@ def test_nodes_share_declarations_of_equal_names():
 @pytest.mark.parametrize(('values', 'text'), [
     ({'position_m': [10.0, 0.0]}, r'position_m: 2 numbers, expected three'),
     ({'position_m': [10.0, 0.0, 0.0] * 2}, r'position_m: 2 points, expected one'),
-    ({'position_m': [4.9, 0.0, 0.0]}, r'position_m: \[\[4.9, 0.0, 0.0\]\], .* region'),
-    ({'position_m': [10.0, 0.0, 1.1]}, r'position_m: .*1.1.*, expected .*\[5.0, -5.0, -1.0\]'),
+    ({'position_m': [-4.9, 0.0, 0.0]}, r'position_m: \[\[-4.9, 0.0, 0.0\]\], expected .* front'),
     ({'mobility': 'waypoints'}, r'waypoints_m: empty, expected x, y, z'),
     ({'mobility': 'waypoints', 'waypoints_m': [10.0]}, r'waypoints_m: 1 numbers'),
-    ({'mobility': 'waypoints', 'waypoints_m': [10.0, 0.0, 0.0, 10.0, 6.0, 0.0]},
-     r'waypoints_m: .* region of interest'),
+    ({'mobility': 'waypoints', 'waypoints_m': [10.0, 0.0, 0.0, 0.0, 6.0, 0.0]},
+     r'waypoints_m: .* x > 0'),
     ({'mobility': 'random_walk', 'speed_mps': 5.6},
      r'speed_mps: 5.6, expected at most max_user_speed_mps = 5.55'),
 ])
@@ -238,6 +237,8 @@ def test_values_of_a_user_that_contradict_the_scenario_are_rejected(bench, value
     ({'mobility': 'random_walk', 'position_m': [9.0, 1.0, -0.5], 'speed_mps': 0.0},
      (9.0, 1.0, -0.5)),
     ({'mobility': 'waypoints', 'waypoints_m': [5.0, 5.0, 1.0]}, (5.0, 5.0, 1.0)),
+    # Outside of the region of interest.
+    ({'position_m': [20.0, -6.0, 1.1]}, (20.0, -6.0, 1.1)),
 ])
 def test_the_parameters_of_a_user_set_its_initial_position(bench, values, position):
     overrides = [Parameter(name, value=value) for name, value in values.items()]

@@ -66,7 +66,8 @@ def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, t
     node.dispatch(CodebookOffered(codebooks[0]))
     signals = send(3)
     (estimate,) = bench.until(lambda: estimates)
-    expected = make_estimator('bayes', node.scenario, codebooks[0]).estimate(signals)
+    expected = make_estimator(
+        'bayes', node.scenario, codebooks[0], reject_outside=True).estimate(signals)
     np.testing.assert_array_equal(estimate.position, expected.mean)
     np.testing.assert_array_equal(estimate.covariance_m2, expected.covariance)
     assert len(list((tmp_path / 'tables').iterdir())) == 1

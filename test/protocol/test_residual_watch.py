@@ -1,0 +1,159 @@
+"""The residuals of all users and of each user."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.positioning import Estimate
+from rhs_isac_ros.positioning.residual_monitor import MIN_FIXES, MIN_RETURN, WINDOW
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.events import LogMessage, SettingsOffered
+from rhs_isac_ros.protocol.residual_watch import ResidualWatch
+from rhs_isac_ros.protocol.settings import PositionerSettings
+
+EXPECTED = 62.5
+PLACE = np.array([10.0, 0.0, 0.0])
+
+
+def estimate(factor, expected=EXPECTED):
+    return Estimate(PLACE, np.eye(3), '', factor * EXPECTED, expected)
+
+
+def add(watch, user, n, factor, codebook_id='a'):
+    """Return the messages about n residuals of a user."""
+    return [message for _ in range(n) for message in watch.add(user, codebook_id,
+                                                               estimate(factor))]
+
+
+def test_the_watch_is_silent_without_residuals():
+    watch = ResidualWatch()
+    for _ in range(WINDOW):
+        assert watch.add(1, 'a', Estimate(PLACE, np.eye(3))) == []
+    assert watch.status() == {}
+
+
+def test_residuals_of_the_model_are_shown_without_a_warning():
+    watch = ResidualWatch()
+    assert add(watch, 1, 2 * WINDOW, 1.0) == []
+    assert watch.status() == {'residual.ratio': '1.000', 'residual.fixes': str(WINDOW)}
+
+
+def test_a_deviation_is_logged_when_it_begins_and_when_it_ends():
+    watch = ResidualWatch()
+    (begin,) = add(watch, 1, WINDOW, 2.0)
+    assert begin.warning
+    assert begin.text.startswith('the signals do not match the scenario: residuals 1.76 times')
+    assert watch.status()['warning.residual'].startswith('the signals do not match')
+    (end,) = add(watch, 1, MIN_RETURN, 1.0)
+    assert end == LogMessage('the residuals match the scenario again')
+    assert 'warning.residual' not in watch.status()
+
+
+def test_one_user_does_not_hide_among_many():
+    watch, logged = ResidualWatch(), []
+    for _ in range(2 * MIN_FIXES):
+        for user in range(1, 65):
+            logged += watch.add(user, 'a', estimate(1.3 if user == 7 else 1.0))
+    (message,) = logged
+    assert 'scenario: user 7: residuals 1.3 times' in message.text
+    assert float(watch.status()['residual.ratio']) < 1.01
+
+
+def test_many_deviating_users_make_one_line_of_bounded_length():
+    watch = ResidualWatch()
+    logged = [line for user in range(1, 20) for line in add(watch, user, MIN_FIXES, 3.0)]
+    assert len(logged) == 1
+    text = watch.status()['warning.residual']
+    assert 'user 8: ' in text
+    assert text.endswith('; 11 more users')
+
+
+def test_users_who_may_be_outside_are_not_compared():
+    watch = ResidualWatch()
+    for _ in range(WINDOW):
+        assert watch.add(1, 'a', estimate(9.0, expected=np.nan)) == []
+    assert watch.status() == {}
+
+
+def test_a_change_of_the_codebook_begins_anew():
+    watch = ResidualWatch()
+    assert len(add(watch, 1, MIN_FIXES, 3.0)) == 1
+    assert add(watch, 1, MIN_FIXES - 1, 3.0, 'b') == []
+    assert watch.status()['residual.fixes'] == str(MIN_FIXES - 1)
+    assert 'warning.residual' not in watch.status()
+
+
+class Residuals:
+    """An estimator whose residuals and fixes the test sets."""
+
+    name = 'residuals'
+
+    def __init__(self):
+        self.factor, self.reason = 1.0, ''
+
+    def estimate(self, received):
+        if self.reason:
+            nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
+            return Estimate(*nothing, self.reason, 9.0, np.nan)
+        return estimate(self.factor)
+
+
+@pytest.fixture
+def estimator():
+    return Residuals()
+
+
+@pytest.fixture
+def net(network, estimator):
+    return network(make=lambda codebook: estimator, rest_s=0.0)
+
+
+def warnings(net):
+    return net['positioner'].status().get('warning.residual', '')
+
+
+def texts(net):
+    return [text for text in net.logged('positioner') if 'ready for codebook' not in text]
+
+
+def test_the_positioner_warns_while_the_residuals_deviate(net, estimator):
+    net.run_cycles(MIN_FIXES)
+    assert warnings(net) == ''
+    estimator.factor = 3.0
+    net.run_cycles(2 * MIN_FIXES)
+    assert warnings(net) != ''
+    estimator.factor = 1.0
+    net.run_cycles(MIN_RETURN)
+    assert warnings(net) == ''
+    begin, end = texts(net)
+    assert begin.startswith('the signals do not match the scenario')
+    assert end == 'the residuals match the scenario again'
+    assert set(net.served()) == {1}
+
+
+def test_a_user_outside_is_reported_once_and_causes_no_warning_of_the_residuals(net, estimator):
+    net.run_cycles(1)
+    estimator.reason = 'position outside of the region: probability 1'
+    net.run_cycles(2 * MIN_FIXES)
+    estimator.reason = ''
+    net.run_cycles(2)
+    assert texts(net) == [
+        f'cycle 2: no fix of user 1: {estimator.reason or "position outside of the region"}: '
+        'probability 1', f'cycle {2 + 2 * MIN_FIXES}: user 1 has a position again']
+    assert warnings(net) == ''
+    assert {message.reason for message in net.sent(m.NoFix)} == {
+        'position outside of the region: probability 1'}
+
+
+def test_a_new_codebook_or_new_settings_begin_anew(net, estimator, codebooks):
+    estimator.factor = 3.0
+    net.run_cycles(MIN_FIXES)
+    assert warnings(net) != ''
+    estimator.factor = 1.0
+    net.offer(codebooks[1])
+    assert warnings(net) == ''
+    net.run_cycles(2)
+    estimator.factor = 3.0
+    net.run_cycles(MIN_FIXES)
+    assert warnings(net) != ''
+    net.dispatch('positioner', SettingsOffered(PositionerSettings(reject_outside=False)))
+    assert warnings(net) == ''
