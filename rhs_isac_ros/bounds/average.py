@@ -19,6 +19,7 @@ from rhs_isac_ros.bounds.measurement_rows import (
 from rhs_isac_ros.bounds.quadratic_gradient import quadratic_gradients
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.surface import Beamforming
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 # Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses
 # [n] and their negative derivatives with respect to the forms, float64 [n, G, G].
@@ -84,6 +85,11 @@ class Average:
     combination
         The form's rows, if they are not those of the source.
 
+    Attributes
+    ----------
+    surface
+        An estimate of the surface that is taken as exact; None for that of the scenario.
+
     Raises
     ------
     ValueError
@@ -95,13 +101,14 @@ class Average:
                  combination: Combination | None = None) -> None:
         self.scenario, self._loss = scenario, loss
         self._n_rows, self._combination = n_rows, combination
+        self.surface: SurfaceEstimate | None = None
         self.rows: MeasurementRows = (
             ExactRows(scenario, source, n_items, n_rows, patterns) if tolerance == 0
             else CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns))
 
     def value(self, codebook: Beamforming) -> float:
         """Compute the average without its gradients."""
-        evaluation = self.rows.begin(MeasurementModel(self.scenario, codebook))
+        evaluation = self.rows.begin(self._model(codebook))
         total = 0.0
         for block in blocks(self.rows.n_items):
             whitened = self._whitened(evaluation, block)
@@ -110,7 +117,7 @@ class Average:
 
     def __call__(self, codebook: Beamforming) -> Gradient:
         """Compute the average and its gradients."""
-        model = MeasurementModel(self.scenario, codebook)
+        model = self._model(codebook)
         evaluation = self.rows.begin(model)
         bands = range(self.scenario.n_bands)
         total = 0.0
@@ -126,8 +133,12 @@ class Average:
         mean_terms, covariance_terms = map(
             np.stack, zip(*map(evaluation.sums, bands), strict=True))
         gradients = quadratic_gradients(
-            model, codebook, mean_terms, covariance_terms, self.rows.n_items)
+            model, codebook, mean_terms, covariance_terms, self.rows.n_items, self.surface)
         return Gradient(total / self.rows.n_items, *gradients)
+
+    def _model(self, codebook: Beamforming) -> MeasurementModel:
+        exact = self.surface.without_errors() if self.surface else None
+        return MeasurementModel(self.scenario, codebook, exact)
 
     def _whitened(self, evaluation: Evaluation, block: slice) -> list[np.ndarray]:
         """Whitened means of the form's rows, [n, G, N_SB F] of each band."""

@@ -9,7 +9,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.bounds import crlb_of
+from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.objective import OBJECTIVES
 from rhs_isac_ros.codebook.optimize import (
@@ -24,7 +25,7 @@ from rhs_isac_ros.codebook.plot import plot_optimization
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.codebook.start import STARTS
-from rhs_isac_ros.model import Scenario, ScenarioError, streams
+from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, streams
 from rhs_isac_ros.model.arguments import (
     check_distinct,
     input_file,
@@ -53,6 +54,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='file to write; an existing file is replaced at the end')
     add('--scenario', type=input_file,
         help="YAML file of the scenario; the paper's Table I if omitted")
+    add('--calibration', type=input_file,
+        help="calibration file of the surface; the scenario's surface if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES), default='crlb',
         help='the average bound; the ambiguity between distant positions, which a local bound '
@@ -77,7 +80,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Exit with a usage error if options contradict each other or a library is missing."""
-    check_distinct(parser, {'--scenario': options.scenario},
+    check_distinct(parser, {'--scenario': options.scenario,
+                            '--calibration': options.calibration},
                    {'--output': options.output, '--plot': options.plot})
     if options.resume and options.start:
         parser.error('argument --start: not allowed with --resume, which continues from a file')
@@ -109,6 +113,10 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     """
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+    calibration = None
+    if options.calibration:
+        calibration = Calibration.load(options.calibration)
+        calibration.check(scenario)
     start = _start(options.start, scenario, options.seed)
     resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
     for codebook in filter(None, (start, resumed)):
@@ -117,12 +125,13 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
         result = optimize(
             scenario, method=options.method, objective=options.objective,
             sampling=options.sampling, n_positions=options.positions, seed=options.seed,
-            start=start, resume=resumed, max_steps=options.steps,
+            start=start, resume=resumed, calibration=calibration, max_steps=options.steps,
             max_evaluations=options.evaluations, progress=show,
             keep=lambda result: _save_partial(result, partial))
     held_out = scenario.sample_positions(
         HELD_OUT_POSITIONS, streams.generator(options.seed, streams.HELD_OUT))
-    bounds = crlb(scenario, result.codebook, held_out)
+    bounds = crlb_of(MeasurementModel(
+        scenario, result.codebook, calibration.surface if calibration else None), held_out)
     average, error = float(bounds.mean()), float(bounds.std() / HELD_OUT_POSITIONS**0.5)
     codebook = dataclasses.replace(result.codebook, average_crlb_m2=average)
     _save(codebook, output)

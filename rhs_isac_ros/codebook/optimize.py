@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.bounds import crlb_of
+from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook.alternating import minimize_alternating
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.direct import minimize_direct
@@ -19,7 +20,7 @@ from rhs_isac_ros.codebook.provenance import Provenance
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import BudgetSpent, Progress, Search
 from rhs_isac_ros.codebook.start import STARTS, random_codebook
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.los import checked_positions
 
 # Sobol points; as good as 1200 independent positions.
@@ -72,8 +73,8 @@ def optimize(
         scenario: Scenario, positions: np.ndarray | None = None, method: str = 'lbfgs', *,
         objective: str = 'crlb', sampling: str = 'sobol', n_positions: int = DEFAULT_POSITIONS,
         seed: int = 0, start: Codebook | None = None, resume: Codebook | None = None,
-        max_steps: int | None = None, max_evaluations: int | None = None,
-        progress: Callable[[Progress], None] | None = None,
+        calibration: Calibration | None = None, max_steps: int | None = None,
+        max_evaluations: int | None = None, progress: Callable[[Progress], None] | None = None,
         keep: Callable[[OptimizeResult], None] | None = None) -> OptimizeResult:
     """Find a codebook that minimises an objective.
 
@@ -103,6 +104,9 @@ def optimize(
     resume
         Result of an earlier call with the same arguments, to continue from; its steps and
         evaluations count towards the limits.
+    calibration
+        Calibration of the surface, taken as exact; by default the surface is that of the
+        scenario.
     max_steps
         Maximum number of update steps; by default that of the method.
     max_evaluations
@@ -116,7 +120,8 @@ def optimize(
     ------
     ValueError
         If a name is unknown, a number or the positions are out of range, `resume` was made with
-        other arguments, or the signals do not determine the positions.
+        other arguments, the calibration belongs to another scenario, or the signals do not
+        determine the positions.
     MissingLibraryError
         If the method needs a library that is not installed.
     CodebookError
@@ -142,17 +147,22 @@ def optimize(
             raise ValueError('positions: none, expected at least one')
     provenance = Provenance(
         method=method, objective=objective, seed=int(seed), sampling=sampling,
-        positions=len(positions), scenario=scenario.changes())
+        positions=len(positions), scenario=scenario.changes(),
+        calibration=calibration.id if calibration else '')
     done = provenance.resumed(resume) if resume else provenance
     first = resume or start or STARTS.get(method, random_codebook)(
         scenario, streams.generator(seed, streams.START))
     check_start(first, scenario)
-    problem = Problem(scenario, OBJECTIVES[objective](
-        scenario, positions, streams.generator(seed, streams.PAIRS)))
+    average = OBJECTIVES[objective](scenario, positions, streams.generator(seed, streams.PAIRS))
+    surface = None
+    if calibration:
+        calibration.check(scenario)
+        average.surface = surface = calibration.surface
+    problem = Problem(scenario, average)
 
     def result(reason: str) -> OptimizeResult:
         best = problem.unpack(search.best)
-        bound = float(crlb(scenario, best, positions).mean())
+        bound = float(crlb_of(MeasurementModel(scenario, best, surface), positions).mean())
         text = provenance.to_text(search.history[-1], reason)
         return OptimizeResult(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),

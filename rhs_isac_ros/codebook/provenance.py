@@ -21,6 +21,8 @@ class Provenance:
         Fields of the scenario that differ from Table I.
     version
         Version of this package.
+    calibration
+        Id of the calibration; empty without one.
     steps, evaluations
         Totals, including those of the runs that it resumed.
     value_m2
@@ -36,6 +38,7 @@ class Provenance:
     positions: int
     scenario: dict[str, Any]
     version: str = __version__
+    calibration: str = ''
     steps: int = 0
     evaluations: int = 0
     value_m2: float = float('nan')
@@ -46,7 +49,10 @@ class Provenance:
         result = dataclasses.replace(
             self, steps=end.step, evaluations=end.evaluations, value_m2=float(end.value_m2),
             reason=reason)
-        return provenance_text.encode(dataclasses.asdict(result))
+        fields = dataclasses.asdict(result)
+        if not self.calibration:
+            del fields['calibration']
+        return provenance_text.encode(fields)
 
     def resumed(self, codebook: Codebook) -> 'Provenance':
         """Return the provenance of an earlier result, to resume it.
@@ -57,7 +63,8 @@ class Provenance:
         if earlier is None:
             raise ValueError(
                 f'resume: provenance {codebook.provenance!r}, expected that of an optimisation')
-        for name in ('method', 'objective', 'seed', 'sampling', 'positions', 'scenario'):
+        for name in ('method', 'objective', 'seed', 'sampling', 'positions', 'scenario',
+                     'calibration'):
             given, expected = getattr(self, name), getattr(earlier, name)
             if given != expected:
                 raise ValueError(

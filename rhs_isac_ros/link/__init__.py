@@ -6,11 +6,12 @@ from rhs_isac_ros.link.quartiles import RunningQuartiles
 from rhs_isac_ros.link.steering import (
     CapacityReport,
     Choice,
+    applied_beam,
     capacity_report,
     choose_beam,
     steer,
 )
 
 __all__ = [
-    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'RunningQuartiles', 'beam_pattern',
-    'capacity', 'capacity_report', 'choose_beam', 'expected_capacity', 'steer']
+    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'RunningQuartiles', 'applied_beam',
+    'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacity', 'steer']

@@ -79,6 +79,7 @@ class _Point:
         Return None if it does not increase the capacity.
         """
         corner: np.ndarray = (1 / (1 + self.snr) @ self.snr_gradient > 0).astype(float)
+        corner[self.link.fixed] = 1.0
         direct, radiation = self.los_weights @ corner, self.weights * corner
         scattered = np.sum(self.link.scatter(radiation) * np.conj(radiation), axis=1).real
         return corner if self._gains(np.abs(direct)**2 + scattered) else None
@@ -90,7 +91,7 @@ class _Point:
         """
         curvatures = np.abs(self.los_weights)**2
         curvatures += np.abs(self.weights)**2 * np.diag(self.link.spatial)
-        steps = np.stack([-self.analog, 1 - self.analog])[:, None]
+        steps = np.stack([-self.analog, 1 - self.analog])[:, None] * ~self.link.fixed
         # The power is quadratic in each element, so that this is exact; only rounding can make
         # it negative.
         snr = self.snr[:, None] + steps * self.snr_gradient + steps**2 * curvatures

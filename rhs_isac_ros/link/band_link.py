@@ -10,6 +10,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 # Largest share of the multipath power that the modes may omit.
 _MAX_OMITTED = 0.02
@@ -31,6 +32,8 @@ class BandLink:
         The strongest modes of V_i, float64 [N_E, r]: G with G G^T close to V_i.
     noise_power_w, power_w
         Noise power of a sub-band, and power of the digital part over all sub-bands [W].
+    fixed
+        Elements that do not follow the configuration, bool [N_E]; theirs is 1.
     """
 
     onboard: np.ndarray
@@ -39,10 +42,14 @@ class BandLink:
     modes: np.ndarray
     noise_power_w: float
     power_w: float
+    fixed: np.ndarray
 
     @classmethod
-    def to(cls, scenario: Scenario, position: np.ndarray, band: int) -> 'BandLink':
+    def to(cls, scenario: Scenario, position: np.ndarray, band: int,
+           surface: SurfaceEstimate | None = None) -> 'BandLink':
         """Return the link to a position, float64 [3] [m], in a band, counted from 0.
+
+        The coefficients of an estimated surface become part of the propagation on the board.
 
         Raises
         ------
@@ -51,8 +58,13 @@ class BandLink:
         """
         los = los_gain(scenario, np.asarray(position, dtype=float)[None], band)[0]
         spatial, modes = _multipath(scenario)[band]
-        return cls(onboard_matrix(scenario)[band], los, spatial, modes, scenario.noise_power_w,
-                   scenario.max_power_w)
+        onboard, fixed = onboard_matrix(scenario)[band], np.zeros(scenario.n_elements, bool)
+        if surface:
+            fixed = surface.failed
+            coefficients = np.where(fixed, surface.offsets, surface.gains)
+            onboard = surface.band_gains[band] * coefficients * onboard
+        return cls(onboard, los, spatial, modes, scenario.noise_power_w, scenario.max_power_w,
+                   fixed)
 
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
         """Return the best digital part for a configuration, complex128 [N_SB, K] [sqrt(W)].

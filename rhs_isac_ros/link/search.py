@@ -43,6 +43,7 @@ def candidate_configurations(link: BandLink, max_count: int) -> np.ndarray:
     for n_left in _N_KEPT:
         product = np.conj(pairs).reshape(len(pairs), -1).view(float)
         analog = (product @ path_matrix.T > 0).astype(float)
+        analog[:, link.fixed] = 1.0
         configured = (analog @ path_matrix).view(complex).reshape(pairs.shape)
         snr, on_board, pairs = _improve_pairs(configured, on_board)
         pairs /= (1 + snr)[..., None, None]

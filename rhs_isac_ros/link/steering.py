@@ -12,6 +12,7 @@ from rhs_isac_ros.link.capacity import Beam, capacity, expected_capacity
 from rhs_isac_ros.link.search import candidate_configurations
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface import matched_configuration
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 # Number of candidates to compare over all sub-bands and modes, and of ascents.
 _N_CANDIDATES = 8
@@ -44,13 +45,15 @@ class CapacityReport:
         return 100 * self.loss_bps / self.perfect_bps if self.perfect_bps else math.nan
 
 
-def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
+def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
+          surface: SurfaceEstimate | None = None) -> Beam:
     """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
 
     A search from many starts proposes configurations. The best few of these configurations and
     the matched filter are then improved together with the digital part. The beam is therefore
     never worse than the matched filter. It has the power P_max over all sub-bands. The same
-    position always gives the same beam. Bands are counted from 0.
+    position always gives the same beam. Bands are counted from 0. A calibrated surface applies
+    its own coefficients to the configuration of the beam.
 
     Raises
     ------
@@ -59,17 +62,26 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0) -> Beam:
     """
     if not 0 <= band < scenario.n_bands:
         raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
-    link = BandLink.to(scenario, position, band)
-    starts = [matched_configuration(link.los, link.onboard),
-              *candidate_configurations(link, _N_CANDIDATES)]
+    link = BandLink.to(scenario, position, band, surface)
+    matched = matched_configuration(link.los, link.onboard)
+    matched[link.fixed] = 1.0
+    starts = [matched, *candidate_configurations(link, _N_CANDIDATES)]
     starts.sort(key=link.best_rate, reverse=True)
     ends = [ascend(link, start) for start in starts[:_N_ASCENTS]]
     return Beam(*max(ends, key=lambda end: link.best_rate(end[0])), band)
 
 
+def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
+    """Return a beam with the coefficients and the gain that a calibrated surface applies."""
+    if surface is None:
+        return beam
+    return Beam(surface.applied(beam.analog), surface.band_gains[beam.band] * beam.digital,
+                beam.band)
+
+
 def choose_beam(
         scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
-        bands: Sequence[int] | None = None) -> Choice:
+        bands: Sequence[int] | None = None, surface: SurfaceEstimate | None = None) -> Choice:
     """Steer a beam of each band to the mean position and choose that of highest mean capacity.
 
     The capacity at the mean alone would mislead: a band with a stronger but narrower beam may
@@ -84,6 +96,8 @@ def choose_beam(
         Float64 [3, 3] [m^2]; None if the position is known exactly.
     bands
         Bands to choose from, counted from 0; None for all.
+    surface
+        A calibrated surface; by default that of the scenario.
 
     Raises
     ------
@@ -93,25 +107,27 @@ def choose_beam(
     covariance = np.zeros((3, 3)) if covariance is None else covariance
     choices = []
     for band in range(scenario.n_bands) if bands is None else bands:
-        beam = steer(scenario, mean, band)
-        choices.append(Choice(beam, expected_capacity(scenario, beam, mean, covariance)))
+        beam = steer(scenario, mean, band, surface)
+        choices.append(Choice(beam, expected_capacity(
+            scenario, applied_beam(beam, surface), mean, covariance)))
     return max(choices, key=lambda choice: choice.expected_bps)
 
 
 def capacity_report(
         scenario: Scenario, beam: Beam, position: np.ndarray,
-        bands: Sequence[int] | None = None) -> CapacityReport:
+        bands: Sequence[int] | None = None,
+        surface: SurfaceEstimate | None = None) -> CapacityReport:
     """Compare a beam with the one chosen with the true position, float64 [3] [m].
 
-    The latter is chosen from `bands`, as in `choose_beam`. The search for a beam ends slightly
-    below the maximum, so that the loss with an accurate estimate may be negative, by a few
-    hundredths of a per cent at most.
+    The latter is chosen from `bands` for `surface`, as in `choose_beam`. The search for a beam
+    ends slightly below the maximum, so that the loss with an accurate estimate may be negative,
+    by a few hundredths of a per cent at most.
 
     Raises
     ------
     ValueError
         If the position is not a finite [3] array, or the beam does not fit the scenario.
     """
-    perfect = choose_beam(scenario, position, bands=bands)
-    actual = capacity(scenario, beam, np.asarray(position, dtype=float)[None])[0]
-    return CapacityReport(float(actual), perfect.expected_bps)
+    perfect = choose_beam(scenario, position, bands=bands, surface=surface)
+    used, place = applied_beam(beam, surface), np.asarray(position, dtype=float)
+    return CapacityReport(float(capacity(scenario, used, place[None])[0]), perfect.expected_bps)

@@ -1,6 +1,7 @@
 """Random draws of the deviations that a scenario declares: surfaces, users and cycles."""
 
 import dataclasses
+import hashlib
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,13 @@ class SurfaceImperfection:
 
     gains: np.ndarray
     stuck: np.ndarray
+
+    @property
+    def id(self) -> str:
+        """Hash of the errors, 16 hexadecimal digits."""
+        digest = hashlib.sha256(np.asarray(self.gains, complex).astype('<c16').tobytes())
+        digest.update(np.asarray(self.stuck, float).astype('<f8').tobytes())
+        return digest.hexdigest()[:16]
 
     def applied(self, analog: np.ndarray) -> np.ndarray:
         """Return the coefficients in effect, complex128, for configurations [..., N_E].

@@ -6,14 +6,12 @@ scenario declares add to the covariance; `nuisance` describes unknown gains and 
 """
 
 import functools
+from typing import Protocol
 
 import numpy as np
 
-from rhs_isac_ros.model.element_error import (
-    error_covariance,
-    error_covariance_at,
-    expected_beams,
-)
+from rhs_isac_ros.model import element_error
+from rhs_isac_ros.model.covariance import scattered_covariance, signal_covariance
 from rhs_isac_ros.model.element_sums import ElementSums
 from rhs_isac_ros.model.imperfections import (
     SurfaceImperfection,
@@ -21,18 +19,26 @@ from rhs_isac_ros.model.imperfections import (
     has_element_errors,
 )
 from rhs_isac_ros.model.los import checked_positions, los_derivative, los_gain
-from rhs_isac_ros.model.multipath import (
-    complex_normal,
-    measurement_correlation,
-    multipath_covariance,
-    square_root,
-)
+from rhs_isac_ros.model.multipath import complex_normal, square_root
 from rhs_isac_ros.model.receive import received_signal
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
+# What may be known of the elements: their errors, or an estimate of them.
+Surface = SurfaceImperfection | SurfaceEstimate
 # Positions evaluated at a time.
 _BLOCK = 256
+
+
+class _Errors(Protocol):
+    """The distribution of errors of the elements: that of a scenario, or of an estimate."""
+
+    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray: ...
+
+    def error_covariance_at(
+            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray
+    ) -> np.ndarray: ...
 
 
 def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
@@ -57,25 +63,6 @@ def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
     return derivative
 
 
-def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
-    """Implements Eq. (14). Covariance of the received signals, independent of the position.
-
-    Returns Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W], for the radiation matrices T_i of all
-    bands, complex128 [N_B, N_SB F, N_E].
-    """
-    noise = scenario.noise_power_w * np.eye(radiation.shape[1])
-    covariance: np.ndarray = _scattered_covariance(scenario, radiation) + noise
-    return covariance
-
-
-def _scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
-    """Covariance of the multipath in the received signals [N_B, N_SB F, N_SB F] [W]."""
-    spatial = multipath_covariance(scenario)
-    scattered = np.matmul(np.matmul(radiation, spatial), np.conj(np.swapaxes(radiation, 1, 2)))
-    correlated: np.ndarray = measurement_correlation(scenario) * scattered
-    return correlated
-
-
 class MeasurementModel:
     """Distribution of the received signals for one scenario and beamforming.
 
@@ -88,9 +75,10 @@ class MeasurementModel:
     Parameters
     ----------
     surface
-        Known errors of the elements. By default they are unknown, with the distribution that the
-        scenario declares: the mean is then the average over surfaces, and the covariance
-        includes the errors.
+        Known errors of the elements, or an estimate of them, whose own errors the covariance
+        then includes. By default they are unknown, with the distribution that the scenario
+        declares: the mean is then the average over surfaces, and the covariance includes the
+        errors.
 
     Attributes
     ----------
@@ -104,11 +92,14 @@ class MeasurementModel:
     """
 
     def __init__(self, scenario: Scenario, beamforming: Beamforming,
-                 surface: SurfaceImperfection | None = None) -> None:
+                 surface: Surface | None = None) -> None:
         self.scenario, self._beams = scenario, beamforming
         self._is_uncertain = surface is None and has_element_errors(scenario)
+        self._errors: _Errors | None = element_error if self._is_uncertain else None
+        if isinstance(surface, SurfaceEstimate):
+            self._errors = surface
         applied = (surface.applied_beams(beamforming) if surface
-                   else expected_beams(scenario, beamforming))
+                   else element_error.expected_beams(scenario, beamforming))
         self.radiation = _read_only(radiation_matrix(scenario, applied))
 
     @property
@@ -123,8 +114,8 @@ class MeasurementModel:
         Unknown errors of the elements contribute their average over the region of interest.
         """
         covariance = signal_covariance(self.scenario, self.radiation)
-        if self._is_uncertain:
-            covariance += error_covariance(self.scenario, self._beams)
+        if self._errors:
+            covariance += self._errors.error_covariance(self.scenario, self._beams)
         return covariance
 
     def covariance_at(self, positions: np.ndarray) -> np.ndarray:
@@ -135,8 +126,9 @@ class MeasurementModel:
         positions = checked_positions(positions)
         covariance: np.ndarray = np.repeat(
             signal_covariance(self.scenario, self.radiation)[None], len(positions), axis=0)
-        if self._is_uncertain:
-            covariance += error_covariance_at(self.scenario, self._beams, positions)
+        if self._errors:
+            covariance += self._errors.error_covariance_at(
+                self.scenario, self._beams, positions)
         return covariance
 
     @functools.cached_property
@@ -230,7 +222,7 @@ class MeasurementModel:
             return signals
         # Factors act on the multipath, but not on the noise.
         noise = np.sqrt(self.scenario.noise_power_w) * complex_normal(signals.shape, rng)
-        for band, scattered in enumerate(_scattered_covariance(self.scenario, self.radiation)):
+        for band, scattered in enumerate(scattered_covariance(self.scenario, self.radiation)):
             root = square_root(scattered)
             signals[:, band] += white[:, band, :root.shape[1]] @ root.T
         received: np.ndarray = signals * factors + noise

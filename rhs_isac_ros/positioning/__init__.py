@@ -23,6 +23,7 @@ from rhs_isac_ros.positioning.exhaustive import exhaustive_posterior
 from rhs_isac_ros.positioning.ml import MlEstimator
 from rhs_isac_ros.positioning.network import ModelError, Network
 from rhs_isac_ros.positioning.neural import NeuralEstimator
+from rhs_isac_ros.positioning.search import surface_of
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.training import train
 
@@ -34,7 +35,8 @@ REGION_ESTIMATORS = (BayesEstimator.name, MlEstimator.name)
 __all__ = [
     'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator',
     'ModelError', 'Network', 'NeuralEstimator', 'SignalError', 'estimate_each',
-    'exhaustive_posterior', 'file_options', 'make_estimator', 'simulate_pairs', 'train',
+    'exhaustive_posterior', 'file_options', 'make_estimator', 'simulate_pairs', 'surface_of',
+    'train',
 ]
 
 
@@ -48,8 +50,9 @@ def make_estimator(
         A key of `ESTIMATORS`, or an entry point of the group `plugins.ESTIMATORS`.
     **options
         ``table_folder``, a folder for tables, and ``reject_outside``, whether users outside of
-        the region get no fix, for `REGION_ESTIMATORS`; ``model_file``, a `Network` or its file,
-        for `neural`. Plug-ins define their own options.
+        the region get no fix, and ``surface``, what is known of the surface, for
+        `REGION_ESTIMATORS`; ``model_file``, a `Network` or its file, for `neural`. Plug-ins define
+        their own options.
 
     Raises
     ------

@@ -6,6 +6,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.samples import Samples
 from rhs_isac_ros.positioning.search import SearchEstimator
@@ -23,8 +24,10 @@ class BayesEstimator(SearchEstimator):
 
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
-            table_folder: Path | None = None, *, reject_outside: bool = False) -> None:
-        super().__init__(scenario, codebook, table_folder, reject_outside=reject_outside)
+            table_folder: Path | None = None, *, reject_outside: bool = False,
+            surface: Surface | None = None) -> None:
+        super().__init__(scenario, codebook, table_folder, reject_outside=reject_outside,
+                         surface=surface)
         self._prior_covariance = np.diag((self._bounds[1] - self._bounds[0])**2 / 12)
 
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,8 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model.imperfections import has_element_errors
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
@@ -22,21 +24,41 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
 _STEP_LIMITS = np.array([0.02, 0.03, 0.03])
+# Share of the errors of an estimate in the whitened signals from which their position matters.
+_MIN_ERROR_SHARE = 0.05
 
 
 class ElementErrorModel:
-    """Likelihood of modes under the element errors that a scenario declares."""
+    """Likelihood of modes under the errors of the elements that remain unknown.
+
+    These are the errors that a scenario declares, or those of an estimate of the surface.
+    """
 
     def __init__(self, model: WhitenedModel) -> None:
         scenario = model.scenario
         self._model = model
-        self._average = MeasurementModel(scenario, model.codebook)
+        if model.surface is not None:
+            # The number of failures is known.
+            scenario = dataclasses.replace(scenario, failed_element_share=0.0)
+        self._average = MeasurementModel(scenario, model.codebook, model.surface)
         self._intact = MeasurementModel(
-            dataclasses.replace(scenario, failed_element_share=0.0), model.codebook)
+            dataclasses.replace(scenario, failed_element_share=0.0), model.codebook,
+            model.surface)
         roots = np.linalg.cholesky(self._average.covariance())
         self._log_volume = 2 * np.log(np.diagonal(roots, axis1=1, axis2=2).real).sum()
         self._scales, self._log_weights = _failures(
             scenario.n_elements, scenario.failed_element_share)
+
+    @classmethod
+    def of(cls, model: WhitenedModel) -> 'ElementErrorModel | None':
+        """Return the errors of a model, or None if they are absent or negligible."""
+        if model.surface is None:
+            return cls(model) if has_element_errors(model.scenario) else None
+        if not isinstance(model.surface, SurfaceEstimate):
+            return None
+        errors = model.surface.error_covariance(model.scenario, model.codebook)
+        share = model.whitened_power(errors) / float(np.prod(model.shape))
+        return cls(model) if share > _MIN_ERROR_SHARE else None
 
     def refine(self, modes: Modes, signals: np.ndarray, step: bool) -> tuple[Modes, np.ndarray]:
         """Weigh modes; also return the energy of their residuals, float64 [M].

@@ -1,15 +1,13 @@
 """The paper's network, with one hidden layer from received signals to a position, and its file."""
 
 import dataclasses
-import json
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.archive import ArchiveError, read_archive, write_archive
 from rhs_isac_ros.positioning.estimate import stack_parts
 
 _FORMAT = 1
@@ -101,9 +99,9 @@ class Network:
 
         An existing file is replaced at the end, or kept if there is an `OSError`.
         """
-        arrays = {key: getattr(self, name) for key, name in self._names_by_key().items()}
-        arrays['about'] = json.dumps({'format': _FORMAT, 'inputs': self.inputs, **self.about})
-        write_whole(path, lambda stream: np.savez(stream, **arrays))
+        write_archive(
+            path, {key: getattr(self, name) for key, name in self._names_by_key().items()},
+            {'format': _FORMAT, 'inputs': self.inputs, **self.about})
 
     @classmethod
     def load(cls, path: str | Path) -> 'Network':
@@ -114,24 +112,16 @@ class Network:
         ModelError
             If the file cannot be read, is damaged, or does not contain a model.
         """
-        try:
-            with open(path, 'rb') as stream:
-                file = np.load(stream, allow_pickle=False)
-                arrays = {key: file[key] for key in getattr(file, 'files', ())}
-            about = json.loads(str(arrays.pop('about', '{}')))
-        # Reading verifies the checksum that the format holds for every array.
-        except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError,
-                zipfile.BadZipFile) as error:
-            reason = ' '.join(str(error).split())
-            raise ModelError(f'{path}: cannot be read: {reason}') from error
         names = cls._names_by_key()
-        if not isinstance(about, dict) or about.pop('format', 0) != _FORMAT or (
-                arrays.keys() != names.keys()):
-            raise ModelError(f'{path}: not a model, expected a model file of format {_FORMAT}')
+        try:
+            arrays, about = read_archive(path, 'model', _FORMAT, set(names))
+        except ArchiveError as error:
+            raise ModelError(str(error)) from error
         inputs = str(about.pop('inputs', 'parts'))
         try:
-            return cls(**{names[key]: array.astype(float) for key, array in arrays.items()},
-                       about=about, inputs=inputs)
+            fields: dict[str, Any] = {
+                names[key]: array.astype(float) for key, array in arrays.items()}
+            return cls(**fields, about=about, inputs=inputs)
         except ValueError as error:
             raise ModelError(f'{path}: {error}') from None
 

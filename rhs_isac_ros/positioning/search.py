@@ -8,10 +8,10 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.imperfections import has_element_errors
+from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
-from rhs_isac_ros.positioning.estimate import Estimate, Located, estimate_each
+from rhs_isac_ros.positioning.estimate import Estimate, Estimator, Located, estimate_each
 from rhs_isac_ros.positioning.fit import (
     CONFIDENCE,
     FitTest,
@@ -45,6 +45,8 @@ class SearchEstimator(abc.ABC):
         certain (`fit.CONFIDENCE`), there is no fix either. If it is merely possible, the
         covariance includes the positions outside, while the position remains that of a user
         inside.
+    surface
+        What is known of the surface, as in `MeasurementModel`; for example a calibration.
 
     Raises
     ------
@@ -54,9 +56,10 @@ class SearchEstimator(abc.ABC):
 
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
-            table_folder: Path | None = None, *, reject_outside: bool = False) -> None:
+            table_folder: Path | None = None, *, reject_outside: bool = False,
+            surface: Surface | None = None) -> None:
         self._rejects_outside = reject_outside
-        self._model = WhitenedModel(scenario, codebook)
+        self._model = WhitenedModel(scenario, codebook, surface)
         arrays = load_table(self._model, table_folder)
         self._table = TemplateTable(scenario, arrays)
         self._surroundings = Surroundings(scenario, arrays)
@@ -64,7 +67,7 @@ class SearchEstimator(abc.ABC):
         self._test = FitTest(n_measurements)
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
-        self._error = ElementErrorModel(self._model) if has_element_errors(scenario) else None
+        self._error = ElementErrorModel.of(self._model)
         self._marginal: MarginalSearch | None = None
         # Weak signals may be those of a user with a low gain.
         self._max_power = 10**(_GAIN_REACH * scenario.user_gain_std_db / 10)
@@ -150,6 +153,16 @@ class SearchEstimator(abc.ABC):
         average = float(weights @ residuals / weights.sum())
         return self._mean_residual - (average - residual)
 
+    @property
+    def surface(self) -> Surface | None:
+        """What the estimator assumes to be known of the surface."""
+        return self._model.surface
+
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         """Return a position [3] and its covariance [3, 3] from the modes."""
+
+
+def surface_of(estimator: Estimator) -> Surface | None:
+    """Return what an estimator assumes to be known of the surface; None for other estimators."""
+    return estimator.surface if isinstance(estimator, SearchEstimator) else None

@@ -63,7 +63,8 @@ def table_key(model: WhitenedModel) -> str:
     """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
     parts = (dataclasses.astuple(model.scenario), model.codebook.id, __version__, _FORMAT,
              templates.RANGE_CELL_M, templates.DIRECTION_STEP,
-             surroundings.RANGE_RATIO, surroundings.DIRECTION_STEP)
+             surroundings.RANGE_RATIO, surroundings.DIRECTION_STEP,
+             *([model.surface.id] if model.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 

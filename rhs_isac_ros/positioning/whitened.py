@@ -4,13 +4,14 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.measurement import Surface
 
 
 class WhitenedModel:
     """Likelihood of positions for one scenario and codebook.
 
     Up to a constant, the log-likelihood of whitened signals y at a position with whitened mean t
-    is 2 Re(t^H y) - t^H t.
+    is 2 Re(t^H y) - t^H t. What is known of the surface is that of `MeasurementModel`.
 
     Raises
     ------
@@ -18,11 +19,12 @@ class WhitenedModel:
         If the codebook does not fit the scenario.
     """
 
-    def __init__(self, scenario: Scenario, codebook: Codebook) -> None:
+    def __init__(self, scenario: Scenario, codebook: Codebook,
+                 surface: Surface | None = None) -> None:
         codebook.check(scenario)
-        self.scenario, self.codebook = scenario, codebook
+        self.scenario, self.codebook, self.surface = scenario, codebook, surface
         # Estimators are built between cycles; their first estimate should be as fast as any.
-        self._model = MeasurementModel(scenario, codebook).prepare(jacobian=True)
+        self._model = MeasurementModel(scenario, codebook, surface).prepare(jacobian=True)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -32,6 +34,12 @@ class WhitenedModel:
     def whiten(self, received: np.ndarray) -> np.ndarray:
         """Transform signals [N, N_B, N_SB F] to unit covariance; the shape stays the same."""
         return self._model.whiten(received)
+
+    def whitened_power(self, covariance: np.ndarray) -> float:
+        """Compute the energy of whitened signals with a covariance [N_B, N_SB F, N_SB F]."""
+        whitener = self._model.whitener
+        return float(np.einsum(
+            'irs,ist,irt->', whitener, covariance, np.conj(whitener), optimize=True).real)
 
     def whitened_operators(self, patterns: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 for factors P of the signals, e.g. of nuisance parameters.

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import yaml
 
-from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.bounds import crlb, crlb_of
+from rhs_isac_ros.calibration import Pilots, calibrate, prior_of
 from rhs_isac_ros.codebook import Codebook, Provenance, command, directional_codebook
 from rhs_isac_ros.codebook.__main__ import main
 from rhs_isac_ros.codebook.optimize import INTERRUPTED, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface, streams
 
 
 @pytest.fixture
@@ -240,6 +241,45 @@ def test_a_partial_file_that_cannot_be_written_is_a_warning(call, files, capsys,
     assert call('--steps', 3) == 0
     assert 'warning: ' in capsys.readouterr().err
     assert Provenance.parse(Codebook.load(files / 'codebook.yaml').provenance).steps == 3
+
+
+@pytest.fixture
+def calibration(scenario, files, random_beams):
+    """A calibration of a surface with errors, in a file."""
+    rng = np.random.default_rng(0)
+    declared = dataclasses.replace(
+        scenario, element_error_rms=0.3, failed_element_share=0.2)
+    beams, positions = random_beams(scenario, rng), scenario.sample_positions(40, rng)
+    model = MeasurementModel(scenario, beams, draw_surface(declared, rng))
+    calibration = calibrate(
+        scenario, [Pilots(beams, positions, model.sample(positions, rng))], prior_of(declared))
+    calibration.save(files / 'calibration.npz')
+    return calibration
+
+
+def test_a_codebook_is_optimised_for_a_calibrated_surface(
+        call, files, scenario, calibration, capsys):
+    assert call('--steps', 40, '--calibration', files / 'calibration.npz') == 0
+    codebook = Codebook.load(files / 'codebook.yaml')
+    assert Provenance.parse(codebook.provenance).calibration == calibration.id
+    held_out = scenario.sample_positions(
+        command.HELD_OUT_POSITIONS, streams.generator(0, streams.HELD_OUT))
+    model = MeasurementModel(scenario, codebook, calibration.surface)
+    assert codebook.average_crlb_m2 == pytest.approx(crlb_of(model, held_out).mean(), rel=1e-9)
+    # A codebook for an ideal surface is worse on the calibrated one.
+    assert call('--steps', 40) == 0
+    ideal = Codebook.load(files / 'codebook.yaml')
+    assert crlb_of(MeasurementModel(scenario, ideal, calibration.surface),
+                   held_out).mean() > codebook.average_crlb_m2
+    assert call('--calibration', files / 'calibration.npz', '--resume') == 2
+    assert "calibration: 'ca" in capsys.readouterr().err
+
+
+def test_a_calibration_of_another_scenario_is_refused(files, calibration, capsys):
+    assert main(['--calibration', str(files / 'calibration.npz'), '--output',
+                 str(files / 'codebook.yaml'), '--quiet']) == 2
+    assert capsys.readouterr().err.startswith('error: scenario_id: ')
+    assert not (files / 'codebook.yaml').exists()
 
 
 def test_progress_shows_value_and_step(files, capfd):

@@ -9,6 +9,7 @@ import pytest
 from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
+    applied_beam,
     capacity,
     capacity_report,
     choose_beam,
@@ -18,6 +19,7 @@ from rhs_isac_ros.link import (
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 POSITION = np.array([9.0, 1.5, -0.4])
 
@@ -260,3 +262,41 @@ def test_an_outcome_at_an_invalid_position_is_an_error(table1, position):
     beam = steer(table1.scenario, POSITION)
     with pytest.raises(ValueError, match='expected'):
         capacity_report(table1.scenario, beam, np.array(position))
+
+
+@pytest.fixture(scope='module')
+def damaged(table1):
+    """A surface with errors and three failed elements, as an exact estimate."""
+    scenario, rng = table1.scenario, np.random.default_rng(0)
+    failed = np.zeros(scenario.n_elements, bool)
+    failed[[3, 44, 90]] = True
+    gains = 1 + 0.2 * rng.normal(size=(scenario.n_elements, 2)) @ [1, 1j]
+    return SurfaceEstimate(
+        np.where(failed, 0, gains), np.where(failed, 0.8 * gains, 0),
+        np.array([0.9, 1.1j]), np.zeros((2 * scenario.n_elements + 2, 0), complex),
+        failed.astype(float))
+
+
+def test_a_beam_for_a_calibrated_surface_has_the_capacity_of_the_search(table1, damaged):
+    """No other configuration of one element increases it, and an uncalibrated beam has less."""
+    scenario = table1.scenario
+    beam = steer(scenario, POSITION, 0, damaged)
+    best = capacity(scenario, applied_beam(beam, damaged), POSITION[None])[0]
+    plain = steer(scenario, POSITION)
+    assert capacity(scenario, applied_beam(plain, damaged), POSITION[None])[0] < best
+    np.testing.assert_array_equal(beam.analog[damaged.failed], 1.0)
+    for element in (0, 17, 44):
+        changed = beam.analog.copy()
+        changed[element] = 1 - changed[element]
+        other = applied_beam(Beam(changed, beam.digital), damaged)
+        change = capacity(scenario, other, POSITION[None])[0] - best
+        # A failed element does not follow.
+        assert change == 0 if element == 44 else change < 0
+
+
+def test_a_report_is_about_the_calibrated_surface(table1, damaged):
+    scenario = table1.scenario
+    choice = choose_beam(scenario, POSITION, surface=damaged)
+    report = capacity_report(scenario, choice.beam, POSITION, surface=damaged)
+    assert report.actual_bps == report.perfect_bps == choice.expected_bps
+    assert capacity_report(scenario, choice.beam, POSITION).actual_bps != report.actual_bps

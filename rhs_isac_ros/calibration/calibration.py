@@ -1,0 +1,156 @@
+"""A calibration: the estimate of a surface, the scenario that it belongs to, and its file."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rhs_isac_ros import __version__
+from rhs_isac_ros.calibration.estimate import TOLERANCE, estimate_surface, prior_of
+from rhs_isac_ros.calibration.mixture import SurfacePrior
+from rhs_isac_ros.calibration.pilots import Pilots
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.archive import ArchiveError, read_archive, write_archive
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+
+_FORMAT = 1
+# Types of the arrays in a file, and of their standard deviations, which are there for readers.
+_ARRAYS = {'gains': complex, 'offsets': complex, 'band_gains': complex, 'factor': complex,
+           'failed_probability': float}
+_DEVIATIONS = ('gains_std', 'offsets_std', 'band_gains_std')
+
+
+class CalibrationError(ValueError):
+    """A calibration is malformed or belongs to another scenario."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Calibration:
+    """An estimate of a surface.
+
+    Attributes
+    ----------
+    surface
+        The estimate, which estimators, bounds and beams take.
+    scenario_id
+        `Scenario.id` of the scenario for which it holds.
+    about
+        How it was made: ``pilots``, their number; ``codebooks``, their ids; ``prior``, that of
+        the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
+        estimation, and whether it ``converged``; ``version``.
+
+    Raises
+    ------
+    CalibrationError
+        If sizes disagree or a number is not finite.
+    """
+
+    surface: SurfaceEstimate
+    scenario_id: str
+    about: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        """Check sizes and numbers, and make the arrays read-only."""
+        n_elements, n_bands = np.size(self.surface.gains), np.size(self.surface.band_gains)
+        rank = np.shape(self.surface.factor)[-1] if np.ndim(self.surface.factor) == 2 else 0
+        shapes = {'gains': (n_elements,), 'offsets': (n_elements,), 'band_gains': (n_bands,),
+                  'factor': (2 * n_elements + n_bands, rank),
+                  'failed_probability': (n_elements,)}
+        for name, shape in shapes.items():
+            array = getattr(self.surface, name)
+            if np.shape(array) != shape:
+                raise CalibrationError(f'{name}: shape {np.shape(array)}, expected {shape}')
+            if not np.isfinite(array).all():
+                raise CalibrationError(f'{name}: not finite, expected finite numbers')
+            array.flags.writeable = False
+        probability = self.surface.failed_probability
+        if n_elements and not (0 <= probability.min() and probability.max() <= 1):
+            raise CalibrationError(
+                f'failed_probability: {probability.min():g} to {probability.max():g}, expected '
+                '0 to 1')
+
+    @property
+    def id(self) -> str:
+        """Hash of the content: ``ca`` and 16 hexadecimal digits."""
+        return f'ca{self.surface.id}'
+
+    def check(self, scenario: Scenario) -> None:
+        """Raise CalibrationError unless the calibration belongs to a scenario."""
+        if self.scenario_id != scenario.id:
+            raise CalibrationError(
+                f'scenario_id: {self.scenario_id}, a calibration for the scenario '
+                f'{self.about.get("scenario")}, expected {scenario.id}')
+        sizes = len(self.surface.band_gains), len(self.surface.gains)
+        expected = scenario.n_bands, scenario.n_elements
+        if sizes != expected:
+            raise CalibrationError(f'gains: N_B, N_E = {sizes}, expected {expected}')
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration to a file of NumPy's format ``.npz``, without pickled objects.
+
+        An existing file is replaced at the end, or kept if there is an `OSError`.
+        """
+        surface, std = self.surface, self.surface.std()
+        n = len(surface.gains)
+        deviations = dict(zip(_DEVIATIONS, np.split(std, [n, 2 * n]), strict=True))
+        arrays = {name: getattr(surface, name) for name in _ARRAYS}
+        write_archive(path, arrays | deviations, {
+            'format': _FORMAT, 'scenario_id': self.scenario_id, **self.about})
+
+    @classmethod
+    def load(cls, path: str | Path) -> 'Calibration':
+        """Read a calibration from a file.
+
+        Raises
+        ------
+        CalibrationError
+            If the file cannot be read, is damaged, or does not contain a calibration.
+        """
+        try:
+            arrays, about = read_archive(
+                path, 'calibration', _FORMAT, {*_ARRAYS, *_DEVIATIONS})
+        except ArchiveError as error:
+            raise CalibrationError(str(error)) from error
+        try:
+            surface = SurfaceEstimate(**{
+                name: arrays[name].astype(kind) for name, kind in _ARRAYS.items()})
+            return cls(surface, str(about.pop('scenario_id', '')), about)
+        except (TypeError, ValueError) as error:
+            raise CalibrationError(f'{path}: {error}') from None
+
+
+def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
+              prior: SurfacePrior | None = None) -> Calibration:
+    """Estimate a surface from pilots; see `estimate_surface`.
+
+    The ids of the codebooks are those of beamforming that has one.
+    """
+    prior = prior or prior_of(scenario)
+    changes: list[float] = []
+    surface = estimate_surface(scenario, pilots, prior, lambda _, change: changes.append(change))
+    codebooks = sorted({str(getattr(group.beams, 'id', '')) for group in pilots} - {''})
+    return Calibration(surface, scenario.id, {
+        'pilots': sum(len(group.positions) for group in pilots), 'codebooks': codebooks,
+        'prior': dataclasses.asdict(prior), 'scenario': scenario.changes(),
+        'rounds': len(changes), 'converged': not changes or changes[-1] < TOLERANCE,
+        'version': __version__})
+
+
+def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:
+    """Return the estimate in a calibration file; None if the path is empty.
+
+    Raises
+    ------
+    CalibrationError
+        If the file is invalid or belongs to another scenario.
+    """
+    if not path:
+        return None
+    calibration = Calibration.load(path)
+    try:
+        calibration.check(scenario)
+    except CalibrationError as error:
+        raise CalibrationError(f'{path}: {error}') from None
+    return calibration.surface

@@ -1,0 +1,229 @@
+"""Pilots, and their statistics for the linear model of the surface."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from rhs_isac_ros.model import Beamforming, Scenario, nuisance_parameters
+from rhs_isac_ros.model.covariance import signal_covariance
+from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.nuisance import nuisance_patterns
+from rhs_isac_ros.model.surface_estimate import (
+    direct_design,
+    element_radiation,
+    scattered_errors,
+)
+
+# Pilots evaluated at a time.
+_BLOCK = 64
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pilots:
+    """Signals of a reference user at known positions, received with one codebook.
+
+    Attributes
+    ----------
+    beams
+        The codebook.
+    positions
+        Float64 [N, 3] [m].
+    received
+        Complex128 [N, N_B, N_SB F], sub-band-major.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong or a number is not finite.
+    """
+
+    beams: Beamforming
+    positions: np.ndarray
+    received: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check the arrays."""
+        checked_positions(self.positions)
+        n_bands, n_subbands, n_frames, _ = self.beams.digital.shape
+        expected = len(self.positions), n_bands, n_subbands * n_frames
+        if np.shape(self.received) != expected:
+            raise ValueError(
+                f'received: shape {np.shape(self.received)}, expected [N, N_B, N_SB F] = '
+                f'{expected}')
+        if not np.isfinite(self.received).all():
+            raise ValueError('received: not finite, expected finite numbers')
+
+
+class PilotStatistics:
+    """Information of pilots about the parameters, given the covariance of their noise.
+
+    The P = 2 N_E + N_B parameters are gains and offsets of the elements, and relative errors of
+    the bands' gains. Nuisance parameters that the scenario declares have other values for
+    each pilot: each round improves the values by a scoring step and integrates over the rest.
+    """
+
+    def __init__(self, scenario: Scenario, pilots: Sequence[Pilots]) -> None:
+        self._scenario, self._pilots = scenario, pilots
+        self._radiation = [element_radiation(scenario, group.beams) for group in pilots]
+        self._size = 2 * scenario.n_elements + scenario.n_bands
+        parameters = nuisance_parameters(scenario)
+        self._precision = np.array([1 / parameter.std**2 for parameter in parameters])
+        self._patterns = nuisance_patterns(scenario)
+        # One band if the parameter is a phase of the band, all bands if it is a common phase.
+        self._phases = [(q, slice(p.band, p.band + 1) if p.band is not None else slice(None))
+                        for q, p in enumerate(parameters) if p.name in ('phase', 'band_phase')]
+        self._is_sharp = np.array(
+            [parameter.name in ('carrier_offset', 'timing') for parameter in parameters], bool)
+        self._values: list[np.ndarray] = []
+
+    def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute information [2 P, 2 P] and shift [2 P] for real and then imaginary parts.
+
+        Parameters
+        ----------
+        gains
+            Gains of the bands about which the model is linear, complex128 [N_B].
+        mean, covariance
+            Of gains and offsets of the elements, complex128 [2 N_E] and [2 N_E, 2 N_E].
+        """
+        size = self._size
+        normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
+        lost, moved = np.zeros((2 * size, 2 * size)), np.zeros(2 * size)
+        is_first = not self._values
+        for index, (group, radiation) in enumerate(
+                zip(self._pilots, self._radiation, strict=True)):
+            if is_first:
+                self._values.append(np.zeros((len(group.positions), len(self._precision))))
+            whiteners = self._whiteners(radiation, gains, mean, covariance)
+            for start in range(0, len(group.positions), _BLOCK):
+                block = slice(start, start + _BLOCK)
+                part = _Block(self._scenario, radiation, whiteners, group.positions[block], mean)
+                signals = group.received[block] / gains[:, None]
+                values = self._values[index][block]
+                if len(self._precision):
+                    if is_first:
+                        self._align(part, signals, values)
+                    signals, slopes = self._step(part, signals, values)
+                    of_values = self._integrated(part, signals, slopes)
+                    lost, moved = lost + of_values[0], moved + of_values[1]
+                whitened = part.whiten(signals)
+                for columns, white in zip(part.columns, np.swapaxes(whitened, 0, 1), strict=True):
+                    flat = columns.reshape(-1, size)
+                    normal += np.conj(flat.T) @ flat
+                    product += np.conj(flat.T) @ white.reshape(-1)
+        return _real_matrix(normal) - lost, _real_vector(product) - moved
+
+    def _whiteners(self, radiation: np.ndarray, gains: np.ndarray, mean: np.ndarray,
+                   covariance: np.ndarray) -> np.ndarray:
+        """Whiteners of the signals divided by the bands' gains [N_B, N_SB F, N_SB F]."""
+        scenario, n = self._scenario, self._scenario.n_elements
+        expected = radiation[..., :n] * mean[:n] + radiation[..., n:] * mean[n:]
+        total = signal_covariance(scenario, expected)
+        total += scattered_errors(scenario, radiation, covariance)
+        # Thermal noise is not subject to the gain.
+        excess = scenario.noise_power_w * (1 / np.abs(gains)**2 - 1)
+        total += excess[:, None, None] * np.eye(total.shape[1])
+        whiteners: np.ndarray = np.linalg.inv(np.linalg.cholesky(total))
+        return whiteners
+
+    def _factors(self, values: np.ndarray) -> np.ndarray:
+        factors: np.ndarray = np.exp(-np.tensordot(values, self._patterns, axes=1))
+        return factors
+
+    def _align(self, part: '_Block', signals: np.ndarray, values: np.ndarray) -> None:
+        """Set the phases to those of the expected signals."""
+        outputs = np.sum(np.conj(part.mean) * part.whiten(signals), axis=2)
+        for q, bands in self._phases:
+            output = outputs[:, bands].sum(axis=1)
+            magnitude = 2 * np.abs(output)
+            phase = np.angle(output) * magnitude / (magnitude + self._precision[q])
+            values[:, q] = phase
+            outputs[:, bands] *= np.exp(-1j * phase)[:, None]
+
+    def _step(self, part: '_Block', signals: np.ndarray, values: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """Improve the values; return the signals, linear in the values, and their slopes.
+
+        The signals are those of a linear model with the values themselves as parameters, so that
+        the prior applies to these.
+        """
+        aligned = signals * self._factors(values)
+        slopes = part.whiten(self._directions(part, aligned))
+        residual = part.whiten(aligned) - part.mean
+        gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real
+        gradient -= self._precision * values
+        values += np.linalg.solve(self._curvature(slopes), gradient[..., None])[..., 0]
+        aligned = signals * self._factors(values)
+        directions = self._directions(part, aligned)
+        linear: np.ndarray = aligned + np.einsum('nq,nqir->nir', values, directions)
+        return linear, part.whiten(directions)
+
+    def _directions(self, part: '_Block', aligned: np.ndarray) -> np.ndarray:
+        """Derivatives with respect to the values [N, Q, N_B, N_SB F].
+
+        Offsets of carrier and timing move the multipath out of the nulls of its covariance, and
+        are visible there. Their derivatives are therefore those of the signals, not of the mean.
+        """
+        sources = np.where(self._is_sharp[:, None, None], aligned[:, None], part.plain[:, None])
+        directions: np.ndarray = self._patterns * sources
+        return directions
+
+    def _curvature(self, slopes: np.ndarray) -> np.ndarray:
+        n, n_values = slopes.shape[:2]
+        flat = np.ascontiguousarray(slopes.reshape(n, n_values, -1)).view(float)
+        curvature: np.ndarray = (
+            2 * np.matmul(flat, np.swapaxes(flat, 1, 2)) + np.diag(self._precision))
+        return curvature
+
+    def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray]:
+        """Information [2 P, 2 P] and shift [2 P] that the unknown values take."""
+        coupling = sum(np.einsum('nqr,nrp->nqp', np.conj(slopes[:, :, band]), columns)
+                       for band, columns in enumerate(part.columns))
+        coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
+        of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
+        weighted = np.linalg.solve(self._curvature(slopes), coupling)
+        flat = weighted.reshape(-1, weighted.shape[2])
+        return (coupling.reshape(flat.shape).T @ flat, of_signals.reshape(-1) @ flat)
+
+
+class _Block:
+    """Linear model of several pilots.
+
+    Attributes
+    ----------
+    columns
+        Whitened derivatives of each band's signals, complex128 [N, N_SB F, P].
+    plain, mean
+        Expected signals before and after whitening, complex128 [N, N_B, N_SB F].
+    """
+
+    def __init__(self, scenario: Scenario, radiation: np.ndarray, whiteners: np.ndarray,
+                 positions: np.ndarray, mean: np.ndarray) -> None:
+        self._whiteners = whiteners
+        self.columns: list[np.ndarray] = []
+        self.plain = np.empty((len(positions), *radiation.shape[:2]), complex)
+        n = 2 * scenario.n_elements
+        for band, whitener in enumerate(whiteners):
+            design = direct_design(scenario, radiation, band, positions)
+            self.plain[:, band] = design @ mean
+            columns = np.zeros((*design.shape[:2], n + scenario.n_bands), complex)
+            columns[..., :n] = np.matmul(whitener, design)
+            columns[..., n + band] = self.plain[:, band] @ whitener.T
+            self.columns.append(columns)
+        self.mean = self.whiten(self.plain)
+
+    def whiten(self, signals: np.ndarray) -> np.ndarray:
+        """Whiten signals [..., N_B, N_SB F]."""
+        whitened: np.ndarray = np.einsum('irs,...is->...ir', self._whiteners, signals)
+        return whitened
+
+
+def _real_matrix(matrix: np.ndarray) -> np.ndarray:
+    return 2 * np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
+
+
+def _real_vector(vector: np.ndarray) -> np.ndarray:
+    return 2 * np.concatenate([vector.real, vector.imag])

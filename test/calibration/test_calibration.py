@@ -1,0 +1,131 @@
+"""Calibration files."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.calibration import Calibration, CalibrationError, calibrate, load_surface
+from rhs_isac_ros.calibration.report import report
+from rhs_isac_ros.model import Scenario
+
+
+@pytest.fixture(scope='module')
+def calibration(scenario, beams, damaged, send):
+    return calibrate(scenario, [send(scenario, beams, damaged(3), 20)])
+
+
+@pytest.fixture
+def file(calibration, tmp_path):
+    calibration.save(tmp_path / 'calibration.npz')
+    return tmp_path / 'calibration.npz'
+
+
+def rewrite(file, **changes):
+    """Change arrays of a file; None removes one."""
+    with np.load(file) as archive:
+        arrays = dict(archive) | changes
+    np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
+
+
+def test_a_file_holds_the_whole_calibration(calibration, file, scenario, beams):
+    loaded = Calibration.load(file)
+    assert loaded.id == calibration.id
+    assert (loaded.scenario_id, loaded.about) == (scenario.id, calibration.about)
+    assert loaded.about['pilots'] == 20
+    assert loaded.about['converged'] and loaded.about['rounds'] < 20
+    assert loaded.about['codebooks'] == [beams.id]
+    assert loaded.about['prior']['element_error_rms'] == scenario.element_error_rms
+    np.testing.assert_array_equal(loaded.surface.factor, calibration.surface.factor)
+    assert load_surface(str(file), scenario).id == calibration.surface.id
+    assert load_surface('', scenario) is None
+
+
+def test_a_file_holds_standard_deviations(calibration, file):
+    with np.load(file) as archive:
+        np.testing.assert_allclose(
+            np.concatenate([archive['gains_std'], archive['offsets_std'],
+                            archive['band_gains_std']]),
+            calibration.surface.std())
+
+
+def test_a_failed_write_keeps_the_file(calibration, file, monkeypatch):
+    before = file.read_bytes()
+    monkeypatch.setattr(np, 'savez', lambda *_, **__: (_ for _ in ()).throw(OSError('full')))
+    with pytest.raises(OSError, match='full'):
+        calibration.save(file)
+    assert file.read_bytes() == before
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_file_for_another_scenario_is_refused(file, scenario):
+    other = dataclasses.replace(scenario, refractive_index=2.2)
+    with pytest.raises(CalibrationError) as caught:
+        load_surface(str(file), other)
+    text = str(caught.value)
+    assert text.startswith(f'{file}: scenario_id: {scenario.id}, ')
+    assert text.endswith(f'expected {other.id}')
+    assert '\n' not in text
+
+
+@pytest.mark.parametrize(('changes', 'error'), [
+    ({'gains': np.ones(3)}, r'gains.*|offsets: shape \(25,\), expected \(3,\)'),
+    ({'factor': np.ones((4, 2))}, r'factor: shape \(4, 2\), expected \(52, 2\)'),
+    ({'factor': np.ones(4)}, 'factor: shape'),
+    ({'offsets': np.full(25, np.nan)}, 'offsets: not finite'),
+    ({'failed_probability': np.full(25, 1.5)}, 'failed_probability: 1.5 to 1.5, expected 0 to 1'),
+    ({'gains': np.array(['a'])}, 'could not convert|malformed'),
+    ({'factor': None}, 'not a calibration, expected a calibration file of format 1'),
+    ({'extra': np.ones(1)}, 'not a calibration'),
+    ({'about': json.dumps({'format': 2})}, 'not a calibration'),
+    ({'about': 'garbage'}, 'cannot be read'),
+])
+def test_a_malformed_file_is_named(file, changes, error):
+    rewrite(file, **changes)
+    with pytest.raises(CalibrationError, match=error) as caught:
+        Calibration.load(file)
+    assert str(caught.value).startswith(f'{file}: ')
+
+
+@pytest.mark.parametrize('content', [b'', b'garbage', b'\x93NUMPY'])
+def test_a_file_of_another_kind_is_named(tmp_path, content):
+    (tmp_path / 'file').write_bytes(content)
+    with pytest.raises(CalibrationError, match=r'file: (cannot be read|not a calibration)'):
+        Calibration.load(tmp_path / 'file')
+    with pytest.raises(CalibrationError, match='none: cannot be read'):
+        Calibration.load(tmp_path / 'none')
+
+
+def test_a_truncated_file_is_named(file):
+    file.write_bytes(file.read_bytes()[:2000])
+    with pytest.raises(CalibrationError, match='cannot be read'):
+        Calibration.load(file)
+
+
+def test_another_number_of_elements_is_refused(calibration):
+    wrong = dataclasses.replace(calibration, scenario_id=Scenario().id)
+    with pytest.raises(CalibrationError, match=r'N_B, N_E = \(2, 25\), expected \(2, 100\)'):
+        wrong.check(Scenario())
+
+
+def test_the_report_warns_of_an_estimation_that_did_not_converge(calibration, scenario):
+    about = calibration.about | {'converged': False, 'rounds': 30}
+    text = report(dataclasses.replace(calibration, about=about), scenario)
+    assert 'warning: the estimation did not converge in 30 rounds' in text
+    assert 'warning' not in report(calibration, scenario)
+
+
+def test_the_report_lists_failures_errors_and_gains(calibration, scenario):
+    lines = report(calibration, scenario).splitlines()
+    assert lines[0] == f'20 pilots, scenario {scenario.id}'
+    (failed,) = np.nonzero(calibration.surface.failed)
+    assert lines[1].startswith(f'failed elements: {len(failed)} of 25 ')
+    stuck = [line for line in lines if 'stuck at' in line]
+    assert [f'element {m} (row {m // 5}, column {m % 5})' in line
+            for m, line in zip(failed, stuck, strict=True)] == [True] * len(failed)
+    assert sum(line.startswith('band ') for line in lines) == 2
+    errors = [float(line.split()[6]) for line in lines
+              if line.startswith('  ') and 'stuck' not in line]
+    assert errors == sorted(errors, reverse=True)
+    assert len(errors) == 5

@@ -1,0 +1,150 @@
+"""Estimates of synthetic surfaces from pilots at known positions."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.calibration import Pilots, SurfacePrior, estimate_surface, prior_of
+from rhs_isac_ros.model import MeasurementModel, Scenario, SurfaceImperfection
+from rhs_isac_ros.model.element_error import error_covariance, expected_beams
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.positioning import make_estimator
+
+NUISANCE = [
+    {'user_gain_std_db': 1.0}, {'phase_std_rad': 6.2832}, {'band_phase_std_rad': 6.2832},
+    {'carrier_offset_std_hz': 1e3, 'timing_std_s': 1e-8, 'band_phase_std_rad': 0.2}]
+
+
+def excess_energy(scenario, beams, surface, known):
+    """Energy of the error of whitened means in the region; noise alone has N_B N_SB F.
+
+    Errors of the gain and phase of a band do not count: nuisance parameters limit their accuracy.
+    """
+    exact = MeasurementModel(scenario, beams, surface)
+    positions = scenario.sample_positions(100, np.random.default_rng(9))
+    mean = exact.whiten(exact.mean(positions))
+    errors = exact.whiten(MeasurementModel(scenario, beams, known).mean(positions)) - mean
+    share = np.sum(mean.conj() * errors, axis=2) / np.sum(np.abs(mean)**2, axis=2)
+    return np.mean(np.sum(np.abs(errors - share[..., None] * mean)**2, axis=(1, 2)))
+
+
+@pytest.mark.parametrize('changes', [{}, *NUISANCE], ids=lambda changes: ' '.join(changes))
+def test_a_surface_is_recovered(scenario, beams, damaged, send, changes):
+    scenario = dataclasses.replace(scenario, **changes)
+    surface = damaged(3)
+    found = estimate_surface(scenario, [send(scenario, beams, surface)])
+    np.testing.assert_array_equal(found.failed, ~np.isnan(surface.stuck))
+    plain = dataclasses.replace(scenario, element_error_rms=0.0, failed_element_share=0.0)
+    assert excess_energy(scenario, beams, surface, found) < 2.0
+    assert excess_energy(scenario, beams, surface, None) > 10.0
+    assert excess_energy(plain, beams, surface, None) > 10.0
+
+
+def test_deviations_are_those_of_the_errors(scenario, beams, damaged, send, truth):
+    """Over several surfaces, the normalised errors of all numbers have unit variance."""
+    normalised = []
+    for seed in range(8):
+        surface = damaged(seed)
+        found = estimate_surface(scenario, [send(scenario, beams, surface, 30, seed)])
+        errors = np.concatenate([found.gains, found.offsets]) - truth(surface).ravel()
+        std = found.std()[:len(errors)]
+        # Offsets of elements that surely work are zero without any uncertainty.
+        normalised.append((np.abs(errors) / np.maximum(std, 1e-12))[std > 1e-4])
+    assert 0.8 < np.mean(np.concatenate(normalised)**2) < 1.25
+
+
+def test_without_pilots_the_estimate_is_the_prior(scenario, beams):
+    """Mean and covariance of the signals are those that the scenario declares."""
+    found = estimate_surface(scenario, [], SurfacePrior(
+        scenario.element_error_rms, scenario.failed_element_share, band_gain_rms=0.0))
+    applied, expected = found.applied_beams(beams), expected_beams(scenario, beams)
+    np.testing.assert_allclose(applied.analog, expected.analog, atol=1e-9)
+    np.testing.assert_allclose(applied.digital, expected.digital)
+    np.testing.assert_allclose(found.failed_probability, scenario.failed_element_share)
+    covariance = found.error_covariance(scenario, beams)
+    declared = error_covariance(scenario, beams)
+    assert np.abs(covariance - declared).max() < 0.05 * np.abs(declared).max()
+
+
+def test_gains_and_phases_of_bands_are_estimated(scenario, beams, damaged, send):
+    surface, gains = damaged(4), np.array([1.3 * np.exp(0.5j), 0.8 * np.exp(-2.0j)])
+    pilots = send(scenario, beams, surface)
+    pilots = Pilots(beams, pilots.positions, gains[:, None] * pilots.received)
+    found = estimate_surface(scenario, [pilots])
+    std = found.std()[-2:]
+    assert (np.abs(found.band_gains / gains - 1) < 4 * std).all()
+    assert (std < 0.1).all()
+    np.testing.assert_array_equal(found.failed, ~np.isnan(surface.stuck))
+
+
+def test_several_codebooks_reveal_more_of_the_elements(scenario, damaged, send, random_beams):
+    surface = damaged(5)
+    codebooks = [random_beams(scenario, np.random.default_rng(seed)) for seed in range(3)]
+    groups = [send(scenario, codebook, surface, 20) for codebook in codebooks]
+    alone, together = estimate_surface(scenario, groups[:1]), estimate_surface(scenario, groups)
+    assert together.std()[:25].mean() < 0.8 * alone.std()[:25].mean()
+
+
+def test_an_intact_surface_stays_intact(beams, scenario, send):
+    """With the default prior of a scenario that declares nothing."""
+    silent = Scenario(elements_per_side=5, n_feeds=2)
+    assert prior_of(silent).element_error_rms > 0
+    pilots = send(silent, beams, None)
+    found = estimate_surface(silent, [pilots])
+    assert not found.failed.any()
+    assert excess_energy(silent, beams, None, found) < 2.0
+
+
+def test_estimators_use_the_surface(scenario, beams, damaged, send):
+    """With errors close to those of exact knowledge, and consistent covariances."""
+    surface = damaged(6)
+    estimate = estimate_surface(scenario, [send(scenario, beams, surface)])
+    fresh = send(scenario, beams, surface, 60, seed=7)
+    squares = {}
+    for name, known in (('before', None), ('after', estimate), ('exact', surface)):
+        found = make_estimator('bayes', scenario, beams, surface=known).estimate(fresh.received)
+        squares[name] = np.sum((found.mean - fresh.positions)**2, axis=1)
+        if name == 'after':
+            assert found.fix.all()
+            trace = np.trace(found.covariance, axis1=1, axis2=2)
+            assert 0.6 < squares[name].mean() / trace.mean() < 1.6
+    assert squares['after'].mean() < 1.2 * squares['exact'].mean()
+    assert squares['after'].mean() < 0.8 * squares['before'].mean()
+
+
+def test_a_poor_estimate_has_consistent_errors(scenario, beams, damaged, send):
+    """Few pilots leave errors whose covariance depends on the position."""
+    surface = damaged(8)
+    estimate = estimate_surface(scenario, [send(scenario, beams, surface, 4)])
+    fresh = send(scenario, beams, surface, 60, seed=8)
+    model = MeasurementModel(scenario, beams, estimate)
+    errors = fresh.received - model.mean(fresh.positions)
+    covariance = model.covariance_at(fresh.positions)
+    energy = np.einsum('nir,nir->n', errors.conj(),
+                       np.linalg.solve(covariance, errors[..., None])[..., 0]).real
+    assert 0.5 < energy.mean() / errors[0].size < 1.3
+    found = make_estimator('bayes', scenario, beams, surface=estimate).estimate(fresh.received)
+    assert found.fix.mean() > 0.95
+
+
+def test_an_exact_estimate_is_the_surface(scenario, beams, damaged, truth):
+    surface = damaged(2)
+    gains, offsets = truth(surface)
+    exact = SurfaceEstimate(gains, offsets, np.ones(2, complex), np.zeros((52, 0), complex),
+                            np.where(np.isnan(surface.stuck), 0.0, 1.0))
+    one, other = MeasurementModel(scenario, beams, surface), MeasurementModel(
+        scenario, beams, exact)
+    np.testing.assert_allclose(one.radiation, other.radiation, rtol=1e-12)
+    np.testing.assert_allclose(one.covariance(), other.covariance(), rtol=1e-12)
+    assert surface.id != SurfaceImperfection(surface.gains + 1, surface.stuck).id
+
+
+@pytest.mark.parametrize(('positions', 'received', 'error'), [
+    (np.zeros((2, 2)), None, r'positions: shape \(2, 2\)'),
+    (np.ones((2, 3)), np.zeros((1, 2, 32)), r'received: shape \(1, 2, 32\), expected'),
+    (np.ones((1, 3)), np.full((1, 2, 32), np.nan), 'received: not finite'),
+])
+def test_malformed_pilots_are_named(beams, positions, received, error):
+    with pytest.raises(ValueError, match=error):
+        Pilots(beams, positions, received)

@@ -1,0 +1,80 @@
+"""Pilots at known positions, assembled from messages."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.pilot_log import PilotLog
+from rhs_isac_ros.protocol import messages as m
+
+SCENARIO = Scenario(elements_per_side=3, n_feeds=2, n_subbands=2, n_frames=2)
+
+
+@pytest.fixture
+def codebook(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(0))
+
+
+@pytest.fixture
+def log(codebook):
+    log = PilotLog(SCENARIO)
+    log.add_codebook(codebook)
+    return log
+
+
+def truth(cycle_id, user=1, sender=7):
+    return m.GroundTruth(cycle_id=cycle_id, user=user, sender=sender, velocity=np.zeros(3),
+                         position=np.array([8.0, cycle_id, 0.0]))
+
+
+def signals(cycle_id, codebook_id, user=1, instance=7):
+    return m.ReceivedSignals(
+        cycle_id=cycle_id, user=user, user_instance=instance, codebook_id=codebook_id,
+        signals=np.full((2, 2, 2), cycle_id + 1j))
+
+
+def test_signals_are_paired_with_the_position_of_their_cycle(log, codebook):
+    for message in (truth(1), signals(2, codebook.id), signals(1, codebook.id), truth(2)):
+        log.add(message)
+    (pilots,) = log.pilots()
+    assert (log.n_pilots, pilots.beams) == (2, codebook)
+    np.testing.assert_array_equal(pilots.positions[:, 1], [2, 1])
+    np.testing.assert_array_equal(pilots.received[:, 0, 0], [2 + 1j, 1 + 1j])
+
+
+@pytest.mark.parametrize('message', [
+    truth(0), truth(3, user=2), truth(3, sender=8)], ids=['no cycle', 'user', 'instance'])
+def test_positions_of_others_do_not_count(log, codebook, message):
+    log.add(message)
+    log.add(signals(3, codebook.id))
+    assert (log.n_signals, log.n_pilots, log.pilots()) == (1, 0, [])
+
+
+def test_repeated_signals_count_once(log, codebook):
+    for message in (truth(1), signals(1, codebook.id), signals(1, codebook.id)):
+        log.add(message)
+    assert log.n_pilots == 1
+
+
+def test_signals_of_one_user_may_be_selected(codebook):
+    log = PilotLog(SCENARIO, user=2)
+    log.add_codebook(codebook)
+    for user in (1, 2):
+        log.add(truth(user, user))
+        log.add(signals(user, codebook.id, user))
+    assert log.n_pilots == 1
+
+
+def test_signals_of_an_unknown_codebook_wait_for_it(log, random_beams, codebook):
+    other = random_beams(SCENARIO, np.random.default_rng(1))
+    for message in (truth(1), signals(1, other.id), truth(2), signals(2, codebook.id)):
+        log.add(message)
+    assert (log.missing_codebooks, log.n_pilots) == ([other.id], 1)
+    log.add_codebook(codebook, other.id)
+    assert (log.missing_codebooks, log.n_pilots, len(log.pilots())) == ([], 2, 2)
+
+
+def test_a_codebook_of_another_scenario_is_refused(log, shipped):
+    with pytest.raises(CodebookError, match='analog: shape'):
+        log.add_codebook(shipped)
