@@ -18,7 +18,7 @@ NODES = (
     'visualizer',
 )
 # The terminal tools that have no counterpart in `ros2`.
-TOOLS = ('record', 'replay', 'snapshot', 'watch')
+TOOLS = ('calibrate', 'record', 'replay', 'snapshot', 'watch')
 
 setup(
     name=NAME,

@@ -17,6 +17,7 @@ _PR_SET_PDEATHSIG = 1
 # Subpackage of each executable.
 EXECUTABLES = {
     'bs': 'nodes',
+    'calibrate': 'tools',
     'channel': 'nodes',
     'demo': 'tools',
     'network': 'nodes',

@@ -11,8 +11,8 @@ import pytest
 import rhs_isac_ros
 
 LAYERS = (
-    'model', 'bounds', 'codebook', 'positioning', 'link', 'experiments', 'protocol',
-    'monitoring', 'ros', 'nodes', 'tools')
+    'model', 'calibration', 'bounds', 'codebook', 'positioning', 'link', 'experiments',
+    'protocol', 'monitoring', 'ros', 'nodes', 'tools')
 ROS_LAYERS = ('ros', 'nodes', 'tools')
 PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)
 # The libraries that the pure layers may import at module level.

@@ -10,6 +10,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
+from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import plugins
 from rhs_isac_ros.positioning import (
@@ -36,7 +37,7 @@ from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
 from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.parameters import settings_of
+from rhs_isac_ros.ros.parameters import calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.user_topics import UserTopics
@@ -63,9 +64,11 @@ class PositionerNode(RoleNode[Positioner]):
         Raises
         ------
         ParameterError
-            If the estimator cannot be loaded, or needs a model that is missing or unreadable.
+            If the estimator cannot be loaded, needs a model that is missing or unreadable, or
+            cannot use the calibration.
         """
         settings = settings_of(PositionerSettings, values)
+        calibrated_surface(values, self.scenario)
         if settings.estimator not in ESTIMATORS:
             self._check_plugin(settings.estimator)
             return settings
@@ -73,6 +76,10 @@ class PositionerNode(RoleNode[Positioner]):
             # Other estimators do not use the file. Clear it, so that a change of the file does not
             # rebuild them.
             return dataclasses.replace(settings, model_file='')
+        if settings.calibration_file:
+            raise ParameterError(
+                f'calibration_file: {settings.calibration_file!r}, expected none for the '
+                'estimator neural, whose model is trained for the surface of the scenario')
         if not settings.model_file:
             raise ParameterError(
                 "model_file: '', expected a trained model for the estimator neural")
@@ -97,6 +104,8 @@ class PositionerNode(RoleNode[Positioner]):
             settings.model_file)
         if settings.estimator in REGION_ESTIMATORS:
             options['reject_outside'] = settings.reject_outside
+        if settings.calibration_file:
+            options['surface'] = load_surface(settings.calibration_file, self.scenario)
         return make_estimator(settings.estimator, self.scenario, codebook, **options)
 
     def execute(self, action: Action) -> None:

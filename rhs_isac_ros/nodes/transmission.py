@@ -5,11 +5,12 @@ import types
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.parameters import settings_of
+from rhs_isac_ros.ros.parameters import calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -19,7 +20,10 @@ class TransmissionNode(RoleNode[Transmission]):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('transmission', **node_options)
-        self.start(Transmission(self.scenario, self.make_settings(self.values)),
+        # Surfaces by calibration file, as they were when the parameter was checked.
+        self._surfaces: dict[str, SurfaceEstimate | None] = {}
+        settings = self.make_settings(self.values)
+        self.start(Transmission(self.scenario, settings, self._surfaces.__getitem__),
                    advertise=False, subscribe=False)
         self.follow_codebook(self._on_codebook)
 
@@ -29,12 +33,13 @@ class TransmissionNode(RoleNode[Transmission]):
         Raises
         ------
         ParameterError
-            If the scenario does not have the band.
+            If the scenario does not have the band, or the calibration cannot be used.
         """
         n_bands = self.scenario.n_bands
         if values.band >= n_bands:
             raise ParameterError(
                 f'band: {values.band}, expected 0 to {n_bands - 1} of the scenario, or -1')
+        self._surfaces[values.calibration_file] = calibrated_surface(values, self.scenario)
         return settings_of(TransmissionSettings, values)
 
     def _on_codebook(self, codebook: Codebook) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import Estimate, Estimator, SignalError
+from rhs_isac_ros.positioning import Estimate, Estimator, SignalError, surface_of
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import (
@@ -143,7 +143,7 @@ class Positioner(PlainRole):
         is_current = job.settings == self._settings.latest
         if not is_current and codebook.id in self._estimators:
             return []
-        model = MeasurementModel(self._scenario, codebook).prepare()
+        model = MeasurementModel(self._scenario, codebook, surface_of(estimator)).prepare()
         self._estimators.put(codebook.id, _Built(job, model, estimator))
         self._settings.in_use = job.settings
         self._residuals.clear()

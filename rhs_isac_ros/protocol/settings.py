@@ -77,6 +77,10 @@ class BaseStationSettings:
             raise ValueError(f'allowed_users: {error}') from None
 
 
+def _calibration_file() -> Any:
+    return setting('', 'Calibration file; empty: the surface is that of the scenario.')
+
+
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
     """Settings of the positioner."""
@@ -87,6 +91,7 @@ class PositionerSettings:
     reject_outside: bool = setting(
         True, 'Whether users who are almost certainly outside of the region get no fix; only '
         'bayes and ml.')
+    calibration_file: str = _calibration_file()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,6 +101,7 @@ class TransmissionSettings:
     band: int = setting(
         -1, 'Band of the transmission, from 0; -1: the best band of each cycle.',
         low=-1, high=4095)
+    calibration_file: str = _calibration_file()
 
 
 def changes(old: Any, new: Any) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The transmission role, which steers a beam to the estimate and reports its capacity."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +10,13 @@ from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
     RunningQuartiles,
+    applied_beam,
     capacity,
     capacity_report,
     choose_beam,
 )
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import outcomes
 from rhs_isac_ros.protocol.codebook_cache import CodebookCache
@@ -38,12 +40,13 @@ _MAX_REMEMBERED = 8
 
 
 class _Steered(NamedTuple):
-    """The beam of a cycle, its estimate, and the bands from which it was chosen."""
+    """The beam of a cycle, its estimate, and the bands and surface for which it was chosen."""
 
     estimate: m.PositionEstimate
     beam: m.Beam
     at_estimate_bps: float
     bands: Sequence[int]
+    surface: SurfaceEstimate | None
 
 
 class Transmission(PlainRole):
@@ -55,14 +58,18 @@ class Transmission(PlainRole):
     ----------
     settings
         Initial settings; by default the best band of each cycle.
+    surface_of
+        Callable that returns the surface of a calibration file, None for an empty name.
     """
 
     SENDS = (m.Beam, m.Capacity, m.CapacityStatistics)
     RECEIVES = (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth)
 
-    def __init__(self, scenario: Scenario, settings: TransmissionSettings | None = None) -> None:
+    def __init__(
+            self, scenario: Scenario, settings: TransmissionSettings | None = None,
+            surface_of: Callable[[str], SurfaceEstimate | None] = lambda file: None) -> None:
         super().__init__()
-        self._scenario = scenario
+        self._scenario, self._surface_of = scenario, surface_of
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
         # By cycle. `_counted` holds the cycles that the statistics already include.
@@ -112,14 +119,19 @@ class Transmission(PlainRole):
             return [Send(known.beam)]
         self._codebooks.take(estimate.codebook_id)
         bands = known.bands if known else self._bands()
-        choice = choose_beam(self._scenario, estimate.position, estimate.covariance_m2, bands)
+        surface = (known.surface if known
+                   else self._surface_of(self._settings.in_use.calibration_file))
+        choice = choose_beam(
+            self._scenario, estimate.position, estimate.covariance_m2, bands, surface)
         beam = choice.beam
         sent = m.Beam(
             cycle_id=estimate.cycle_id, user=estimate.user, codebook_id=estimate.codebook_id,
             band=beam.band, analog=beam.analog, digital=beam.digital,
             expected_bps=choice.expected_bps)
-        at_estimate_bps = float(capacity(self._scenario, beam, estimate.position[None])[0])
-        self._steered.put(estimate.cycle_id, _Steered(estimate, sent, at_estimate_bps, bands))
+        at_estimate_bps = float(capacity(
+            self._scenario, applied_beam(beam, surface), estimate.position[None])[0])
+        self._steered.put(
+            estimate.cycle_id, _Steered(estimate, sent, at_estimate_bps, bands, surface))
         return [Send(sent)]
 
     def _report(self, applied: m.RhsConfiguration) -> list[Action]:
@@ -138,7 +150,8 @@ class Transmission(PlainRole):
         result = CapacityReport(math.nan, math.nan)
         if truth:
             used = Beam(applied.analog[0], beam.digital, beam.band)
-            result = capacity_report(self._scenario, used, truth.position, steered.bands)
+            result = capacity_report(
+                self._scenario, used, truth.position, steered.bands, steered.surface)
         report = m.Capacity(
             cycle_id=beam.cycle_id, user=beam.user, codebook_id=beam.codebook_id, band=beam.band,
             expected_bps=beam.expected_bps, actual_bps=result.actual_bps,

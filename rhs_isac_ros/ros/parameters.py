@@ -12,8 +12,10 @@ import types
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
+from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.model import Scenario, mobility, plugins
 from rhs_isac_ros.model.arguments import ArgumentParser
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
@@ -81,6 +83,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
                   'Directory in which tables are cached; empty: the cache directory of the user.'),
         _POSITIONER['model_file'],
         _POSITIONER['reject_outside'],
+        _POSITIONER['calibration_file'],
     ),
     'transmission': (_SCENARIO, *_declared_by(TransmissionSettings).values()),
     'optimizer': (
@@ -188,6 +191,21 @@ def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settin
                        for field in dataclasses.fields(kind)})
     except ValueError as error:
         raise ParameterError(str(error)) from None
+
+
+def calibrated_surface(
+        values: types.SimpleNamespace, scenario: Scenario) -> SurfaceEstimate | None:
+    """Return the surface of the parameter ``calibration_file``; None if it is empty.
+
+    Raises
+    ------
+    ParameterError
+        If the file is invalid, or belongs to another scenario.
+    """
+    try:
+        return load_surface(values.calibration_file, scenario)
+    except CalibrationError as error:
+        raise ParameterError(f'calibration_file: {error}') from None
 
 
 def scenario_of(values: types.SimpleNamespace) -> Scenario:

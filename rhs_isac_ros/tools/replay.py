@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError, plugins
@@ -130,9 +131,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
     options = parse(parser, arguments)
-    if options.publish and (options.estimator or options.model):
-        parser.error('argument --publish: not allowed with --estimator or --model, because '
-                     'running nodes estimate')
+    if options.publish and (options.estimator or options.model or options.calibration):
+        parser.error('argument --publish: not allowed with --estimator, --model or '
+                     '--calibration, because running nodes estimate')
+    if options.calibration and 'neural' in (options.estimator or ()):
+        parser.error('argument --calibration: not allowed with --estimator neural, whose model '
+                     'is trained for an ideal surface')
     if not options.publish and (options.topic, options.rate, options.timeout) != (
             None, _RATE, _TIMEOUT_S):
         parser.error('arguments --topic, --rate and --timeout: expected together with --publish')
@@ -142,8 +146,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.publish:
             return republish(options, ['replay', *arguments])
         _compare(options)
-    except (RecordingError, ScenarioError, CodebookError, ModelError, plugins.PluginError,
-            OSError) as error:
+    except (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
+            plugins.PluginError, OSError) as error:
         print_error(error, parser.prog)
         return 2
     except RepublishError as error:
@@ -161,10 +165,13 @@ def _compare(options: argparse.Namespace) -> None:
     names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
     print(f'{len(live)} cycles\n{"":12s} median error  root mean square  no fix')
     print(_row(f'live {", ".join(names)}', live))
+    known = {}
+    if options.calibration:
+        known['surface'] = load_surface(str(options.calibration), recording.scenario)
     for name in options.estimator or ['bayes']:
         estimators = {codebook_id: make_estimator(
             name, recording.scenario, codebook,
-            **file_options(name, default_folder(), options.model or ''))
+            **file_options(name, default_folder(), options.model or ''), **known)
             for codebook_id, codebook in codebooks.items()}
         print(_row(name, errors_m(recording.cycles, estimators)))
 
@@ -209,6 +216,8 @@ def _parser() -> argparse.ArgumentParser:
                         help='codebook to assume; by default the recorded one')
     parser.add_argument('--config', type=input_file, metavar='FILE',
                         help='scenario file; by default the recorded scenario')
+    parser.add_argument('--calibration', type=input_file, metavar='FILE',
+                        help='calibration of the surface; by default that of the scenario')
     parser.add_argument('--model', type=input_file, metavar='FILE',
                         help='model of the estimator neural')
     parser.add_argument('--namespace', default='/',

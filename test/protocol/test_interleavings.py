@@ -102,7 +102,7 @@ NOISE = st.fixed_dictionaries({
 @pytest.fixture(scope='module', autouse=True)
 def plain_beams():
     """Replace the optimization of beams by a simple function of the position."""
-    def choose(scenario, position, covariance_m2, bands):
+    def choose(scenario, position, covariance_m2, bands, surface):
         angles = np.arange(scenario.n_elements) * np.abs(position).sum()
         digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
         return types.SimpleNamespace(

@@ -26,7 +26,8 @@ def test_settings_in_use_and_pending_are_described():
     described = describe_settings(
         PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
     assert described == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
-                    'parameter.reject_outside': 'true', 'pending.estimator': 'neural'}
+                    'parameter.reject_outside': 'true', 'parameter.calibration_file': '',
+                    'pending.estimator': 'neural'}
 
 
 def test_values_are_written_as_in_ros():

@@ -1,10 +1,12 @@
 """Changes of the parameters of a running node."""
 
+import dataclasses
 import math
 
 import pytest
 from rclpy.parameter import Parameter
 
+from rhs_isac_ros.calibration import calibrate
 from rhs_isac_ros.nodes.bs import BsNode
 from rhs_isac_ros.nodes.channel import ChannelNode
 from rhs_isac_ros.nodes.positioner import PositionerNode
@@ -77,6 +79,8 @@ def test_an_invalid_value_is_rejected_with_a_reason(make, executable, parameter)
     ('positioner', {'estimator': 'neural'}, "model_file: '', expected a trained model"),
     ('positioner', {'estimator': 'neural', 'model_file': '/no/model.npz'},
      'model_file: /no/model.npz: '),
+    ('positioner', {'calibration_file': '/no/file.npz'}, 'calibration_file: /no/file.npz: '),
+    ('transmission', {'calibration_file': '/no/file.npz'}, 'calibration_file: /no/file.npz: '),
 ])
 def test_a_value_that_contradicts_other_parameters_scenario_or_files_is_rejected(
         make, executable, values, reason):
@@ -85,6 +89,22 @@ def test_a_value_that_contradicts_other_parameters_scenario_or_files_is_rejected
     assert not result.successful
     assert result.reason.startswith(reason)
     assert node.offered == []
+
+
+def test_a_calibration_must_belong_to_the_scenario_and_suit_the_estimator(make, tmp_path):
+    positioner, transmission = make('positioner'), make('transmission')
+    mine, other = str(tmp_path / 'mine.npz'), str(tmp_path / 'other.npz')
+    calibrate(positioner.scenario, []).save(mine)
+    calibrate(dataclasses.replace(positioner.scenario, refractive_index=2.0), []).save(other)
+    for node in (positioner, transmission):
+        result = set_together(node, calibration_file=other)
+        assert not result.successful
+        assert result.reason.startswith(f'calibration_file: {other}: scenario_id: ')
+        assert set_together(node, calibration_file=mine).successful
+        assert [s.calibration_file for s in node.offered] == [mine]
+    result = set_together(positioner, estimator='neural')
+    assert not result.successful
+    assert result.reason.startswith(f"calibration_file: '{mine}', expected none")
 
 
 def test_parameters_that_are_set_together_are_offered_together(make):

@@ -1,0 +1,223 @@
+"""``scripts/calibrate``: estimates errors of a surface from pilots at known positions.
+
+The pilots are the received signals of a recording, or of a running network, whose users
+publish their true positions.
+"""
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rclpy.node import Node
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.calibration import Calibration, SurfacePrior, calibrate, prior_of
+from rhs_isac_ros.calibration.pilots import Pilots
+from rhs_isac_ros.calibration.report import report
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    integer,
+    nonnegative_float,
+    output_file,
+    positive_float,
+    positive_int,
+)
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.monitoring.pilot_log import RECEIVES, PilotLog
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
+from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
+from rhs_isac_ros.tools.republish import topic_prefix
+
+_CYCLES = 200
+_TIMEOUT_S = 600.0
+# Pilots whose positions are estimated for comparison.
+_N_COMPARED = 200
+
+
+class CalibratorNode(Node):
+    """Collects the pilots of a running network."""
+
+    def __init__(self, log: PilotLog, scenario: Scenario) -> None:
+        super().__init__('calibrator')
+        self._log = log
+        subscribe_messages(self, RECEIVES, scenario.sizes, log.add, scenario_id=scenario.id)
+        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, qos.LATCHED)
+
+    def _on_codebook(self, message: ros.Codebook) -> None:
+        try:
+            self._log.add_codebook(convert.codebook_from_ros(message))
+        except (m.MessageError, CodebookError) as error:
+            self.get_logger().warning(  # type: ignore[no-untyped-call]
+                f'dropped codebook: {error}')
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Calibrate, print the result and write the file.
+
+    Parameters
+    ----------
+    arguments
+        Command line including ROS arguments; by default that of the process.
+
+    Returns
+    -------
+    int
+        Exit code: 0; 1 if there were too few pilots in time; 2 if an argument or a file is
+        invalid.
+    """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    parser = _parser()
+    options = parse(parser, arguments)
+    check_distinct(parser, {'file': options.file, '--config': options.config,
+                            '--codebook': options.codebook}, {'--output': options.output})
+    try:
+        scenario = _scenario(options)
+        log = PilotLog(scenario, options.user)
+        if options.file:
+            _read(options, scenario, log)
+        elif not _listen(options, scenario, log, arguments):
+            print(f'error: {log.n_pilots} pilots within {options.timeout:g} s, expected '
+                  f'{options.cycles}, in the domain {os.environ.get("ROS_DOMAIN_ID", "0")} and '
+                  'this namespace', file=sys.stderr)
+            return 1
+        pilots = _checked(log, options)
+        calibration = calibrate(scenario, pilots, _prior(scenario, options))
+        print(report(calibration, scenario), flush=True)
+        for text, surface in (('before', None), ('after', calibration.surface)):
+            print(f'position error of the pilots {text}: {_error(scenario, pilots, surface)}')
+        _write(calibration, options.output)
+    except (RecordingError, ScenarioError, CodebookError, ValueError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def _write(calibration: Calibration, output: Path) -> None:
+    calibration.save(output)
+    print(f'{output}: calibration {calibration.id}')
+
+
+def _scenario(options: argparse.Namespace) -> Scenario:
+    if options.config:
+        return Scenario.from_yaml(options.config)
+    return (read_scenario(options.file) if options.file else None) or Scenario()
+
+
+def _prior(scenario: Scenario, options: argparse.Namespace) -> SurfacePrior:
+    given = {'element_error_rms': options.element_error_rms,
+             'failed_element_share': options.failed_element_share,
+             'band_gain_rms': options.band_gain_rms}
+    return dataclasses.replace(
+        prior_of(scenario), **{name: value for name, value in given.items() if value is not None})
+
+
+def _read(options: argparse.Namespace, scenario: Scenario, log: PilotLog) -> None:
+    """Add the pilots of a recording."""
+    prefix = topic_prefix(options.namespace)
+    kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
+    codebook_topic = f'{prefix}{topics.CODEBOOK}'
+    for topic, message, _ in read(options.file, [*kinds, codebook_topic]):
+        try:
+            if topic == codebook_topic:
+                log.add_codebook(convert.codebook_from_ros(message))
+            else:
+                plain = convert.from_ros(kinds[topic], message)
+                m.check(plain, scenario.sizes)
+                log.add(plain)
+        except (m.MessageError, CodebookError) as error:
+            raise RecordingError(f'{options.file}: {topic}: {error}') from None
+
+
+def _listen(options: argparse.Namespace, scenario: Scenario, log: PilotLog,
+            arguments: Sequence[str]) -> bool:
+    """Collect pilots of a running network; return whether there are enough."""
+    end_s = time.monotonic() + options.timeout
+    run(lambda: [CalibratorNode(log, scenario)], ['calibrate', *arguments],
+        lambda: log.n_signals >= options.cycles and log.n_pilots >= options.cycles
+        or time.monotonic() > end_s)
+    return log.n_pilots >= int(options.cycles)
+
+
+def _checked(log: PilotLog, options: argparse.Namespace) -> list[Pilots]:
+    """Return the pilots, or raise RecordingError if there are none or a codebook is missing."""
+    if options.codebook:
+        codebook = Codebook.load(options.codebook)
+        for codebook_id in log.missing_codebooks:
+            log.add_codebook(codebook, codebook_id)
+    source = options.file or 'network'
+    if log.missing_codebooks:
+        raise RecordingError(f'{source}: codebook {log.missing_codebooks[0]}: not in the '
+                             'recording; give its file with --codebook FILE')
+    pilots = log.pilots()
+    if not pilots:
+        raise RecordingError(
+            f'{source}: no received signals with a true position, expected at least one in the '
+            f'namespace {options.namespace}')
+    return pilots
+
+
+def _error(scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimate | None) -> str:
+    """Return root mean square error and number of missing fixes as text."""
+    errors: list[np.ndarray] = []
+    left = _N_COMPARED
+    for group in pilots:
+        if not isinstance(group.beams, Codebook) or not left:
+            continue
+        estimator = make_estimator('bayes', scenario, group.beams, surface=surface)
+        estimate = estimator.estimate(group.received[:left])
+        errors.append(np.linalg.norm(estimate.mean - group.positions[:left], axis=1))
+        left -= len(errors[-1])
+    distances = np.concatenate(errors)
+    fixes = distances[np.isfinite(distances)]
+    rms = f'{np.sqrt(np.mean(fixes**2)):.3f} m rms' if len(fixes) else 'none'
+    return f'{rms}, {len(distances) - len(fixes)} of {len(distances)} without a fix'
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = ArgumentParser(
+        prog='calibrate', description='Estimate errors and failures of the elements, and gains '
+        'and phases of the bands, from signals of users at known positions. Without a recording, '
+        'the signals are those of a running network; ROS arguments select its namespace: '
+        '--ros-args -r __ns:=/lab')
+    add = parser.add_argument
+    add('file', type=input_file, nargs='?', help='recording made with record')
+    add('--output', type=output_file, default=Path('calibration.npz'), metavar='FILE',
+        help='calibration to write (default: calibration.npz)')
+    add('--config', type=input_file, metavar='FILE',
+        help="scenario file; by default the recorded scenario, or the paper's Table I")
+    add('--codebook', type=input_file, metavar='FILE',
+        help='codebook to assume if the recording contains none')
+    add('--user', type=integer(0), default=0, metavar='ID',
+        help='use only the signals of this user (default: of all users)')
+    add('--namespace', default='/', help='namespace of the recorded network (default: /)')
+    add('--cycles', type=positive_int, default=_CYCLES, metavar='N',
+        help=f'pilots to collect from a running network (default: {_CYCLES})')
+    add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
+        help=f'maximum time to collect them (default: {_TIMEOUT_S:g} s)')
+    prior = parser.add_argument_group(
+        'prior', 'What is known of the surface before; by default what the scenario declares.')
+    for name, text in (
+            ('--element-error-rms', 'RMS of the relative errors of the elements'),
+            ('--failed-element-share', 'probability that an element has failed'),
+            ('--band-gain-rms', "RMS of the relative errors of the bands' gains (default: 1)")):
+        prior.add_argument(name, type=nonnegative_float, metavar='X', help=text)
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(exit_code_of(main))

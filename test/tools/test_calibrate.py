@@ -1,0 +1,154 @@
+"""``scripts/calibrate`` on a recording of a network with a damaged surface, and what follows."""
+
+import functools
+import re
+import subprocess
+import time
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.signals import SignalHandlerOptions
+
+from rhs_isac_ros.calibration import Calibration
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario, draw_surface, streams
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros.recording import Recorder
+from rhs_isac_ros.tools.calibrate import main
+
+pytest.importorskip('mcap', reason='mcap is not installed')
+CONFIG = Path(__file__).parents[2] / 'config'
+SCENARIO = Scenario.from_yaml(CONFIG / 'quick.yaml')
+CODEBOOK = Codebook.load(CONFIG / 'codebook_quick.yaml')
+NAMESPACE = '/damaged'
+# Of this seed, four of 36 elements have failed, so that hardly any signals have a fix.
+ERRORS = {'seed': 1, 'element_error_rms': 0.03, 'failed_element_share': 0.05}
+N_PILOTS, N_FRESH = 45, 30
+TIMEOUT_S = 60.0
+
+
+@pytest.fixture(scope='module')
+def process(module_processes):
+    return module_processes.start(
+        'network', namespace=NAMESPACE, users=4, mobility='random_walk', speed_mps=5.0,
+        rest_s=0.03, scenario_file=CONFIG / 'quick.yaml',
+        codebook_file=CONFIG / 'codebook_quick.yaml', **ERRORS)
+
+
+@pytest.fixture(scope='module')
+def recording(process, tmp_path_factory):
+    """A recording of the network before any calibration."""
+    path = tmp_path_factory.mktemp('recording') / 'run.mcap'
+    recorder, context = Recorder(path, SCENARIO), Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    observer = CycleObserver(recorder, context=context, namespace=NAMESPACE)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(observer)
+    end_s = time.monotonic() + TIMEOUT_S
+    while sum(record.outcome == 'no_fix' for record in observer.log.ended) < N_PILOTS:
+        executor.spin_once(timeout_sec=1.0)
+        assert process.running and time.monotonic() < end_s, process.log
+    executor.shutdown()
+    observer.destroy_node()
+    rclpy.shutdown(context=context)
+    recorder.close()
+    assert len(observer.log.complete) < N_PILOTS / 5
+    return path
+
+
+@pytest.fixture(scope='module')
+def surface():
+    declared = Impairments(**{name: value for name, value in ERRORS.items() if name != 'seed'})
+    return draw_surface(declared.applied_to(SCENARIO),
+                        streams.generator(ERRORS['seed'], streams.SURFACE))
+
+
+def call(capsys, *arguments):
+    code = main([*map(str, arguments)])
+    return types.SimpleNamespace(code=code, **capsys.readouterr()._asdict())
+
+
+def test_a_calibration_restores_the_accuracy_of_a_running_network(
+        process, recording, surface, make_watch, tmp_path, capsys):
+    """Errors come close to those of an estimator that knows the surface exactly."""
+    file = tmp_path / 'surface.npz'
+    done = call(capsys, recording, '--namespace', NAMESPACE, '--output', file)
+    assert (done.code, done.err) == (0, '')
+    failed = np.nonzero(~np.isnan(surface.stuck))[0].tolist()
+    assert [int(text) for text in re.findall(r'element (\d+) .*stuck at', done.out)] == failed
+    before = re.search(r'pilots before: .*, (\d+) of (\d+) without a fix', done.out)
+    assert int(before[1]) > 0.8 * int(before[2])
+    assert re.search(r'pilots after: [\d.]+ m rms, 0 of \d+ without a fix', done.out)
+    assert done.out.endswith(f'{file}: calibration {Calibration.load(file).id}\n')
+
+    watch = make_watch(NAMESPACE)
+    for node in ('positioner', 'transmission'):
+        client = AsyncParameterClient(watch.node, node)
+        parameters = [Parameter('calibration_file', value=str(file))]
+        response = watch.call(client, functools.partial(set_together, parameters), [process])
+        assert response.result.successful, response.result.reason
+    watch.until(lambda: process.log.count('bayes is ready') == 2, 'the estimator', [process])
+    first = len(watch.received[m.PositionEstimate])
+    watch.until(lambda: len(watch.received[m.PositionEstimate]) >= first + N_FRESH
+                and len(watch.received[m.Capacity]) >= N_FRESH, 'estimates', [process])
+    live, exact = compare(watch, watch.received[m.PositionEstimate][first:], surface)
+    assert live.mean() < 1.5 * exact.mean()
+    # Beams for the surface as it is lose little of the capacity.
+    losses = [report.loss_percent for report in watch.received[m.Capacity]
+              if np.isfinite(report.loss_percent)]
+    assert np.median(losses) < 5
+
+
+def set_together(parameters, client):
+    return client.set_parameters_atomically(parameters)
+
+
+def compare(watch, estimates, surface):
+    """Squared errors of the live estimates, and of those with the exact surface."""
+    estimator = make_estimator('bayes', SCENARIO, CODEBOOK, surface=surface)
+    live, exact = [], []
+    for estimate in estimates:
+        signals = watch.of_cycle(m.ReceivedSignals, estimate.cycle_id)
+        truths = watch.of_cycle(m.GroundTruth, estimate.cycle_id)
+        if signals and truths:
+            place = truths[-1].position
+            other = estimator.estimate(signals[-1].signals.reshape(2, -1))
+            live.append(np.sum((estimate.position - place)**2))
+            exact.append(np.sum((other.mean - place)**2))
+    assert len(live) >= N_FRESH / 2
+    return np.array(live), np.array(exact)
+
+
+def test_the_pilots_may_come_from_the_running_network(built_scripts, process, recording, tmp_path):
+    done = subprocess.run(
+        [CONFIG.parent / 'scripts' / 'calibrate', '--config', CONFIG / 'quick.yaml', '--cycles',
+         '5', '--output', 'live.npz', '--ros-args', '-r', f'__ns:={NAMESPACE}'], cwd=tmp_path,
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    assert done.returncode == 0, done.stderr
+    assert 5 <= Calibration.load(tmp_path / 'live.npz').about['pilots'] < 50
+
+
+@pytest.mark.parametrize(('arguments', 'error'), [
+    (['--namespace', '/lab'], 'no received signals with a true position'),
+    (['--namespace', NAMESPACE, '--user', '99'], 'no received signals'),
+    (['--namespace', NAMESPACE, '--config', CONFIG / 'table1.yaml'], 'codebook: analog: shape'),
+    (['--namespace', NAMESPACE, '--failed-element-share', '0.7'],
+     'failed_element_share: 0.7, expected 0 to 0.5'),
+])
+def test_an_unusable_recording_or_prior_is_named(recording, capsys, tmp_path, arguments, error):
+    done = call(capsys, recording, '--output', tmp_path / 'x.npz', *arguments)
+    assert done.code == 2
+    assert done.err.startswith('error: ')
+    assert error in done.err
+    assert len(done.err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
