@@ -5,44 +5,53 @@ from collections.abc import Callable
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.imperfections import SurfaceImperfection, has_element_errors
+from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received, stack_parts
-from rhs_isac_ros.positioning.whitened import WhitenedModel
+from rhs_isac_ros.positioning.exhaustive_errors import ElementErrorLikelihood
+from rhs_isac_ros.positioning.exhaustive_nuisance import NuisanceLikelihood
 
 _BLOCK = 4096
 
 
 def exhaustive_posterior(
         scenario: Scenario, codebook: Codebook, received: np.ndarray, log2_points: int = 22,
-        progress: Callable[[float], None] | None = None) -> Estimate:
+        progress: Callable[[float], None] | None = None, *,
+        surface: SurfaceImperfection | None = None) -> Estimate:
     """Compute mean and covariance of the posterior from points all over the region of interest.
 
     The prior is uniform on the region. All phases share the 2^log2_points points of a scrambled
     Sobol sequence; the default number takes minutes. `progress` is called with the completed
     share of the points. Signals are complex128 [N, N_B, N_SB F] for an estimate of N positions.
 
+    Gains, phases and offsets that the scenario declares as unknown are integrated out at every
+    point; see `NuisanceLikelihood`. Element errors are treated as Gaussian, with their covariance
+    at every point, see `ElementErrorLikelihood`, unless `surface` contains them: no estimator
+    without this knowledge has a lower mean squared error.
+
     Raises
     ------
     SignalError
         If the signals have another shape or are not finite.
+    ValueError
+        If the scenario declares a combination of deviations that is not supported.
     """
     from scipy.stats import qmc
 
-    model = WhitenedModel(scenario, codebook)
+    codebook.check(scenario)
     batch = checked_received(scenario, codebook, received)
-    signals = stack_parts(model.whiten(batch)).astype(np.float32).T
+    log_likelihood_at = _likelihood(scenario, codebook, batch, surface)
     low, high = scenario.roi_bounds_m
     center = (low + high) / 2
-    n = signals.shape[1]
+    n = len(batch)
     # Sums of the weights, of the weighted coordinates and of their products. Weights are relative
     # to the highest likelihood so far.
     highest, sums = np.full(n, -np.inf), np.zeros((n, 13))
     sequence, total = qmc.Sobol(3, seed=0), 2**log2_points
     for done in range(0, total, _BLOCK):
         points = (sequence.random(min(_BLOCK, total - done)) - 0.5) * (high - low)
-        means = stack_parts(model.mean(points + center)).astype(np.float32)
-        log_likelihood = means @ (2 * signals)
-        log_likelihood -= np.sum(means**2, axis=1)[:, None]
+        log_likelihood = log_likelihood_at(points + center)
         previous, highest = highest, np.maximum(highest, log_likelihood.max(axis=0))
         sums *= np.exp(previous - highest)[:, None]
         log_likelihood -= highest.astype(np.float32)
@@ -55,3 +64,22 @@ def exhaustive_posterior(
     mean = sums[:, 1:4]
     covariance = sums[:, 4:].reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
     return Estimate(mean + center, covariance)
+
+
+def _likelihood(scenario: Scenario, codebook: Codebook, received: np.ndarray,
+                surface: SurfaceImperfection | None) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of positions [P, 3] with the log-likelihood of each phase, [P, N]."""
+    if nuisance_parameters(scenario):
+        return NuisanceLikelihood(scenario, codebook, received)
+    if has_element_errors(scenario) and surface is None:
+        return ElementErrorLikelihood(scenario, codebook, received)
+    model = MeasurementModel(scenario, codebook, surface).prepare()
+    signals = stack_parts(model.whiten(received)).astype(np.float32).T
+
+    def log_likelihood(positions: np.ndarray) -> np.ndarray:
+        means = stack_parts(model.whiten(model.mean(positions))).astype(np.float32)
+        values: np.ndarray = means @ (2 * signals)
+        values -= np.sum(means**2, axis=1)[:, None]
+        return values
+
+    return log_likelihood

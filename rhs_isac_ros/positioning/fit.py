@@ -5,7 +5,7 @@ variance: ``2 |y - t|^2`` has a chi-square distribution with two degrees of free
 measurement. Signals beyond its quantiles at the probability `FALSE_ALARM` do not fit any position
 of the region. Possible causes are a user elsewhere, another codebook, or a silent or defective
 receiver. Such signals give no position, and neither do signals that are from outside of the region
-with the probability `CONFIDENCE`.
+with a probability above `OUTSIDE_LIMIT`.
 """
 
 import math
@@ -14,8 +14,10 @@ import math
 FALSE_ALARM = 1e-9
 # Prior probability that a user is in the region of interest rather than outside.
 REGION_PROBABILITY = 0.5
-# Probability with which a user is considered to be outside, or inside.
-CONFIDENCE = 0.95
+# Probability of a user outside above which there is no fix: high, because most users are inside,
+# and none of them should lose a fix. Above the second, the covariance includes positions outside.
+OUTSIDE_LIMIT = 0.99
+DOUBT_LIMIT = 0.05
 
 
 class FitTest:
@@ -74,7 +76,7 @@ def outside_probability(log_bayes_factor: float) -> float:
 
 def outside_test(probability: float) -> str:
     """Reject signals of a user who is outside of the region with this probability."""
-    if probability <= CONFIDENCE:
+    if probability <= OUTSIDE_LIMIT:
         return ''
     return (f'position outside of the region: probability {probability:.6g}, expected at most '
-            f'{CONFIDENCE:g}')
+            f'{OUTSIDE_LIMIT:g}')

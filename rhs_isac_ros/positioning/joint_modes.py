@@ -82,14 +82,22 @@ def find_joint_modes(
         for field, new in zip((*joint.modes, joint.residual, joint.values),
                               (*moved.modes, moved.residual, moved.values), strict=True):
             field[moving] = new
-    return _prune(joint, gain)[0]
+    # A step that has not converged may predict any likelihood.
+    joint, gain = _prune(joint, gain)
+    return _prune(*_step(
+        model, unknowns, received, joint.modes.points, joint.values, moves=False))[0]
 
 
 def _prune(joint: JointModes, gain: np.ndarray) -> tuple[JointModes, np.ndarray]:
-    """Sort by likelihood; drop improbable modes and repetitions."""
+    """Sort by likelihood; drop improbable modes and repetitions.
+
+    The likelihood of a mode is a prediction. The best is at most the one before the last step,
+    which is computed.
+    """
     value = joint.modes.roi_log_likelihood
     order = np.argsort(-value)
-    order = order[value[order] >= value[order[0]] - _EXACT_MARGIN - np.maximum(gain[order], 0)]
+    best = min(value.max(), (value - gain).max())
+    order = order[value[order] >= best - _EXACT_MARGIN - np.maximum(gain[order], 0)]
     points, curvature = joint.modes.roi_points, joint.modes.curvature
     kept: list[int] = []
     for index in order.tolist():
@@ -105,9 +113,16 @@ def _prune(joint: JointModes, gain: np.ndarray) -> tuple[JointModes, np.ndarray]
 
 def _step(
         model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, points: np.ndarray,
-        values: np.ndarray) -> tuple[JointModes, np.ndarray]:
-    """Take one scoring step; also return the gain of log-likelihood in the region, [M]."""
-    curvature, gradient, value, residual = _local_model(
+        values: np.ndarray, moves: bool = True) -> tuple[JointModes, np.ndarray]:
+    """Take one scoring step; also return the gain of log-likelihood in the region, [M].
+
+    If it does not move the points, the result is the likelihood there, and the gain is 0.
+    """
+    coarse = unknowns.band_phase_std_rad >= COARSE_STD_RAD
+    if coarse:
+        # Steps of the range turn the phases many times.
+        values = with_band_phases(model, unknowns, received, points, values)
+    curvature, gradient, value, residual = local_model(
         model, unknowns, received, points, values)
     nuisance = curvature[:, 3:, 3:]
     coupling = np.linalg.solve(nuisance, curvature[:, 3:, :3])
@@ -115,12 +130,14 @@ def _step(
     marginal = (marginal + np.swapaxes(marginal, 1, 2)) / 2
     reduced = gradient[:, :3] - np.einsum('mqp,mq->mp', coupling, gradient[:, 3:])
     limits = STEP_LIMITS.copy()
-    if unknowns.band_phase_std_rad >= COARSE_STD_RAD:
+    if coarse:
         limits[0] = _COARSE_STEP_M
     step = np.linalg.solve(marginal, reduced[..., None])[..., 0]
     step = np.clip(step, -limits, limits)
     of_values = (np.linalg.solve(nuisance, gradient[:, 3:, None])[..., 0]
                  - np.einsum('mqp,mp->mq', coupling, step))
+    if not moves:
+        step, of_values = np.zeros_like(step), np.zeros_like(of_values)
     whole = np.hstack([step, of_values])
     change = np.sum(gradient * whole, axis=1) - likelihood_loss(whole, curvature)
     evidence = value - np.linalg.slogdet(nuisance)[1] / 2 - np.sum(np.log(unknowns.std))
@@ -128,11 +145,24 @@ def _step(
     roi_offset = offset_to_roi(points, marginal, model.scenario.roi_bounds_m)
     modes = Modes(points, marginal, evidence + change, roi_offset)
     predicted = residual - change
-    return (JointModes(modes, predicted, values + of_values),
-            modes.roi_log_likelihood - evidence)
+    gain = modes.roi_log_likelihood - evidence if moves else np.zeros(len(points))
+    return JointModes(modes, predicted, values + of_values), gain
 
 
-def _local_model(
+def with_band_phases(
+        model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, points: np.ndarray,
+        values: np.ndarray) -> np.ndarray:
+    """Replace the phases of the bands, in values [M, Q], by the most likely ones at points."""
+    phases = [q for q, name in enumerate(unknowns.names) if name == 'band_phase']
+    values = values.copy()
+    values[:, phases] = 0.0
+    mean = model.mean(to_positions(points))
+    whitened = model.whiten(received * unknowns.factors(values))
+    values[:, phases] = np.angle(np.sum(mean.conj() * whitened, axis=2))
+    return values
+
+
+def local_model(
         model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, points: np.ndarray,
         values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Information [M, 3 + Q, 3 + Q], gradient, value of the log-likelihood, and residual [M].

@@ -4,9 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.positioning.broad_modes import draw_broad_samples
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.joint_modes import find_joint_modes
+from rhs_isac_ros.positioning.joint_search import COARSE_STD_RAD
 from rhs_isac_ros.positioning.modes import Modes
+from rhs_isac_ros.positioning.samples import Samples
 from rhs_isac_ros.positioning.surroundings import Surroundings
 from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.unknowns import Alignment, Unknowns
@@ -33,6 +36,8 @@ class Found(NamedTuple):
         Evidence for a user outside of the region.
     scale_outside
         Factor of the signals, from the gain, that is most probable outside.
+    samples
+        Samples of the posterior if the modes are too broad for a Gaussian.
     """
 
     modes: Modes
@@ -40,6 +45,7 @@ class Found(NamedTuple):
     whitened: np.ndarray
     log_evidence_outside: float
     scale_outside: float = 1.0
+    samples: Samples | None = None
 
 
 class MarginalSearch:
@@ -51,6 +57,7 @@ class MarginalSearch:
         self._model, self._table, self._surroundings = model, table, surroundings
         self.unknowns = Unknowns(model)
         self._alignment = Alignment(model, self.unknowns, table.filters)
+        self._is_broad = error is None and self.unknowns.band_phase_std_rad >= COARSE_STD_RAD
 
     def find(self, received: np.ndarray) -> Found:
         """Find the modes for the signals of one positioning phase, [N_B, N_SB F]."""
@@ -61,7 +68,10 @@ class MarginalSearch:
         if self._error:
             divided = received * self.unknowns.factors(joint.values)
             modes, residuals = self._error.refine(modes, divided, step=False)
-        return Found(modes, residuals, whitened, *self._outside(whitened, aligned))
+        samples = (draw_broad_samples(
+            self._model, self.unknowns, received, joint, self._table.normal)
+            if self._is_broad else None)
+        return Found(modes, residuals, whitened, *self._outside(whitened, aligned), samples)
 
     def _outside(self, whitened: np.ndarray, aligned: np.ndarray) -> tuple[float, float]:
         """Compute the evidence outside, with the sharp parameters by Laplace's method.

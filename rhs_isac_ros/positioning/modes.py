@@ -67,17 +67,18 @@ class Modes(NamedTuple):
 
 def find_modes(
         model: WhitenedModel, table: TemplateTable, whitened: np.ndarray,
-        max_steps: int = _SHORT_SEARCH_STEPS) -> Modes:
+        max_steps: int = _SHORT_SEARCH_STEPS, extra_margin: float = 0.0) -> Modes:
     """Find the modes with a substantial weight in the posterior.
 
     The whitened signals of one positioning phase, complex128 [N_B, N_SB F], give at least one
-    mode. The most likely in the region comes first. At least one exact step is taken.
+    mode. The most likely in the region comes first. At least one exact step is taken. Modes may
+    be less likely than the best by `extra_margin` more than usual.
     """
-    points = table.modes(whitened, MAX_MODES, TABLE_MARGIN)
+    points = table.modes(whitened, MAX_MODES, TABLE_MARGIN + extra_margin)
     modes, gain = _gauss_newton_step(model, points, whitened)
     value = modes.roi_log_likelihood
     order = np.argsort(-value)
-    order = order[value[order] >= value[order[0]] - _EXACT_MARGIN]
+    order = order[value[order] >= value[order[0]] - _EXACT_MARGIN - extra_margin]
     chosen = order[separate(modes.points[order] / _MIN_SEPARATION, MAX_MODES)]
     modes, gain = modes.select(chosen), gain[chosen]
     for _ in range(max_steps - 1):

@@ -12,8 +12,9 @@ from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, Located, estimate_each
+from rhs_isac_ros.positioning.failed_elements import FailedElements, can_enumerate
 from rhs_isac_ros.positioning.fit import (
-    CONFIDENCE,
+    DOUBT_LIMIT,
     FitTest,
     outside_probability,
     outside_test,
@@ -42,9 +43,9 @@ class SearchEstimator(abc.ABC):
     ----------
     reject_outside
         Whether the user may also be outside of the region; see `surroundings`. If this is almost
-        certain (`fit.CONFIDENCE`), there is no fix either. If it is merely possible, the
-        covariance includes the positions outside, while the position remains that of a user
-        inside.
+        certain (`fit.OUTSIDE_LIMIT`), there is no fix either. If it is merely possible
+        (`fit.DOUBT_LIMIT`), the covariance includes the positions outside, while the position
+        remains that of a user inside.
     surface
         What is known of the surface, as in `MeasurementModel`; for example a calibration.
 
@@ -68,6 +69,9 @@ class SearchEstimator(abc.ABC):
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
         self._error = ElementErrorModel.of(self._model)
+        self._failures: FailedElements | None = None
+        if surface is None and can_enumerate(scenario):
+            self._failures = FailedElements(self._model, self._table)
         self._marginal: MarginalSearch | None = None
         # Weak signals may be those of a user with a low gain.
         self._max_power = 10**(_GAIN_REACH * scenario.user_gain_std_db / 10)
@@ -94,7 +98,8 @@ class SearchEstimator(abc.ABC):
                 continue
             found = (self._marginal.find(received) if self._marginal
                      else self._find(received, whitened))
-            samples = draw_samples(found.modes, self._table.normal, self._bounds)
+            samples = found.samples or draw_samples(
+                found.modes, self._table.normal, self._bounds)
             residual = float(found.residuals[np.argmax(found.modes.roi_log_likelihood)])
             outside = 0.0
             if self._rejects_outside:
@@ -103,7 +108,7 @@ class SearchEstimator(abc.ABC):
             reason = self._reason(found, residual, outside)
             moments = no_fix if reason else self._moments(found.modes, samples)
             expected = np.nan
-            if outside <= 1 - CONFIDENCE or self._test.residual_test(residual) == reason != '':
+            if outside <= DOUBT_LIMIT or self._test.residual_test(residual) == reason != '':
                 expected = self._expected_residual(found.residuals, residual, samples)
             elif not reason:
                 moments = self._with_outside(moments, found, outside)
@@ -115,7 +120,11 @@ class SearchEstimator(abc.ABC):
             # Strong signals may need more steps to reach the maximum.
             modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
         residuals = -modes.roi_log_likelihood
-        if self._error:
+        if self._failures:
+            modes = find_modes(
+                self._model, self._table, whitened, extra_margin=self._failures.search_margin)
+            modes, residuals = self._failures.refine(modes, received)
+        elif self._error:
             signals = np.broadcast_to(received, (len(modes.points), *received.shape))
             modes, residuals = self._error.refine(modes, signals, step=True)
         outside = (float(self._surroundings.log_evidence(whitened)[0])

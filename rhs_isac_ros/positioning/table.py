@@ -133,6 +133,36 @@ class TemplateTable:
         chosen: np.ndarray = points[order][separate(points[order] / scale, max_modes)]
         return chosen
 
+    def peaks_under(self, whitened: np.ndarray, factor: np.ndarray, max_points: int) -> np.ndarray:
+        """Find the highest separate points of the grid for another covariance of the signals.
+
+        Parameters
+        ----------
+        whitened
+            Signals of one positioning phase, whitened as the templates, complex128
+            [N_B, N_SB F].
+        factor
+            F of the inverse F F^H of the other covariance after this whitening, complex128
+            [N_B, N_SB F, N_SB F].
+
+        Returns
+        -------
+        numpy.ndarray
+            Points (r [m], u, v), the most likely first, float64 [P, 3].
+        """
+        turned = np.matmul(self._filters, factor.astype(np.complex64))
+        signals = np.einsum('bsr,bs->br', factor.conj(), whitened).astype(np.complex64)
+        filtered = np.matmul(turned, signals[..., None])[..., 0] * self._carrier
+        likelihood = self._rotation @ np.concatenate([filtered.real, filtered.imag])
+        likelihood -= np.sum(turned.real**2 + turned.imag**2, axis=(0, 2))
+        cell, offset_m, value = self._peaks(np.transpose(likelihood))
+        order = np.argsort(-value)
+        points = self.points[cell[order]]
+        points[:, 0] += offset_m[order]
+        scale = np.array(_MIN_SEPARATION) * (self._wavelength_m, 1, 1)
+        chosen: np.ndarray = points[separate(points / scale, max_points)]
+        return chosen
+
     def _loss_outside(self, points: np.ndarray, cell: np.ndarray, value: np.ndarray,
                       margin: float) -> np.ndarray:
         """Loss of log-likelihood from points to the region, [C]: 0 inside.

@@ -31,6 +31,11 @@ class WhitenedModel:
         """Sizes (N_B, N_SB F) of the signals of a positioning phase."""
         return self._model.shape
 
+    @property
+    def root(self) -> np.ndarray:
+        """Cholesky factor of the covariance, complex128 [N_B, N_SB F, N_SB F], read-only."""
+        return self._model.root
+
     def whiten(self, received: np.ndarray) -> np.ndarray:
         """Transform signals [N, N_B, N_SB F] to unit covariance; the shape stays the same."""
         return self._model.whiten(received)

@@ -9,8 +9,12 @@ The 95 % region of an estimate is the ellipsoid of its covariance that contains 
 Brackets contain 95 % intervals: Wilson's for shares, the percentile bootstrap for mean squared
 errors. The last column is the share of windows in which the monitor of the residuals warns; the
 windows are random draws of phases. The predicted error is that of fixes that are not possibly from
-outside of the region. With --reference N, rows without nuisance parameters and element errors are
-compared with the posterior over 2^N points.
+outside of the region.
+
+With --reference N, the first N positions of each declared row are compared with the exhaustive
+posterior of the declared model, paired. Element errors have their covariance at every point there.
+Failed elements have no such sum, because drawn surfaces do not fit the signals; their row is
+compared with the posterior that knows the surface, so that the ratio is an upper limit.
 """
 
 import os
@@ -19,6 +23,7 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
+import copy
 import dataclasses
 import json
 from pathlib import Path
@@ -31,8 +36,7 @@ from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import reduction
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
-from rhs_isac_ros.model.imperfections import has_element_errors
-from rhs_isac_ros.model.nuisance import nuisance_parameters
+from rhs_isac_ros.model.imperfections import SurfaceImperfection, draw_deviations
 from rhs_isac_ros.positioning import Estimate, exhaustive_posterior, make_estimator
 from rhs_isac_ros.positioning.residual_monitor import WINDOW, ResidualMonitor
 
@@ -80,7 +84,9 @@ def main() -> None:
     add('--only', action='append', default=[], metavar='TEXT',
         help='only rows whose name contains the text; may be repeated')
     add('--reference', type=int, default=0, metavar='N',
-        help='compare with the posterior over 2^N points; 0 to omit')
+        help='compare the first N positions with the exhaustive posterior; 0 to omit')
+    add('--log2-points', type=positive_int, default=21,
+        help='binary logarithm of the number of points of that posterior')
     add('--windows', type=positive_int, default=200,
         help='number of windows to which the monitor of the residuals is applied')
     add('--json', type=Path, help='JSON file for the results')
@@ -113,7 +119,7 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
                 options: argparse.Namespace) -> list[dict[str, Any]]:
     """Measure users inside the region, with a silent and a declaring scenario."""
     declared = dataclasses.replace(silent, **changes)
-    positions, received = draw(declared, codebook, options)
+    positions, received, surfaces = draw(declared, codebook, options)
     rows = []
     for kind, scenario in (('silent', silent), ('declared', declared)):
         if kind == 'silent' and not changes:
@@ -122,11 +128,10 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
             options.estimator, scenario, codebook, reject_outside=True)
         estimate = estimator.estimate(received)
         row = {'signals': name, 'scenario': kind, **figures(estimate, positions, options.windows)}
-        plain = not nuisance_parameters(scenario) and not has_element_errors(scenario)
-        if options.reference and kind == 'declared' and plain:
-            row |= ratio_to_reference(
-                exhaustive_posterior(scenario, codebook, received, options.reference),
-                estimate, positions)
+        if options.reference and kind == 'declared':
+            n = options.reference
+            reference = reference_means(scenario, codebook, received[:n], surfaces[:n], options)
+            row |= ratio_to_reference(reference, estimate, positions[:n])
         rows.append(report(row))
     return rows
 
@@ -152,17 +157,34 @@ def outside_rows(scenario: Scenario, codebook: Codebook,
     return rows
 
 
-def draw(scenario: Scenario, codebook: Codebook,
-         options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Draw positions and signals; every few positions have another surface."""
+def draw(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
+         ) -> tuple[np.ndarray, np.ndarray, list[SurfaceImperfection | None]]:
+    """Draw positions, signals and surfaces; every few positions have another surface."""
     model = MeasurementModel(scenario, codebook)
     positions, received = [], []
+    surfaces: list[SurfaceImperfection | None] = []
     for group in range(-(-options.positions // PER_SURFACE)):
         rng = streams.generator(options.seed, streams.PHASES, group)
         positions.append(scenario.sample_positions(PER_SURFACE, rng))
+        # The model draws the same surface from a generator in the same state.
+        surface, _ = draw_deviations(scenario, PER_SURFACE, copy.deepcopy(rng))
+        surfaces += PER_SURFACE * [surface]
         received.append(model.sample(positions[-1], rng))
     n = options.positions
-    return np.concatenate(positions)[:n], np.concatenate(received)[:n]
+    return np.concatenate(positions)[:n], np.concatenate(received)[:n], surfaces[:n]
+
+
+def reference_means(
+        scenario: Scenario, codebook: Codebook, received: np.ndarray,
+        surfaces: list[SurfaceImperfection | None], options: argparse.Namespace) -> np.ndarray:
+    """Compute the means of the exhaustive posterior, float64 [N, 3] [m]."""
+    if not scenario.failed_element_share:
+        return exhaustive_posterior(scenario, codebook, received, options.log2_points).mean
+    groups = range(0, len(received), PER_SURFACE)
+    return np.concatenate([
+        exhaustive_posterior(scenario, codebook, received[start:start + PER_SURFACE],
+                             options.log2_points, surface=surfaces[start]).mean
+        for start in groups])
 
 
 def shell(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -249,13 +271,15 @@ def mean_interval(samples: np.ndarray) -> tuple[float, float, float] | None:
 
 
 def ratio_to_reference(
-        reference: Estimate, estimate: Estimate, positions: np.ndarray) -> dict[str, Any]:
+        reference: np.ndarray, estimate: Estimate, positions: np.ndarray) -> dict[str, Any]:
     """Compare the squared errors of fixes with those of the exhaustive posterior."""
-    fix = estimate.fix
-    own, best = (np.sum((means - positions)[fix]**2, axis=1)
-                 for means in (estimate.mean, reference.mean))
+    n = len(positions)
+    fix = estimate.fix[:n]
+    own, best = (np.sum((means[:n] - positions)[fix]**2, axis=1)
+                 for means in (estimate.mean, reference))
     value, low, high = reduction(own, best, lambda samples: samples.mean(axis=-1))
-    return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100)}
+    return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100),
+            'reference_positions': n}
 
 
 def report(row: dict[str, Any]) -> dict[str, Any]:

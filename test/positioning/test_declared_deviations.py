@@ -9,9 +9,9 @@ from scipy.stats import binom, norm
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.nuisance import nuisance_factors
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning import exhaustive_posterior, make_estimator
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
-from rhs_isac_ros.positioning.joint_modes import _local_model, find_joint_modes
+from rhs_isac_ros.positioning.joint_modes import find_joint_modes, local_model
 from rhs_isac_ros.positioning.marginal import MarginalSearch
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.polar import to_polar, to_positions
@@ -84,13 +84,13 @@ def test_the_gradient_is_that_of_the_log_likelihood(codebook):
     received = MeasurementModel(scenario, codebook).sample(position, rng)[0]
     values = 0.3 * unknowns.std * rng.normal(size=(1, len(unknowns.std)))
     points = to_polar(position + 0.003)
-    information, gradient, _, _ = _local_model(model, unknowns, received, points, values)
+    information, gradient, _, _ = local_model(model, unknowns, received, points, values)
     np.testing.assert_allclose(information, np.swapaxes(information, 1, 2), rtol=1e-9)
     assert (np.linalg.eigvalsh(information / np.sqrt(
         np.einsum('mp,mq->mpq', *[np.diagonal(information, axis1=1, axis2=2)] * 2))) > 0).all()
 
     def value(change):
-        return _local_model(model, unknowns, received, points + change[:3],
+        return local_model(model, unknowns, received, points + change[:3],
                             values + change[3:])[2][0]
 
     scale = 1e-4 / np.sqrt(np.diagonal(information[0]))
@@ -111,7 +111,7 @@ def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, ch
     step = unknowns.std[0] / 500
     values = found.values[0] + step * np.arange(-1500, 1501)[:, None]
     points = np.repeat(found.modes.points[:1], len(values), axis=0)
-    _, _, log_likelihood, _ = _local_model(model, unknowns, received, points, values)
+    _, _, log_likelihood, _ = local_model(model, unknowns, received, points, values)
     highest = log_likelihood.max()
     average = highest + np.log(
         np.sum(np.exp(log_likelihood - highest)) * step / unknowns.std[0])
@@ -130,8 +130,8 @@ def test_the_information_is_the_covariance_of_the_gradient(codebook):
     exact = MeasurementModel(SCENARIO, codebook)
     received = exact.sample(np.tile(to_positions(point), (2000, 1)), rng)
     gradients = np.array([
-        _local_model(model, unknowns, signals, point, zero)[1][0] for signals in received])
-    information = _local_model(model, unknowns, received[0], point, zero)[0][0]
+        local_model(model, unknowns, signals, point, zero)[1][0] for signals in received])
+    information = local_model(model, unknowns, received[0], point, zero)[0][0]
     information[3:, 3:] -= np.diag(unknowns.precision)
     scale = np.sqrt(np.diag(information))
     found = np.cov(gradients.T) / np.outer(scale, scale)
@@ -152,6 +152,19 @@ def test_the_evidence_outside_is_the_average_over_the_gain(codebook):
     exponent += norm(scale=search.unknowns.std[0]).logpdf(gains) - 2 * received.size * gains
     expected = logsumexp(exponent) + np.log(gains[1] - gains[0])
     assert search.find(received).log_evidence_outside == pytest.approx(expected, abs=0.1)
+def test_the_weights_of_modes_are_likelihoods_and_no_predictions(codebook):
+    """Far from a mode, the prediction of a step may be arbitrarily wrong."""
+    scenario, rng = declaring(carrier_offset_std_hz=3e3, user_gain_std_db=2.0), (
+        np.random.default_rng(8))
+    model = WhitenedModel(scenario, codebook)
+    table, unknowns = TemplateTable(scenario, tabulate(model)), Unknowns(model)
+    alignment = Alignment(model, unknowns, table.filters)
+    received = MeasurementModel(scenario, codebook).sample(scenario.sample_positions(8, rng), rng)
+    for signals in received:
+        joint = find_joint_modes(model, table, unknowns, signals, alignment.values(signals))
+        _, _, _, residual = local_model(
+            model, unknowns, signals, joint.modes.points, joint.values)
+        np.testing.assert_allclose(joint.residual, residual, rtol=1e-9)
 
 
 def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
@@ -232,3 +245,18 @@ def test_a_step_predicts_the_likelihood_after_it(codebook):
     first, *_, last = (float(mode.log_likelihood[0]) for mode in found)
     assert first == pytest.approx(last, abs=0.5)
     np.testing.assert_allclose(found[3].points, found[2].points, atol=1e-4)
+def test_random_phases_of_the_bands_leave_the_moments_of_the_posterior(codebook):
+    """The modes extend over the range and overlap."""
+    scenario = declaring(
+        band_phase_std_rad=7.0, roi_center_m=(14.0, 0.0, 0.0), roi_size_m=(8.0, 4.0, 2.0))
+    rng = np.random.default_rng(7)
+    positions = scenario.sample_positions(25, rng)
+    received = MeasurementModel(scenario, codebook).sample(positions, rng)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received)
+    assert estimate.fix.all()
+    reference = exhaustive_posterior(scenario, codebook, received, 17)
+    variance = np.trace(reference.covariance, axis1=1, axis2=2)
+    difference = np.sum((estimate.mean - reference.mean)**2, axis=1)
+    assert np.mean(difference) < 0.04 * np.mean(variance)
+    predicted = np.trace(estimate.covariance, axis1=1, axis2=2)
+    assert np.mean(predicted) == pytest.approx(np.mean(variance), rel=0.15)

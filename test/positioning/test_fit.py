@@ -7,8 +7,8 @@ from scipy.stats import chi2
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 from rhs_isac_ros.positioning.fit import (
-    CONFIDENCE,
     FALSE_ALARM,
+    OUTSIDE_LIMIT,
     REGION_PROBABILITY,
     FitTest,
     outside_probability,
@@ -88,9 +88,9 @@ def test_distorted_signals_give_no_fix(setting, change):
 
 
 def test_a_user_who_is_almost_certainly_outside_is_rejected():
-    assert outside_test(CONFIDENCE) == ''
-    assert outside_test(0.99) == (
-        'position outside of the region: probability 0.99, expected at most 0.95')
+    assert outside_test(OUTSIDE_LIMIT) == ''
+    assert outside_test(0.995) == (
+        'position outside of the region: probability 0.995, expected at most 0.99')
 
 
 def test_the_probability_of_a_user_outside_follows_from_the_bayes_factor():
