@@ -199,8 +199,9 @@ class Watch:
 
     @property
     def given_up(self):
+        """Final states of cycles that failed; signals without a position are no failure."""
         return [message for message in self.received[m.ProtocolState]
-                if message.outcome not in ('', 'served')]
+                if message.outcome not in ('', 'served', 'no_fix')]
 
     def until_served(self, n=1, user=None, processes=()):
         """Wait for n more served cycles, of one user or of any, and return their final states."""

@@ -6,6 +6,7 @@ import math
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.outcomes import Outcome
 
 # Older cycles that still lack a message are discarded, because it will no longer arrive.
 _MAX_OPEN_CYCLES = 16
@@ -117,6 +118,14 @@ class CycleLog:
     def given_up(self) -> list[CycleRecord]:
         """Cycles that ended without being served."""
         return [record for record in self.ended if record.outcome != 'served']
+
+    @property
+    def failed(self) -> list[CycleRecord]:
+        """Cycles that were given up for another reason than signals without a position.
+
+        Such signals are a result: the network works, and the user may be outside of the region.
+        """
+        return [record for record in self.given_up if record.outcome != Outcome.NO_FIX.value]
 
     def add(self, message: m.Message, now_s: float) -> None:
         """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s]."""

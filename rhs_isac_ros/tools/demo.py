@@ -51,8 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 if every cycle was served, including after Ctrl-C; 1 if not; 2 if an
-        argument or a file is invalid.
+        Exit code: 0 if every cycle was served or its signals gave no position, including after
+        Ctrl-C; 1 if not; 2 if an argument or a file is invalid.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -257,7 +257,7 @@ def _report(
         print(f'recording: {options.record}')
     if problem:
         print_error(problem, 'demo')
-    return 1 if problem or given_up else 0
+    return 1 if problem or observer.log.failed else 0
 
 
 if __name__ == '__main__':

@@ -69,11 +69,22 @@ def test_a_cycle_that_is_given_up_has_a_reason_and_no_result(network):
     (record,) = log.given_up
     assert log.complete == []
     assert (record.user, record.outcome) == (1, 'positioner_silent')
-    assert log.ended == [record]
+    assert log.ended == log.failed == [record]
     assert record.completed() is None
     assert record.truth is not None
     assert record.estimate is record.capacity is None
     assert record.durations_s()[m.Phase.ESTIMATING] == pytest.approx(1.0)
+
+
+def test_a_cycle_without_a_position_is_given_up_but_has_not_failed():
+    log = CycleLog()
+    log.add(m.Beacon(cycle_id=7, attempt=1), 0.0)
+    log.add(m.ProtocolState(
+        cycle_id=7, user=1, phase=m.Phase.ESTIMATING, outcome='no_fix', began_s=np.zeros(4),
+        elapsed_s=1.0), 1.0)
+    (record,) = log.given_up
+    assert (record.cycle_id, record.outcome) == (7, 'no_fix')
+    assert log.failed == log.complete == []
 
 
 def test_a_running_cycle_is_neither_complete_nor_given_up(network):
