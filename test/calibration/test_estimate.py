@@ -97,12 +97,17 @@ def test_an_intact_surface_stays_intact(beams, scenario, send):
 
 
 def test_estimators_use_the_surface(scenario, beams, damaged, send):
-    """With errors close to those of exact knowledge, and consistent covariances."""
+    """With errors close to those of exact knowledge, and consistent covariances.
+
+    An estimator that assumes an ideal surface gives no position for most signals.
+    """
     surface = damaged(6)
     estimate = estimate_surface(scenario, [send(scenario, beams, surface)])
     fresh = send(scenario, beams, surface, 60, seed=7)
+    ideal = dataclasses.replace(scenario, element_error_rms=0.0, failed_element_share=0.0)
+    assert make_estimator('bayes', ideal, beams).estimate(fresh.received).fix.mean() < 0.5
     squares = {}
-    for name, known in (('before', None), ('after', estimate), ('exact', surface)):
+    for name, known in (('after', estimate), ('exact', surface)):
         found = make_estimator('bayes', scenario, beams, surface=known).estimate(fresh.received)
         squares[name] = np.sum((found.mean - fresh.positions)**2, axis=1)
         if name == 'after':
@@ -110,7 +115,6 @@ def test_estimators_use_the_surface(scenario, beams, damaged, send):
             trace = np.trace(found.covariance, axis1=1, axis2=2)
             assert 0.6 < squares[name].mean() / trace.mean() < 1.6
     assert squares['after'].mean() < 1.2 * squares['exact'].mean()
-    assert squares['after'].mean() < 0.8 * squares['before'].mean()
 
 
 def test_a_poor_estimate_has_consistent_errors(scenario, beams, damaged, send):
