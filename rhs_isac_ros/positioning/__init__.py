@@ -9,6 +9,8 @@ from a scenario and a codebook. There are two ways to add one:
 * In this package: add the class to `ESTIMATORS` below.
 
 `estimate_each` checks the shape of the signals and handles one positioning phase as well as many.
+
+A `Tracker` combines successive positioning phases of a user that moves.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,10 +23,12 @@ from rhs_isac_ros.positioning.bayes import BayesEstimator
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError, estimate_each
 from rhs_isac_ros.positioning.exhaustive import exhaustive_posterior
 from rhs_isac_ros.positioning.ml import MlEstimator
+from rhs_isac_ros.positioning.motion import Motion
 from rhs_isac_ros.positioning.network import ModelError, Network
 from rhs_isac_ros.positioning.neural import NeuralEstimator
 from rhs_isac_ros.positioning.search import surface_of
 from rhs_isac_ros.positioning.simulate import simulate_pairs
+from rhs_isac_ros.positioning.tracking import Tracker, TrackEstimate
 from rhs_isac_ros.positioning.training import train
 
 ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
@@ -34,8 +38,9 @@ REGION_ESTIMATORS = (BayesEstimator.name, MlEstimator.name)
 
 __all__ = [
     'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator',
-    'ModelError', 'Network', 'NeuralEstimator', 'SignalError', 'estimate_each',
-    'exhaustive_posterior', 'file_options', 'make_estimator', 'simulate_pairs', 'surface_of',
+    'ModelError', 'Motion', 'Network', 'NeuralEstimator', 'SignalError', 'TrackEstimate',
+    'Tracker', 'estimate_each', 'exhaustive_posterior', 'file_options', 'make_estimator',
+    'simulate_pairs', 'surface_of',
     'train',
 ]
 

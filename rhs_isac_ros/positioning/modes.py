@@ -15,7 +15,7 @@ MAX_MODES = 32
 # Maximum difference between the best log-likelihood and that of a mode: on the table, which is
 # accurate to one Gauss-Newton step, and after the first exact step.
 TABLE_MARGIN = 10.0
-_EXACT_MARGIN = 8.0
+EXACT_MARGIN = 8.0
 # Modes closer than this in all of (r [m], u, v) have converged to the same maximum.
 _MIN_SEPARATION = np.array([0.01, 0.02, 0.02])
 # The linear model of a step in (r [m], u, v) does not hold beyond these.
@@ -78,7 +78,7 @@ def find_modes(
     modes, gain = _gauss_newton_step(model, points, whitened)
     value = modes.roi_log_likelihood
     order = np.argsort(-value)
-    order = order[value[order] >= value[order[0]] - _EXACT_MARGIN - extra_margin]
+    order = order[value[order] >= value[order[0]] - EXACT_MARGIN - extra_margin]
     chosen = order[separate(modes.points[order] / _MIN_SEPARATION, MAX_MODES)]
     modes, gain = modes.select(chosen), gain[chosen]
     for _ in range(max_steps - 1):
@@ -96,7 +96,7 @@ def _gauss_newton_step(
         model: WhitenedModel, points: np.ndarray, whitened: np.ndarray
 ) -> tuple[Modes, np.ndarray]:
     """Return the modes after one step, and the gain of log-likelihood in the region, [M]."""
-    curvature, gradient, value = _local_model(model, points, whitened)
+    curvature, gradient, value = local_model(model, points, whitened)
     step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
     step = np.clip(step, -STEP_LIMITS, STEP_LIMITS)
     predicted = value + np.sum(gradient * step, axis=1) - likelihood_loss(step, curvature)
@@ -106,10 +106,14 @@ def _gauss_newton_step(
     return modes, modes.roi_log_likelihood - value
 
 
-def _local_model(
+def local_model(
         model: WhitenedModel, points: np.ndarray, whitened: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Curvature [M, 3, 3], gradient [M, 3] and value [M] of the log-likelihood, polar."""
+    """Compute curvature, gradient and value of the log-likelihood in (r [m], u, v).
+
+    Takes points, float64 [M, 3], and whitened signals, complex128 [N_B, N_SB F]; returns float64
+    [M, 3, 3], [M, 3] and [M].
+    """
     n = len(points)
     mean, by_position = model.mean_and_jacobian(to_positions(points))
     # Re(a^H b) is the inner product of real and imaginary parts.

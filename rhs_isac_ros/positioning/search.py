@@ -3,6 +3,7 @@
 import abc
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,13 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
-from rhs_isac_ros.positioning.estimate import Estimate, Estimator, Located, estimate_each
+from rhs_isac_ros.positioning.estimate import (
+    Estimate,
+    Estimator,
+    Located,
+    checked_received,
+    estimate_each,
+)
 from rhs_isac_ros.positioning.failed_elements import FailedElements, can_enumerate
 from rhs_isac_ros.positioning.fit import (
     DOUBT_LIMIT,
@@ -31,6 +38,24 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _GAIN_REACH = 6
 # Coordinates fitted to the signals of each phase.
 _N_COORDINATES = 3
+
+
+class Posterior(NamedTuple):
+    """The posterior of one positioning phase, for a uniform prior on the region of interest.
+
+    Attributes
+    ----------
+    estimate
+        Its mean and covariance, or the reason why there is no position.
+    modes
+        Its modes; None without a position.
+    whitened
+        Whitened signals, complex128 [N_B, N_SB F].
+    """
+
+    estimate: Estimate
+    modes: Modes | None
+    whitened: np.ndarray
 
 
 class SearchEstimator(abc.ABC):
@@ -88,31 +113,64 @@ class SearchEstimator(abc.ABC):
         model = self._model
         return estimate_each(model.scenario, model.codebook, received, self._locate)
 
+    def posterior(self, received: np.ndarray) -> Posterior:
+        """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F].
+
+        Raises
+        ------
+        SignalError
+            If the signals cannot be used, as in `estimate`.
+        """
+        model = self._model
+        (signals,) = checked_received(model.scenario, model.codebook, received)
+        (whitened,) = model.whiten(signals[None])
+        located, modes = self._analyse(signals, whitened)
+        return Posterior(Estimate(*located), modes, whitened)
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Points that represent a standard Gaussian, float64 [128, 3]."""
+        return self._table.normal
+
+    @property
+    def exact_model(self) -> WhitenedModel | None:
+        """The model of the whitened signals; None if they also depend on other unknowns."""
+        return None if self._marginal or self._error else self._model
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the signals."""
+        return self._model.scenario
+
     def _locate(self, batch: np.ndarray) -> Iterator[Located]:
-        no_fix = np.full(3, np.nan), np.full((3, 3), np.nan)
         for received, whitened in zip(batch, self._model.whiten(batch), strict=True):
-            reason = self._test.min_energy_test(
-                float(np.sum(np.abs(whitened)**2)) * self._max_power)
-            if reason:
-                yield *no_fix, reason, np.nan, np.nan
-                continue
-            found = (self._marginal.find(received) if self._marginal
-                     else self._find(received, whitened))
-            samples = found.samples or draw_samples(
-                found.modes, self._table.normal, self._bounds)
-            residual = float(found.residuals[np.argmax(found.modes.roi_log_likelihood)])
-            outside = 0.0
-            if self._rejects_outside:
-                inside = samples.log_evidence(self._volume_m3)
-                outside = outside_probability(inside - found.log_evidence_outside)
-            reason = self._reason(found, residual, outside)
-            moments = no_fix if reason else self._moments(found.modes, samples)
-            expected = np.nan
-            if outside <= DOUBT_LIMIT or self._test.residual_test(residual) == reason != '':
-                expected = self._expected_residual(found.residuals, residual, samples)
-            elif not reason:
-                moments = self._with_outside(moments, found, outside)
-            yield *moments, reason, residual, expected
+            yield self._analyse(received, whitened)[0]
+
+    def _analyse(
+            self, received: np.ndarray, whitened: np.ndarray) -> tuple[Located, Modes | None]:
+        """Locate one phase; also return the modes, None without a position."""
+        no_fix = np.full(3, np.nan), np.full((3, 3), np.nan)
+        reason = self._test.min_energy_test(
+            float(np.sum(np.abs(whitened)**2)) * self._max_power)
+        if reason:
+            return (*no_fix, reason, np.nan, np.nan), None
+        found = (self._marginal.find(received) if self._marginal
+                 else self._find(received, whitened))
+        samples = found.samples or draw_samples(
+            found.modes, self._table.normal, self._bounds)
+        residual = float(found.residuals[np.argmax(found.modes.roi_log_likelihood)])
+        outside = 0.0
+        if self._rejects_outside:
+            inside = samples.log_evidence(self._volume_m3)
+            outside = outside_probability(inside - found.log_evidence_outside)
+        reason = self._reason(found, residual, outside)
+        moments = no_fix if reason else self._moments(found.modes, samples)
+        expected = np.nan
+        if outside <= DOUBT_LIMIT or self._test.residual_test(residual) == reason != '':
+            expected = self._expected_residual(found.residuals, residual, samples)
+        elif not reason:
+            moments = self._with_outside(moments, found, outside)
+        return (*moments, reason, residual, expected), None if reason else found.modes
 
     def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
         modes = find_modes(self._model, self._table, whitened)

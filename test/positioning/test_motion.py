@@ -1,0 +1,76 @@
+"""The movement that tracks assume."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.positioning.motion import Motion
+from rhs_isac_ros.positioning.polar import jacobian, to_polar, to_positions
+
+PLACE = np.array([[9.0, -2.0, 0.5], [6.0, 3.0, -0.5]])
+
+
+def started(motion, spread=0.01):
+    points = to_polar(PLACE)
+    inverse = np.linalg.inv(jacobian(points))
+    covariances = spread**2 * inverse @ np.swapaxes(inverse, 1, 2)
+    return motion.start(points, covariances, np.log([0.3, 0.7]))
+
+
+def cartesian(mixture):
+    """Return position, velocity and their covariance [C, 6, 6] in Cartesian coordinates."""
+    by_point = jacobian(mixture.means[:, :3])
+    both = np.zeros((len(by_point), 6, 6))
+    both[:, :3, :3] = both[:, 3:, 3:] = by_point
+    return (to_positions(mixture.means[:, :3]),
+            np.matmul(by_point, mixture.means[:, 3:, None])[..., 0],
+            both @ mixture.covariances @ np.swapaxes(both, 1, 2))
+
+
+def test_a_mixture_starts_at_rest_with_the_assumed_speed():
+    mixture = started(Motion(speed_mps=2.0))
+    positions, velocities, covariances = cartesian(mixture)
+    np.testing.assert_allclose(positions, PLACE)
+    np.testing.assert_array_equal(velocities, 0.0)
+    np.testing.assert_allclose(np.trace(covariances[0, 3:, 3:]), 4.0)
+
+
+def test_means_move_in_straight_lines_and_slow_down():
+    motion = Motion(memory_s=2.0)
+    mixture = started(motion)
+    velocity = np.array([0.3, -0.8, 0.1])
+    by_point = jacobian(mixture.means[:, :3])
+    mixture.means[:, 3:] = np.linalg.solve(by_point, velocity[None, :, None])[..., 0]
+    positions, velocities, _ = cartesian(motion.predict(mixture, 0.5))
+    decay = np.exp(-0.25)
+    np.testing.assert_allclose(velocities, [decay * velocity] * 2, atol=1e-12)
+    np.testing.assert_allclose(positions, PLACE + 2.0 * (1 - decay) * velocity, atol=1e-12)
+
+
+@pytest.mark.parametrize('elapsed_s', [1e-4, 0.1, 1.5])
+def test_covariances_are_those_of_the_random_process(elapsed_s):
+    """The reference multiplies many short steps of the process, in Cartesian coordinates."""
+    motion = Motion(speed_mps=1.0, memory_s=1.5)
+    _, _, found = cartesian(motion.predict(started(motion), elapsed_s))
+    step_s, expected = elapsed_s / 2000, np.diag([1e-4, 1 / 3])
+    transition = np.array([[1, step_s], [0, 1 - step_s / 1.5]])
+    for _ in range(2000):
+        expected = transition @ expected @ transition.T
+        expected[1, 1] += 2 / 1.5 / 3 * step_s
+    for axis in (0, 1, 2):
+        block = found[0][np.ix_([axis, axis + 3], [axis, axis + 3])]
+        np.testing.assert_allclose(block, expected, rtol=0.02, atol=1e-9)
+
+
+def test_two_short_predictions_equal_a_long_one():
+    motion = Motion()
+    once = motion.predict(started(motion), 0.4)
+    twice = motion.predict(motion.predict(started(motion), 0.1), 0.3)
+    np.testing.assert_allclose(twice.means, once.means, atol=1e-9)
+    np.testing.assert_allclose(twice.covariances, once.covariances, rtol=1e-6, atol=1e-12)
+
+
+def test_users_stay_in_front_of_the_surface():
+    motion = Motion(memory_s=100.0)
+    mixture = started(motion)
+    mixture.means[:, 3] = -10.0
+    assert (to_positions(motion.predict(mixture, 5.0).means[:, :3])[:, 0] > 0).all()
