@@ -27,6 +27,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
     PeersChanged,
+    PublishTrack,
     Reply,
     RevertSettings,
     Send,
@@ -159,6 +160,7 @@ class Network:
         self.kept: list[Any] = []
         # Replies to operators.
         self.replies: list[Reply] = []
+        self.tracks: list[PublishTrack] = []
         self._ends: list[tuple[int, int, str]] = []
         self.codebooks = {} if codebook is None else {codebook.id: codebook}
         self._roles: dict[str, Any] = {}
@@ -237,6 +239,8 @@ class Network:
                 self.kept.append(action.settings)
             elif isinstance(action, Reply):
                 self.replies.append(action)
+            elif isinstance(action, PublishTrack):
+                self.tracks.append(action)
             else:
                 self.logs.append(Logged(self.now_s, name, action))
 

@@ -22,7 +22,7 @@ KEYS = {
 # Libraries without a key, by the name of the import: their requirement in an extra of setup.py.
 PIP_ONLY = {
     'distributed': 'distributed', 'jax': None, 'mcap': 'mcap', 'mcap_ros2': 'mcap-ros2-support',
-    'pymoo': 'pymoo', 'rosbags': 'rosbags',
+    'pymoo': 'pymoo', 'rosbags': 'rosbags', 'stonesoup': None,
 }
 # Modules of the repository.
 OWN = {

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
@@ -31,6 +32,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     EstimatorFailed,
     EstimatorReady,
+    PublishTrack,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
@@ -53,6 +55,7 @@ class PositionerNode(RoleNode[Positioner]):
         self._pose = self.create_publisher(
             PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
         self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped})
+        self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry})
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
         self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
@@ -109,13 +112,16 @@ class PositionerNode(RoleNode[Positioner]):
         return make_estimator(settings.estimator, self.scenario, codebook, **options)
 
     def execute(self, action: Action) -> None:
-        """Build an estimator in the background.
+        """Build an estimator in the background, or publish the odometry of a track.
 
         Raises
         ------
         TypeError
-            If the action is not a `BuildEstimator`.
+            If the action is another one.
         """
+        if isinstance(action, PublishTrack):
+            self._publish_track(action)
+            return
         if not isinstance(action, BuildEstimator):
             super().execute(action)
             return
@@ -124,6 +130,14 @@ class PositionerNode(RoleNode[Positioner]):
                 build_estimator, action.codebook,
                 functools.partial(self._make_estimator, action.settings), time.perf_counter),
             self._on_estimator)
+
+    def _publish_track(self, track: PublishTrack) -> None:
+        if self.is_standing_by:
+            return
+        odometry = convert.odometry(
+            track.user, track.estimate, self.get_clock().now().to_msg())
+        for publisher in self._user_odometry.publishers(track.user):
+            publisher.publish(odometry)
 
     def _on_estimator(self, event: EstimatorReady | EstimatorFailed) -> None:
         self.dispatch(event)

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.positioning import Estimator
+from rhs_isac_ros.positioning import Estimator, TrackEstimate
 from rhs_isac_ros.protocol.messages import Message
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
@@ -121,4 +121,12 @@ class RevertSettings:
     settings: Any
 
 
-Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings
+@dataclasses.dataclass(frozen=True, eq=False)
+class PublishTrack:
+    """Publish the estimated position and velocity of a user that is tracked."""
+
+    user: int
+    estimate: TrackEstimate
+
+
+Action = Send | LogMessage | Reply | BuildEstimator | RevertSettings | PublishTrack

@@ -9,7 +9,13 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.positioning import Estimate, Estimator, SignalError, surface_of
+from rhs_isac_ros.positioning import (
+    Estimate,
+    Estimator,
+    SignalError,
+    TrackEstimate,
+    surface_of,
+)
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import (
@@ -20,6 +26,7 @@ from rhs_isac_ros.protocol.events import (
     EstimatorReady,
     Event,
     LogMessage,
+    PublishTrack,
     RevertSettings,
     Send,
     SettingsOffered,
@@ -28,7 +35,8 @@ from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.residual_watch import ResidualWatch
 from rhs_isac_ros.protocol.role import PlainRole
-from rhs_isac_ros.protocol.settings import PositionerSettings
+from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
+from rhs_isac_ros.protocol.tracks import Tracks
 
 # Maximum number of users without a fix to keep track of.
 _MAX_USERS = 1024
@@ -62,6 +70,9 @@ class Positioner(PlainRole):
     with other settings, it remains in use until the new one is ready, or permanently if the new
     one cannot be built.
 
+    With the prior ``track``, the positioner keeps the tracks of the users; they do not survive a
+    restart.
+
     Parameters
     ----------
     stopwatch
@@ -86,7 +97,9 @@ class Positioner(PlainRole):
         # The estimator that is being built, and the latest one requested since.
         self._building: _Job | None = None
         self._next: _Job | None = None
-        self._waiting: m.ReceivedSignals | None = None
+        # Signals that wait for it, and the time of their arrival [s].
+        self._waiting: tuple[m.ReceivedSignals, float] | None = None
+        self._tracks = Tracks()
         # Users whose last signals yielded no position; only the first of consecutive failures is
         # logged. Bounded, because signals may name any user.
         self._without_fix: collections.OrderedDict[int, None] = collections.OrderedDict()
@@ -108,7 +121,7 @@ class Positioner(PlainRole):
             case EstimatorFailed(codebook, reason):
                 return [*self._revert(self._job_of(codebook), reason), *self._continue()]
             case m.ReceivedSignals():
-                return self._receive(event)
+                return self._receive(event, now_s)
         return []
 
     def status(self) -> Mapping[str, str]:
@@ -171,28 +184,27 @@ class Positioner(PlainRole):
         waiting, job = self._waiting, self._next
         self._building = self._next = self._waiting = None
         actions = self._request(job) if job else []
-        return actions + (self._receive(waiting) if waiting else [])
+        return actions + (self._receive(*waiting) if waiting else [])
 
-    def _receive(self, received: m.ReceivedSignals) -> list[Action]:
+    def _receive(self, received: m.ReceivedSignals, now_s: float) -> list[Action]:
         if self._answered and m.same(self._answered[0], received):
             self.count(Outcome.DUPLICATE)
             return self._answered[1]
         if received.codebook_id in self._estimators:
-            self._answered = received, self._locate(received)
+            self._answered = received, self._locate(received, now_s)
             return self._answered[1]
         expected = {job.codebook.id for job in (self._building, self._next) if job}
         if received.codebook_id in expected:
-            self._waiting = received
+            self._waiting = received, now_s
         else:
             self.count(Outcome.WRONG_CODEBOOK)
         return []
 
-    def _locate(self, received: m.ReceivedSignals) -> list[Action]:
-        _, model, estimator = self._estimators.take(received.codebook_id)
+    def _locate(self, received: m.ReceivedSignals, now_s: float) -> list[Action]:
+        job, model, estimator = self._estimators.take(received.codebook_id)
         begin = self._stopwatch()
-        signals = received.signals.reshape(len(received.signals), -1)
         try:
-            estimate = estimator.estimate(signals)
+            estimate = self._estimate(received, estimator, job.settings, now_s)
         except SignalError as error:
             return self._no_fix(received, str(error))
         latency_s = self._stopwatch() - begin
@@ -205,16 +217,26 @@ class Positioner(PlainRole):
              latency_s: float) -> list[Action]:
         _, model, estimator = self._estimators.take(received.codebook_id)
         bound = float(crlb_of(model, estimate.mean[None])[0])
-        sent = Send(m.PositionEstimate(
+        actions: list[Action] = [Send(m.PositionEstimate(
             cycle_id=received.cycle_id, user=received.user,
             user_instance=received.user_instance, codebook_id=received.codebook_id,
             position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
-            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))
-        if received.user not in self._without_fix:
-            return [sent]
-        del self._without_fix[received.user]
-        return [sent, LogMessage(
-            f'cycle {received.cycle_id}: user {received.user} has a position again')]
+            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))]
+        if isinstance(estimate, TrackEstimate):
+            actions.append(PublishTrack(received.user, estimate))
+        if received.user in self._without_fix:
+            del self._without_fix[received.user]
+            actions.append(LogMessage(
+                f'cycle {received.cycle_id}: user {received.user} has a position again'))
+        return actions
+
+    def _estimate(
+            self, received: m.ReceivedSignals, estimator: Estimator, settings: PositionerSettings,
+            now_s: float) -> Estimate:
+        if settings.prior == TRACK:
+            return self._tracks.locate(received, estimator, settings.track_speed_mps, now_s)
+        self._tracks.clear()
+        return estimator.estimate(received.signals.reshape(len(received.signals), -1))
 
     def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
         self.count(Outcome.NO_FIX)

@@ -8,9 +8,12 @@ import dataclasses
 from typing import Any
 
 from rhs_isac_ros.model import plugins
-from rhs_isac_ros.positioning import ESTIMATORS
+from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
 from rhs_isac_ros.protocol.ack_filter import parse_users
 from rhs_isac_ros.protocol.user_scheduler import POLICIES
+
+# Priors of the position.
+REGION, TRACK = PRIORS = ('region', 'track')
 
 
 def setting(
@@ -83,7 +86,13 @@ def _calibration_file() -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
-    """Settings of the positioner."""
+    """Settings of the positioner.
+
+    Raises
+    ------
+    ValueError
+        If the estimator cannot use the prior.
+    """
 
     estimator: str = setting(
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)
@@ -92,6 +101,18 @@ class PositionerSettings:
         True, 'Whether users who are almost certainly outside of the region get no fix; only '
         'bayes and ml.')
     calibration_file: str = _calibration_file()
+    prior: str = setting(
+        'region', 'Prior of the position: uniform in the region of interest, or the track of the '
+        'user from earlier cycles, with the estimator bayes.', choices=PRIORS)
+    track_speed_mps: float = setting(
+        1.0, 'Typical speed of the users, for the prior track.', unit='m/s', low=0.01, high=1e3)
+
+    def __post_init__(self) -> None:
+        """Check the constraints that types and ranges cannot express."""
+        if self.prior == TRACK and self.estimator != BayesEstimator.name:
+            raise ValueError(
+                f"prior: '{TRACK}', expected '{REGION}' with the estimator {self.estimator}; "
+                f'tracks need {BayesEstimator.name}')
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,16 +14,21 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
+from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.positioning import TrackEstimate
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
-from rhs_isac_ros.ros.topics import MAP_FRAME, NAMES
+from rhs_isac_ros.ros.topics import MAP_FRAME, NAMES, USER_FRAME
 
 _Codec = Callable[[Any], Any]
+
+# Variance of an unknown angular velocity [rad^2/s^2], the value that ROS drivers use.
+_UNKNOWN_ROTATION_VARIANCE = 1e6
 
 
 def ros_type(kind: type[Message]) -> Any:
@@ -165,10 +170,31 @@ def pose(estimate: PositionEstimate, stamp: Time) -> PoseWithCovarianceStamped:
     """
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=MAP_FRAME))
     result.pose.pose.position = _encode_vector(Point, estimate.position)
-    covariance = np.diag([0.0] * 3 + [math.pi**2 / 3] * 3)
-    covariance[:3, :3] = estimate.covariance_m2
-    result.pose.covariance = covariance.ravel()
+    result.pose.covariance = _with_rotation(estimate.covariance_m2, math.pi**2 / 3)
     return result
+
+
+def odometry(user: int, estimate: TrackEstimate, stamp: Time) -> Odometry:
+    """Return position and velocity of a track; orientation and angular velocity are unknown.
+
+    The axes of the child frame, in which the velocity is given, are those of the map.
+    """
+    result = Odometry(header=Header(stamp=stamp, frame_id=MAP_FRAME),
+                      child_frame_id=USER_FRAME.format(user=user))
+    result.pose.pose.position = _encode_vector(Point, estimate.mean)
+    result.pose.covariance = _with_rotation(estimate.covariance, math.pi**2 / 3)
+    result.twist.twist.linear = _encode_vector(Vector3, estimate.velocity)
+    result.twist.covariance = _with_rotation(
+        estimate.velocity_covariance, _UNKNOWN_ROTATION_VARIANCE)
+    return result
+
+
+def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
+    """Return the 36 elements of a covariance with independent rotations of a variance."""
+    both = variance * np.eye(6)
+    both[:3, :3] = covariance
+    elements: np.ndarray = both.ravel()
+    return elements
 
 
 def _encode_real(values: np.ndarray) -> ros.RealArray:

@@ -84,6 +84,8 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         _POSITIONER['model_file'],
         _POSITIONER['reject_outside'],
         _POSITIONER['calibration_file'],
+        _POSITIONER['prior'],
+        _POSITIONER['track_speed_mps'],
     ),
     'transmission': (_SCENARIO, *_declared_by(TransmissionSettings).values()),
     'optimizer': (

@@ -147,6 +147,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         return dataclasses.replace(
             report, fault=True, summary='; '.join(conflicts), values=values)
 
+    @property
+    def is_standing_by(self) -> bool:
+        """Whether a newer node has the role."""
+        return self._stands_by
+
     def stand_by(self) -> None:
         """Handle that a newer node has the role; nodes with more than a role override this."""
 

@@ -30,8 +30,9 @@ DIAGNOSTICS = 'diagnostics'
 MARKERS = 'markers'
 PRESENCE = 'presence'
 
-# Pose, estimated path and true path of a user.
+# Pose, odometry, estimated path and true path of a user.
 POSE = 'users/user_{user}/pose'
+ODOMETRY = 'users/user_{user}/odometry'
 PATH = 'users/user_{user}/path'
 TRUE_PATH = 'users/user_{user}/true_path'
 

@@ -21,13 +21,16 @@ from rhs_isac_ros.model.arguments import ArgumentParser, input_file, positive_fl
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
+    BayesEstimator,
     Estimator,
     ModelError,
+    Motion,
     file_options,
     make_estimator,
 )
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.tracks import Tracks
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
@@ -114,6 +117,26 @@ def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator
     return np.array(errors)
 
 
+def tracked_errors_m(
+        cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
+        speed_mps: float = Motion.speed_mps) -> np.ndarray:
+    """Track the users over the cycles, and return the errors; see `errors_m`.
+
+    Parameters
+    ----------
+    speed_mps
+        Typical speed of the users [m/s].
+    """
+    tracks, errors = Tracks(), []
+    for cycle in cycles:
+        estimate = tracks.locate(
+            cycle.signals, estimators[cycle.signals.codebook_id], speed_mps,
+            cycle.phase_s.get(m.Phase.ESTIMATING, cycle.ended_s))
+        errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
+                      if estimate.fix else np.nan)
+    return np.array(errors)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the recorded position errors and those of estimators applied to the same signals.
 
@@ -131,15 +154,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
     options = parse(parser, arguments)
-    if options.publish and (options.estimator or options.model or options.calibration):
-        parser.error('argument --publish: not allowed with --estimator, --model or '
-                     '--calibration, because running nodes estimate')
+    if options.publish and (
+            options.estimator or options.model or options.calibration or options.track):
+        parser.error('argument --publish: not allowed with --estimator, --model, --calibration or '
+                     '--track, because running nodes estimate')
     if options.calibration and 'neural' in (options.estimator or ()):
         parser.error('argument --calibration: not allowed with --estimator neural, whose model '
                      'is trained for an ideal surface')
     if not options.publish and (options.topic, options.rate, options.timeout) != (
             None, _RATE, _TIMEOUT_S):
         parser.error('arguments --topic, --rate and --timeout: expected together with --publish')
+    if options.track and BayesEstimator.name not in (options.estimator or ['bayes']):
+        parser.error('argument --track: expected together with --estimator bayes')
     if options.model and 'neural' not in (options.estimator or ()):
         parser.error('argument --model: expected together with --estimator neural')
     try:
@@ -174,6 +200,9 @@ def _compare(options: argparse.Namespace) -> None:
             **file_options(name, default_folder(), options.model or ''), **known)
             for codebook_id, codebook in codebooks.items()}
         print(_row(name, errors_m(recording.cycles, estimators)))
+        if options.track and name == BayesEstimator.name:
+            print(_row('track', tracked_errors_m(
+                recording.cycles, estimators, options.track_speed)))
 
 
 def _row(name: str, errors: np.ndarray) -> str:
@@ -212,6 +241,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--estimator', action='append',
                         choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
                         help='may be repeated (default: bayes)')
+    parser.add_argument('--track', action='store_true',
+                        help='also track the users with the estimator bayes')
+    parser.add_argument('--track-speed', type=positive_float, default=Motion.speed_mps,
+                        metavar='MPS', help='typical speed of the users (default: 1 m/s)')
     parser.add_argument('--codebook', type=input_file, metavar='FILE',
                         help='codebook to assume; by default the recorded one')
     parser.add_argument('--config', type=input_file, metavar='FILE',

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
@@ -108,6 +109,7 @@ def test_changes_of_policy_and_noise_are_reported(running):
     ('bs', {'rest_s': 1}, 'rest_s: 1, expected a number with a decimal point, 0 to 3600 s'),
     ('bs', {'allowed_users': 'all'}, "allowed_users: 'all', expected numbers"),
     ('positioner', {'estimator': 'neural'}, "model_file: '', expected a trained model"),
+    ('positioner', {'estimator': 'ml', 'prior': 'track'}, "prior: 'track', expected 'region'"),
     ('transmission', {'band': 7}, 'band: 7, expected 0 to 1 of the scenario'),
     ('channel', {'loss_probability': 1.5}, 'loss_probability: 1.5, expected a number'),
     ('user_1', {'speed_mps': 2.0}, 'Trying to set a read-only parameter: speed_mps'),
@@ -130,6 +132,28 @@ def test_the_estimator_changes_without_the_loss_of_a_cycle(running):
     # One change to the other estimator and one back.
     order = [names[cycle_id] for cycle_id in sorted(names)]
     assert sum(a != b for a, b in zip(order, order[1:], strict=False)) == 2
+    assert len(watch.given_up) == before
+
+
+def test_users_are_tracked_on_request(running):
+    """Odometry of both users has the positions of their estimates; it ends with the prior."""
+    watch, before, tracks = running.watch, len(running.watch.given_up), []
+    for user in (1, 2):
+        watch.node.create_subscription(
+            Odometry, topics.ODOMETRY.format(user=user), tracks.append, qos.EXCHANGE)
+    assert running.set('positioner', prior='track').successful
+    running.until_reported('positioner', parameter__prior='track', pending__prior=None)
+
+    def published():
+        return {track.child_frame_id: track for track in tracks}
+    watch.until(lambda: set(published()) == {'user_1', 'user_2'}, 'odometry', [running.process])
+    place = published()['user_1'].pose.pose.position
+    watch.until(lambda: any(
+        tuple(estimate.position) == (place.x, place.y, place.z)
+        for estimate in watch.received[m.PositionEstimate] if estimate.user == 1),
+        'the estimate', [running.process])
+    assert running.set('positioner', prior='region').successful
+    running.until_reported('positioner', parameter__prior='region', pending__prior=None)
     assert len(watch.given_up) == before
 
 

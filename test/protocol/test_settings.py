@@ -27,6 +27,7 @@ def test_settings_in_use_and_pending_are_described():
         PositionerSettings('bayes', 'a'), PositionerSettings('neural', 'a'))
     assert described == {'parameter.estimator': 'bayes', 'parameter.model_file': 'a',
                     'parameter.reject_outside': 'true', 'parameter.calibration_file': '',
+                    'parameter.prior': 'region', 'parameter.track_speed_mps': '1.0',
                     'pending.estimator': 'neural'}
 
 
@@ -39,6 +40,14 @@ def test_values_are_written_as_in_ros():
 def test_a_malformed_list_of_users_is_an_error(users):
     with pytest.raises(ValueError, match=f"allowed_users: '{users}', expected numbers"):
         BaseStationSettings(allowed_users=users)
+
+
+@pytest.mark.parametrize('estimator', ['ml', 'neural', 'mine'])
+def test_tracks_need_the_estimator_bayes(estimator):
+    assert PositionerSettings(prior='track').estimator == 'bayes'
+    expected = f"prior: 'track', expected 'region' with the estimator {estimator}; tracks need"
+    with pytest.raises(ValueError, match=expected):
+        PositionerSettings(estimator, prior='track')
 
 
 def test_the_latest_settings_are_pending_until_they_are_applied():

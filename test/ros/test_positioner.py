@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -143,6 +144,41 @@ def test_invalid_signals_are_answered_without_a_fix(bench, node, send, codebooks
     assert [message.cycle_id for message in estimates] == [3]
     assert 'energy' in missed[0].reason
     assert 'residual' in missed[1].reason
+
+
+class TestTrack:
+    """A node whose prior is the track of the user."""
+
+    @pytest.fixture
+    def values(self):
+        return {'prior': 'track'}
+
+    def test_each_user_has_odometry(self, bench, node, send, codebooks):
+        receiver, tracks = bench.add(Node, 'receiver'), []
+        estimates = bench.collect(receiver, m.PositionEstimate)
+        subscription = receiver.create_subscription(
+            Odometry, 'users/user_1/odometry', tracks.append, qos.EXCHANGE)
+        node.dispatch(CodebookOffered(codebooks[0]))
+        # The first estimate creates the topic.
+        send(3)
+        bench.until(subscription.get_publisher_count, 'the topic')
+        send(4)
+        bench.until(lambda: len(estimates) == 2, 'the estimates')
+        last = estimates[-1]
+        bench.until(lambda: tracks and tracks[-1].pose.pose.position.x == last.position[0],
+                    'the odometry')
+        track = tracks[-1]
+        assert (track.header.frame_id, track.child_frame_id) == ('map', 'user_1')
+        covariance = np.reshape(track.pose.covariance, (6, 6))
+        np.testing.assert_array_equal(covariance[:3, :3], last.covariance_m2)
+        velocity = track.twist.twist.linear
+        assert np.linalg.norm([velocity.x, velocity.y, velocity.z]) > 0
+        assert np.linalg.eigvalsh(np.reshape(track.twist.covariance, (6, 6))).min() > 0
+
+    def test_an_estimator_without_modes_is_refused(self, node):
+        result = node.set_parameters_atomically([Parameter('estimator', value='ml')])
+        assert not result.successful
+        assert "prior: 'track', expected 'region'" in result.reason
 
 
 class TestNeural:

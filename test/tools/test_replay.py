@@ -20,7 +20,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import Recorder, read
-from rhs_isac_ros.tools.replay import errors_m, load, main
+from rhs_isac_ros.tools.replay import errors_m, load, main, tracked_errors_m
 
 pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -84,6 +84,29 @@ def test_errors_match_those_of_the_estimator(run):
         fix = estimators[cycle.signals.codebook_id].estimate(cycle.signals.signals.reshape(2, -1))
         expected.append(np.sqrt(np.sum((fix.mean - cycle.truth.position)**2)))
     np.testing.assert_allclose(errors_m(recording.cycles, estimators), expected, rtol=1e-9)
+
+
+def test_users_are_tracked_beside_single_cycles(run, run_script):
+    """The first estimate of each user is that of a single cycle; later ones differ."""
+    recording = load(run.path)
+    estimators = {key: make_estimator('bayes', recording.scenario, codebook)
+                  for key, codebook in recording.codebooks.items()}
+    alone = errors_m(recording.cycles, estimators)
+    tracked = tracked_errors_m(recording.cycles, estimators)
+    users = [cycle.user for cycle in recording.cycles]
+    first = [users.index(user) for user in set(users)]
+    assert len(first) < CYCLES
+    np.testing.assert_array_equal(np.delete(tracked != alone, first), True)
+    np.testing.assert_array_equal(tracked[first], alone[first])
+    found = rows(run_script(f'{SCRIPTS}/replay {run.path} --track'))
+    assert found['track'] == [
+        f'{np.median(tracked):.6f}', 'm', f'{np.sqrt(np.mean(tracked**2)):.6f}', 'm', '0']
+
+
+def test_only_bayes_tracks(run, capsys):
+    with pytest.raises(SystemExit):
+        main([str(run.path), '--estimator', 'ml', '--track'])
+    assert 'argument --track: expected together with' in capsys.readouterr().err
 
 
 def test_an_estimator_of_a_plugin_is_available(run, install, capsys):
