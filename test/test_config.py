@@ -11,7 +11,7 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 
 CONFIG = Path(__file__).parents[1] / 'config'
-SCENARIOS = ('table1', 'quick', 'wideband')
+SCENARIOS = ('table1', 'quick', 'wideband', 'bandplan')
 CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
 FIELDS = {field.name: field.metadata['unit'] for field in dataclasses.fields(Scenario)}
 
@@ -50,6 +50,14 @@ def test_quick_is_smaller_and_wideband_has_four_bands():
                if symbol != 'N_B')
     assert wideband.n_bands == 4
     assert wideband.changes().keys() == {'center_frequencies_hz'}
+
+
+def test_the_band_plan_has_the_spectrum_and_the_pilots_of_table1():
+    plan, table1 = Scenario.from_yaml(CONFIG / 'bandplan.yaml'), Scenario()
+    assert plan.changes().keys() == {'center_frequencies_hz', 'n_frames'}
+    assert plan.n_bands * plan.n_frames == table1.n_bands * table1.n_frames
+    low, high = table1.center_frequencies_hz
+    assert all(low <= frequency <= high for frequency in plan.center_frequencies_hz)
 
 
 @pytest.mark.parametrize('name', sorted(CODEBOOKS))

@@ -1,6 +1,6 @@
 """Averages of losses that depend on a codebook through quadratic forms, with gradients."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -108,11 +108,7 @@ class Average:
 
     def value(self, codebook: Beamforming) -> float:
         """Compute the average without its gradients."""
-        evaluation = self.rows.begin(self._model(codebook))
-        total = 0.0
-        for block in blocks(self.rows.n_items):
-            whitened = self._whitened(evaluation, block)
-            total += float(self._loss(block, _sum_of_forms(whitened))[0].sum())
+        total = sum(float(losses.sum()) for losses, _ in self._losses(codebook))
         return total / self.rows.n_items
 
     def __call__(self, codebook: Beamforming) -> Gradient:
@@ -121,12 +117,12 @@ class Average:
         evaluation = self.rows.begin(model)
         bands = range(self.scenario.n_bands)
         total = 0.0
-        for block in blocks(self.rows.n_items):
+        for block in self._blocks():
             whitened = self._whitened(evaluation, block)
             losses, weights = self._loss(block, _sum_of_forms(whitened))
             total += float(losses.sum())
             for band in bands:
-                weighted = np.matmul(weights, whitened[band].view(float)).view(complex)
+                weighted = _weighted(weights, whitened[band])
                 if self._combination:
                     weighted = self._combination.backward(band, weighted, self._n_rows)
                 evaluation.accumulate(block, band, weighted)
@@ -135,6 +131,15 @@ class Average:
         gradients = quadratic_gradients(
             model, codebook, mean_terms, covariance_terms, self.rows.n_items, self.surface)
         return Gradient(total / self.rows.n_items, *gradients)
+
+    def _losses(self, codebook: Beamforming) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Results of the loss for each block."""
+        evaluation = self.rows.begin(self._model(codebook))
+        for block in self._blocks():
+            yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
+
+    def _blocks(self) -> Iterator[slice]:
+        return blocks(self.rows.n_items, self._n_rows)
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
         exact = self.surface.without_errors() if self.surface else None
@@ -150,5 +155,14 @@ class Average:
 
 def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:
     """Sum of the bands' quadratic forms [n, G, G]."""
-    total: np.ndarray = np.sum([quadratic_form(means) for means in whitened], axis=0)
+    total: np.ndarray = np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
     return total
+
+
+def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
+    """Weights [n, G, G] times rows [n, G, R], in the precision of the rows."""
+    parts = whitened.view(whitened.real.dtype)
+    weights = weights.astype(parts.dtype, copy=False)
+    # Products of single rows take many times as long as one product of arrays.
+    product: np.ndarray = weights * parts if parts.shape[1] == 1 else np.matmul(weights, parts)
+    return product.view(whitened.dtype)

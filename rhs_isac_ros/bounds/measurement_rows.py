@@ -21,7 +21,7 @@ RowSource = Callable[[slice, int], np.ndarray]
 # for 1. Together, the slices cover all rows.
 Pattern = tuple[slice, np.ndarray | None]
 PLAIN: Sequence[Pattern] = ((slice(None), None),)
-# Items per block: the arrays of a block fit into the cache.
+# Items of three rows per block: the arrays of a block fit into the cache.
 _BLOCK = 128
 # Memory for exact rows that are kept between evaluations.
 _CACHE_BYTES = 1 << 30
@@ -138,7 +138,8 @@ class _ExactEvaluation:
         return GradientSums(self._mean_term[band], self._covariance_term[band])
 
 
-def blocks(n_items: int) -> Iterator[slice]:
-    """Split the items, in order, into blocks that fit into the cache."""
-    for start in range(0, n_items, _BLOCK):
-        yield slice(start, min(start + _BLOCK, n_items))
+def blocks(n_items: int, n_rows: int = 3) -> Iterator[slice]:
+    """Split items of `n_rows` rows each, in order, into blocks that fit into the cache."""
+    size = max(3 // n_rows, 1) * _BLOCK
+    for start in range(0, n_items, size):
+        yield slice(start, min(start + size, n_items))

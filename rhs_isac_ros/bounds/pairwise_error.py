@@ -1,10 +1,18 @@
 """Error by confusion of distant positions, which the local Cramer-Rao bound does not include."""
 
+import copy
+
 import numpy as np
 
 from rhs_isac_ros.bounds.average import Average
+from rhs_isac_ros.bounds.compressed_rows import CompressedRows
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.model.surface import Beamforming
+
+# Share of a sample that is drawn uniformly. It bounds the weight of a pair whose cost grows while
+# the codebook changes.
+_UNIFORM_SHARE = 0.05
 
 
 class PairwiseErrorCost(Average):
@@ -49,9 +57,48 @@ class PairwiseErrorCost(Average):
         super().__init__(
             scenario,
             lambda block, band: (
-                los_gain(scenario, first_positions[block], band)
+                _repeated_gain(scenario, first_positions[block], band)
                 - los_gain(scenario, second_positions[block], band))[:, None],
             n, 1, self._confusion, tolerance)
+
+    def sample(
+            self, codebook: Beamforming, n: int, rng: np.random.Generator
+    ) -> 'PairwiseErrorCost':
+        """Draw n of the pairs, with a probability that grows with their cost.
+
+        The cost of the sample is an unbiased estimate for this codebook, and close to the whole
+        cost for similar ones: a few pairs, which are the most similar, contribute most of it. An
+        evaluation is in single precision.
+
+        Raises
+        ------
+        ValueError
+            If n is not from 1 to the number of pairs, or the differences are exact.
+        """
+        total = len(self._costs)
+        if not 1 <= n <= total:
+            raise ValueError(f'n: {n}, expected 1 to {total}, the number of pairs')
+        if not isinstance(self.rows, CompressedRows):
+            raise ValueError('tolerance: 0, expected compressed differences to draw a sample of')
+        costs = self._cost_of_pairs(codebook)
+        shares = np.full(total, 1 / total)
+        if costs.any():
+            shares += (1 - _UNIFORM_SHARE) * (costs / costs.sum() - shares)
+        probabilities = _inclusion_probabilities(shares, n)
+        # Systematic sampling: no pair occurs twice, because no probability exceeds 1.
+        edges = np.cumsum(probabilities)
+        edges *= n / edges[-1]
+        items = np.searchsorted(edges, np.arange(n) + rng.uniform(), side='right')
+        items = np.minimum(items, total - 1)
+        sample = copy.copy(self)
+        sample.rows = self.rows.chosen(items)
+        sample._costs = self._costs[items] / probabilities[items] * (n / total)
+        sample._loss = sample._confusion
+        return sample
+
+    def _cost_of_pairs(self, codebook: Beamforming) -> np.ndarray:
+        """Weighted cost of each pair, float64 [N] [m^2]."""
+        return np.concatenate([losses for losses, _ in self._losses(codebook)])
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cost times Q(sqrt(q / 2)) [n], and minus its derivative d/d(2 q), [n, 1, 1]."""
@@ -62,3 +109,20 @@ class PairwiseErrorCost(Average):
         # The derivative is undefined for equal signals; the limit keeps it finite.
         slope = np.exp(-root**2 / 8) / (4 * np.sqrt(2 * np.pi) * np.maximum(root, 1e-9))
         return costs * ndtr(-root / 2), (costs * slope)[:, None, None]
+
+
+def _repeated_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
+    """Line-of-sight gains [n, N_SB, N_E], computed once for equal positions that are adjacent."""
+    is_new = np.concatenate([[True], np.any(np.diff(positions, axis=0) != 0, axis=1)])
+    gains: np.ndarray = los_gain(scenario, positions[is_new], band)[np.cumsum(is_new) - 1]
+    return gains
+
+
+def _inclusion_probabilities(shares: np.ndarray, n: int) -> np.ndarray:
+    """Probabilities proportional to shares [N], up to 1, whose sum is n."""
+    descending = np.sort(shares)[::-1]
+    rest = np.cumsum(descending[::-1])[::-1]
+    # The first number of certain items with which no other probability exceeds 1.
+    n_certain = np.argmax((n - np.arange(len(shares))) * descending <= rest)
+    probabilities: np.ndarray = np.minimum(shares * ((n - n_certain) / rest[n_certain]), 1.0)
+    return probabilities

@@ -9,8 +9,16 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import yaml
+
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
+from rhs_isac_ros.codebook.band_plan import (
+    DEFAULT_RASTER_HZ,
+    Candidate,
+    choose_bands,
+    with_bands,
+)
 from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.objective import OBJECTIVES
 from rhs_isac_ros.codebook.optimize import (
@@ -30,11 +38,14 @@ from rhs_isac_ros.model.arguments import (
     check_distinct,
     input_file,
     integer,
+    interval,
     output_file,
     picture_file,
+    positive_float,
     positive_int,
     seed,
 )
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import MissingLibraryError
 
 __all__ = ['ERRORS', 'HELD_OUT_POSITIONS', 'INTERRUPTED', 'add_options', 'check', 'run']
@@ -57,9 +68,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--calibration', type=input_file,
         help="calibration file of the surface; the scenario's surface if omitted")
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
-    add('--objective', choices=sorted(OBJECTIVES), default='crlb',
+    add('--objective', choices=sorted(OBJECTIVES),
         help='the average bound; the ambiguity between distant positions, which a local bound '
-             'ignores; or the bound with unknown phases of the bands and the region as prior')
+             'ignores; or the bound with unknown phases of the bands and the region as prior. '
+             'crlb if omitted, or ambiguity with --spectrum')
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
     add('--positions', type=integer(1, _MAX_POSITIONS), default=DEFAULT_POSITIONS,
@@ -75,14 +87,33 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='continue from OUTPUT.part, which an unfinished run leaves, or from OUTPUT')
     add('--plot', type=picture_file,
         help='file for a plot of convergence, bound and beam patterns: PNG, PDF or SVG')
+    add('--spectrum', type=interval, nargs='+', metavar='LOW:HIGH',
+        help='choose the centre frequencies of the bands within these intervals [Hz]')
+    add('--bands', type=positive_int, help='number of bands to choose')
+    add('--raster', type=positive_float, default=DEFAULT_RASTER_HZ,
+        help='spacing of possible centre frequencies [Hz]')
+    add('--min-gap', type=positive_float,
+        help='smallest distance of centre frequencies [Hz]; the width of a band if omitted')
+    add('--plan', type=output_file, default='bandplan.yaml',
+        help='file to write the scenario with the chosen bands to')
     add('--quiet', action='store_true', help='show no progress')
 
 
 def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Exit with a usage error if options contradict each other or a library is missing."""
-    check_distinct(parser, {'--scenario': options.scenario,
-                            '--calibration': options.calibration},
-                   {'--output': options.output, '--plot': options.plot})
+    inputs = {'--scenario': options.scenario, '--calibration': options.calibration}
+    outputs = {'--output': options.output, '--plot': options.plot}
+    if options.spectrum:
+        outputs['--plan'] = Path(options.plan)
+    check_distinct(parser, inputs, outputs)
+    if bool(options.spectrum) != bool(options.bands):
+        parser.error('argument --bands: expected together with --spectrum')
+    if options.spectrum and (options.start or options.resume):
+        parser.error('argument --spectrum: not allowed with --start or --resume; to resume, '
+                     'expected --scenario with the file of --plan')
+    if options.spectrum and options.calibration:
+        parser.error('argument --calibration: not allowed with --spectrum, because a calibration '
+                     'belongs to one scenario')
     if options.resume and options.start:
         parser.error('argument --start: not allowed with --resume, which continues from a file')
     partial = _partial(options.output)
@@ -113,6 +144,9 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     """
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+    if options.spectrum:
+        scenario = _choose_bands(options, scenario)
+    objective = options.objective or ('ambiguity' if options.spectrum else 'crlb')
     calibration = None
     if options.calibration:
         calibration = Calibration.load(options.calibration)
@@ -123,7 +157,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
         check_start(codebook, scenario)
     with _progress_bar(options) as show:
         result = optimize(
-            scenario, method=options.method, objective=options.objective,
+            scenario, method=options.method, objective=objective,
             sampling=options.sampling, n_positions=options.positions, seed=options.seed,
             start=start, resume=resumed, calibration=calibration, max_steps=options.steps,
             max_evaluations=options.evaluations, progress=show,
@@ -141,6 +175,26 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     if options.plot:
         plot_optimization(scenario, codebook, result.history, options.plot)
     return codebook, result.reason
+
+
+def _choose_bands(options: argparse.Namespace, scenario: Scenario) -> Scenario:
+    """Choose the bands, write the scenario with them, and return it."""
+    def report(candidate: Candidate) -> None:
+        print(f'{_in_ghz(candidate)}: {candidate.error_m2:.4f} m^2 expected', file=sys.stderr)
+
+    best, *_ = choose_bands(
+        scenario, options.spectrum, options.bands, raster_hz=options.raster,
+        min_gap_hz=options.min_gap, seed=options.seed, report=None if options.quiet else report)
+    scenario = with_bands(scenario, best.frequencies_hz)
+    changes = yaml.safe_dump(scenario.changes(), sort_keys=False, default_flow_style=None)
+    write_whole(options.plan, f'# Chosen by python -m rhs_isac_ros.codebook --spectrum. Omitted '
+                              f'fields have the values of Table I.\n{changes}')
+    print(f'{options.plan}: {_in_ghz(best)}, {scenario.n_frames} frames each')
+    return scenario
+
+
+def _in_ghz(candidate: Candidate) -> str:
+    return ', '.join(f'{frequency / 1e9:g}' for frequency in candidate.frequencies_hz) + ' GHz'
 
 
 def _partial(output: Path) -> Path:

@@ -27,10 +27,11 @@ def minimize_lbfgs(search: Search) -> str:
 def run_lbfgs(
         objective: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray,
         bounds: Sequence[tuple[float, float] | tuple[None, None]], max_steps: int,
-        on_step: Callable[[], None]) -> OptimizeResult:
+        on_step: Callable[[], None], memory: int = _MEMORY) -> OptimizeResult:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    `on_step` is called after each of at most `max_steps` steps.
+    `on_step` is called after each of at most `max_steps` steps; `memory` is the number of
+    corrections.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
@@ -39,4 +40,4 @@ def run_lbfgs(
         objective, start, jac=True, method='L-BFGS-B', bounds=bounds,
         callback=lambda _: on_step(),
         options={'maxiter': max_steps, 'maxfun': 20 * max_steps,
-                 'maxcor': _MEMORY, 'ftol': 1e-10, 'gtol': 1e-10})
+                 'maxcor': memory, 'ftol': 1e-10, 'gtol': 1e-10})

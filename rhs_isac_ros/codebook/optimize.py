@@ -17,6 +17,7 @@ from rhs_isac_ros.codebook.levels import minimize_levels
 from rhs_isac_ros.codebook.objective import OBJECTIVES
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.codebook.provenance import Provenance
+from rhs_isac_ros.codebook.sampled import FEWEST_PAIRS, minimize_sampled
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.search import BudgetSpent, Progress, Search
 from rhs_isac_ros.codebook.start import STARTS, random_codebook
@@ -168,7 +169,7 @@ def optimize(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
             tuple(search.history), reason)
 
-    minimize = _minimizer(scenario, method)
+    minimize = _minimizer(problem, method)
     search = Search(
         problem, problem.pack(first), max_steps, max_evaluations,
         streams.generator(seed, streams.METHOD),
@@ -186,14 +187,17 @@ def check_start(codebook: Codebook, scenario: Scenario) -> None:
     codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
 
 
-def _minimizer(scenario: Scenario, method: str) -> Callable[[Search], str] | None:
+def _minimizer(problem: Problem, method: str) -> Callable[[Search], str] | None:
     """Return the function of a method, or raise ValueError if it needs continuous amplitudes."""
+    scenario = problem.scenario
     if scenario.amplitude_levels and method == 'lbfgs':
         return minimize_levels
     if scenario.amplitude_levels and method in ('alternating', 'direct'):
         raise ValueError(
             f'method: {method!r} with amplitude_levels = {scenario.amplitude_levels}, expected '
             "'lbfgs' or 'genetic'")
+    if method == 'lbfgs' and problem.n_pairs >= FEWEST_PAIRS:
+        return minimize_sampled
     return METHODS[method].minimize
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from rhs_isac_ros.bounds import PairwiseErrorCost
 from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -42,6 +43,22 @@ class Problem:
         Configurations are rounded to the amplitudes that the elements can take.
         """
         return self._codebook(variables, relaxed=False)
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs of the objective that samples are drawn from; 0 if it has no pairs."""
+        cost = self.objective
+        return cost.rows.n_items if isinstance(cost, PairwiseErrorCost) else 0
+
+    def sample(self, variables: np.ndarray, n_pairs: int, rng: np.random.Generator) -> 'Problem':
+        """Return the problem with a sample of the pairs, see `PairwiseErrorCost.sample`.
+
+        Raise ValueError if the objective has fewer pairs.
+        """
+        cost = self.objective
+        if not isinstance(cost, PairwiseErrorCost):
+            raise ValueError('objective: expected one of pairs to draw a sample of')
+        return Problem(self.scenario, cost.sample(self.unpack(variables), n_pairs, rng))
 
     def value(self, variables: np.ndarray) -> float:
         """Return the objective [m^2] for variables as `pack` returns them."""

@@ -83,6 +83,11 @@ class Search:
         """Number of amplitudes of an element; 0 if they are continuous."""
         return self._problem.scenario.amplitude_levels
 
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs of the objective that samples are drawn from; 0 if it has no pairs."""
+        return self._problem.n_pairs
+
     def begin(self) -> float:
         """Evaluate the start [m^2] and record it as the first entry of the history.
 
@@ -125,6 +130,21 @@ class Search:
         self._count()
         return self._problem.value_and_gradient(variables, relaxed=True)
 
+    def sample(
+            self, variables: np.ndarray, n_pairs: int
+    ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+        """Return an estimate of `value_and_gradient` from a sample of the pairs at a point.
+
+        It counts evaluations as `value_and_gradient` does, and raises BudgetSpent if none would
+        be left for its result. Its points do not become the best one.
+        """
+        problem = self._problem.sample(variables, n_pairs, self.rng)
+
+        def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
+            self._count(reserve=1)
+            return problem.value_and_gradient(point)
+        return evaluate
+
     def on_step(self) -> None:
         """Record a step; methods call this after each of their steps."""
         elapsed = time.perf_counter() - self._begin
@@ -134,8 +154,9 @@ class Search:
         if self._progress:
             self._progress(entry)
 
-    def _count(self) -> None:
-        if self._max_evaluations is not None and self._evaluations >= self._max_evaluations:
+    def _count(self, reserve: int = 0) -> None:
+        if (self._max_evaluations is not None
+                and self._evaluations + reserve >= self._max_evaluations):
             raise BudgetSpent
         self._evaluations += 1
 

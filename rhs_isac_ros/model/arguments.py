@@ -78,6 +78,18 @@ def _number(text: str, valid: Callable[[float], bool], expected: str) -> float:
     return number
 
 
+def interval(text: str) -> tuple[float, float]:
+    """Parse LOW:HIGH, positive numbers in ascending order, or raise ArgumentTypeError."""
+    low, colon, high = text.partition(':')
+    try:
+        numbers = positive_float(low), positive_float(high)
+    except argparse.ArgumentTypeError:
+        numbers = math.inf, 0.0
+    if not colon or numbers[0] > numbers[1]:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected LOW:HIGH with 0 < LOW <= HIGH')
+    return numbers
+
+
 def input_file(text: str) -> Path:
     """Parse the path of an existing file, or raise argparse.ArgumentTypeError."""
     path = Path(text)

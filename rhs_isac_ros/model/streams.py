@@ -3,7 +3,7 @@
 import numpy as np
 
 (CHANNEL, RECEIVER, USER, BASE_STATION, SAMPLES, START, HELD_OUT, SKETCH, PAIRS,
- METHOD, PHASES, TRAINING, AIR, SURFACE, USER_DEVIATION, CYCLE_DEVIATION) = range(16)
+ METHOD, PHASES, TRAINING, AIR, SURFACE, USER_DEVIATION, CYCLE_DEVIATION, PLANS) = range(17)
 
 
 def generator(seed: int, stream: int, *key: int) -> np.random.Generator:

@@ -4,7 +4,8 @@ Problem: minimise the average Cramer-Rao bound over sampled positions. (a) What 
 of the value and its gradient cost, compared with automatic differentiation of the same objective,
 and with the matrix products that are unavoidable? (b) How long does each method take to reach an
 average bound of 0.0415 m^2 on held-out positions? (c) How do time and memory grow with the numbers
-of positions, elements and bands?
+of positions, elements and bands? (d) How much faster is the objective ambiguity on samples of its
+pairs than with all pairs in each step?
 """
 
 import argparse
@@ -17,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from parts.ambiguity_speed import ambiguity_speed
 from parts.optimizer_growth import GROWTH, POSITIONS, growth, side_by_side
 from peers.jax_crlb import JaxAverageCrlb
 from scipy.optimize import minimize
@@ -55,7 +57,7 @@ def main() -> None:
                         help='number of cores and threads')
     parser.add_argument('--limit', type=positive_float, default=120.0,
                         help='time limit per method in (b) [s]')
-    parser.add_argument('--parts', type=parts, default='abc', help='parts to run')
+    parser.add_argument('--parts', type=parts, default='abcd', help='parts to run')
     parser.add_argument('--json', type=output_file, help='JSON file for the results')
     parser.add_argument('--picture', type=picture_file, help='file for the picture')
     options = parser.parse_args()
@@ -65,7 +67,9 @@ def main() -> None:
         print('JAX is not installed, so its figures are omitted; to install it: '
               'python -m pip install --no-deps -r requirements-peers.txt\n', file=sys.stderr)
     figures: dict = {'threads': options.threads}
-    for part, measure in (('a', gradient), ('b', lambda: target(options.limit)), ('c', growth)):
+    for part, measure in (
+            ('a', gradient), ('b', lambda: target(options.limit)), ('c', growth),
+            ('d', ambiguity_speed)):
         if part in options.parts:
             figures |= measure()
     if options.json:
@@ -76,8 +80,8 @@ def main() -> None:
 
 def parts(text: str) -> str:
     """Parse the letters of the parts, for argparse."""
-    if not text or set(text) - set('abc'):
-        raise argparse.ArgumentTypeError(f'{text!r}, expected letters of abc')
+    if not text or set(text) - set('abcd'):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected letters of abcd')
     return text
 
 

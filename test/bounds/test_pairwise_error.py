@@ -151,7 +151,7 @@ def test_gradients_are_the_limit_of_differences_of_the_value(
 @pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
 def test_pairs_are_weighted_in_all_blocks(
         scenario, codebook, pairs, plain_of, monkeypatch, tolerance):
-    monkeypatch.setattr(measurement_rows, '_BLOCK', 4)
+    monkeypatch.setattr(measurement_rows, '_BLOCK', 1)
     weights = np.random.default_rng(3).uniform(0, 2, N_PAIRS)
     weights[5] = 0
     expected = np.mean(weights * plain_of(codebook.analog, codebook.digital, *pairs))
@@ -248,3 +248,60 @@ def test_positions_that_are_not_pairs_are_errors(scenario, n_first, n_second):
 def test_a_tolerance_out_of_range_is_an_error(scenario, pairs, tolerance):
     with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
         PairwiseErrorCost(scenario, *pairs, tolerance=tolerance)
+
+
+@pytest.fixture(scope='module')
+def many(scenario):
+    """The cost of 400 pairs."""
+    positions = scenario.sample_positions(800, np.random.default_rng(2)).reshape(2, -1, 3)
+    return PairwiseErrorCost(scenario, *positions, tolerance=1e-6)
+
+
+def test_a_sample_of_all_pairs_has_the_cost_and_the_gradients_of_all_pairs(many, codebook):
+    sample = many.sample(codebook, 400, np.random.default_rng(0))
+    assert_near(sample(codebook), many(codebook), 1e-5)
+
+
+def test_the_mean_over_samples_is_the_cost_of_all_pairs(many, codebook, random_beams, scenario):
+    """Also for another codebook than that of the samples, whose costs scatter more."""
+    other = random_beams(scenario, np.random.default_rng(5))
+    rng = np.random.default_rng(1)
+    samples = [many.sample(codebook, 40, rng) for _ in range(300)]
+    for beams, spread in ((codebook, 0.03), (other, 2.0)):
+        values = np.array([sample.value(beams) for sample in samples])
+        assert values.std() < spread * values.mean()
+        assert values.mean() == pytest.approx(
+            many.value(beams), abs=4 * values.std() / np.sqrt(len(values)))
+
+
+def test_a_sample_is_closer_to_the_cost_than_a_uniform_choice(many, codebook, scenario):
+    rng = np.random.default_rng(1)
+    costs = many._cost_of_pairs(codebook)
+    uniform = [rng.choice(costs, 40, replace=False).mean() for _ in range(200)]
+    sampled = [many.sample(codebook, 40, rng).value(codebook) for _ in range(200)]
+    assert np.std(sampled) < 0.1 * np.std(uniform)
+
+
+@pytest.mark.parametrize('n', [1, 17, 399])
+def test_a_sample_holds_each_pair_at_most_once(many, codebook, n):
+    sample = many.sample(codebook, n, np.random.default_rng(n))
+    assert sample.rows.n_items == n
+    rows = sample.rows.coefficients[0]
+    assert len(np.unique(rows, axis=0)) == n
+    assert rows.dtype == np.complex64
+
+
+def test_a_sample_of_pairs_that_cost_nothing_is_uniform(codebook, pairs, scenario):
+    same = PairwiseErrorCost(scenario, pairs[0], pairs[0], tolerance=1e-6)
+    assert same.sample(codebook, 4, np.random.default_rng(0)).value(codebook) == 0
+
+
+@pytest.mark.parametrize('n', [0, 401])
+def test_a_sample_of_another_number_of_pairs_is_an_error(many, codebook, n):
+    with pytest.raises(ValueError, match=f'^n: {n}, expected 1 to 400, '):
+        many.sample(codebook, n, np.random.default_rng(0))
+
+
+def test_exact_differences_are_not_sampled(scenario, codebook, pairs):
+    with pytest.raises(ValueError, match='^tolerance: 0, expected compressed differences'):
+        PairwiseErrorCost(scenario, *pairs).sample(codebook, 2, np.random.default_rng(0))

@@ -13,7 +13,7 @@ import yaml
 
 from rhs_isac_ros.bounds import crlb, crlb_of
 from rhs_isac_ros.calibration import Pilots, calibrate, prior_of
-from rhs_isac_ros.codebook import Codebook, Provenance, command, directional_codebook
+from rhs_isac_ros.codebook import Codebook, Provenance, band_plan, command, directional_codebook
 from rhs_isac_ros.codebook.__main__ import main
 from rhs_isac_ros.codebook.optimize import INTERRUPTED, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
@@ -163,6 +163,33 @@ def test_invalid_arguments_leave_the_last_output(call, files, capsys, arguments,
     good = (files / 'codebook.yaml').read_bytes()
     fails_with(call, capsys, words, *arguments)
     assert (files / 'codebook.yaml').read_bytes() == good
+
+
+def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, monkeypatch):
+    monkeypatch.setattr(band_plan, '_SHORT_STEPS', 2)
+    monkeypatch.setattr(band_plan, '_SHORT_POSITIONS', 4)
+    plan = files / 'plan.yaml'
+    assert call('--spectrum', '2.5e9:2.52e9', '3e9:3e9', '--bands', 2, '--raster', 5e6,
+                '--steps', 3, '--plan', plan) == 0
+    chosen, codebook = Scenario.from_yaml(plan), Codebook.load(files / 'codebook.yaml')
+    assert (chosen.n_bands, chosen.n_frames) == (2, scenario.n_bands * scenario.n_frames // 2)
+    allowed = [2.5e9, 2.505e9, 2.51e9, 2.515e9, 2.52e9, 3e9]
+    assert np.isin(chosen.center_frequencies_hz, allowed).all()
+    codebook.check(chosen)
+    assert Provenance.parse(codebook.provenance).objective == 'ambiguity'
+    assert f'{plan}: ' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--spectrum', '2.5e9:3e9'], ['--bands: expected together with --spectrum']),
+    (['--bands', '2'], ['--bands: expected together with --spectrum']),
+    (['--spectrum', '3e9:2e9', '--bands', '2'], ["--spectrum: '3e9:2e9', expected LOW:HIGH"]),
+    (['--spectrum', '3e9', '--bands', '2'], ["--spectrum: '3e9', expected LOW:HIGH"]),
+    (['--spectrum', '2e9:3e9', '--bands', '2', '--start', 'random'], ['not allowed with']),
+    (['--spectrum', '2e9:3e9', '--bands', '3'], ['bands: 3, expected a divisor of 2'])])
+def test_invalid_band_plans_are_errors(call, files, capsys, arguments, words):
+    fails_with(call, capsys, words, '--plan', files / 'plan.yaml', *arguments)
+    assert not (files / 'plan.yaml').exists()
 
 
 @pytest.mark.parametrize('option', ['--method', '--objective', '--sampling'])
@@ -315,4 +342,4 @@ def test_options_can_be_added_to_another_parser():
     parser = argparse.ArgumentParser()
     command.add_options(parser)
     options = parser.parse_args([])
-    assert (options.method, options.objective, options.seed) == ('lbfgs', 'crlb', 0)
+    assert (options.method, options.objective, options.seed) == ('lbfgs', None, 0)

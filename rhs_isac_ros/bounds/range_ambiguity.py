@@ -1,0 +1,150 @@
+"""Confusion of ranges whose signals have similar phases in all bands.
+
+The phases of carriers f_i at ranges that differ by a lag r differ by 2 pi f_i r / v_0. The range
+ambiguity function is the mismatch sum_i w_i (1 - cos(2 pi f_i r / v_0)); its minima are the lags
+that are hard to distinguish from 0. It depends on the frequencies alone, and so compares many band
+plans in little time.
+"""
+
+import numpy as np
+
+from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
+
+# Grid points of the lag per shortest wavelength.
+_LAGS_PER_WAVELENGTH = 24
+# Draws of the noise at each position.
+_DRAWS = 16
+# Band plans evaluated at a time.
+_BLOCK = 128
+
+
+def range_confusion_error(
+        frequencies_hz: np.ndarray, energies: np.ndarray, max_lag_m: float) -> np.ndarray:
+    """Estimate the squared error by confusion of ranges for many band plans, float64 [P] [m^2].
+
+    Each minimum r of the mismatch has the weight w = (1 - r / r_max) Q(sqrt(q / 2)), with
+    q = 2 E sum_i (1 - cos(2 pi f_i r / v_0)) / N_B and the share 1 - r / r_max of the positions
+    from which a lag stays inside the region. The estimate is sum w r^2 / (1/2 + sum w), averaged
+    over energies E: the mean of r^2 over the confused ranges and the true one.
+
+    Parameters
+    ----------
+    frequencies_hz
+        Centre frequencies of each plan, float64 [P, N_B] [Hz].
+    energies
+        Energies of the whitened mean signals of all bands at some positions, float64 [N].
+    max_lag_m
+        Longest lag r_max [m].
+    """
+    # A slow import, which loading a codebook does not need.
+    from scipy.special import ndtr
+
+    n_bands = frequencies_hz.shape[1]
+    errors = np.zeros(len(frequencies_hz))
+    lags = _lags(float(frequencies_hz.max()), max_lag_m)
+    # The cosines of each frequency are computed once.
+    distinct, index = np.unique(frequencies_hz, return_inverse=True)
+    cosines = np.cos(2 * np.pi / SPEED_OF_LIGHT_MPS * np.outer(distinct, lags))
+    index = index.reshape(frequencies_hz.shape)
+    for start in range(0, len(errors), _BLOCK):
+        mismatch = n_bands - sum(cosines[index[start:start + _BLOCK, i]] for i in range(n_bands))
+        plan, lag = np.nonzero(_is_minimum(mismatch))
+        ratio = np.sqrt(_refined(mismatch, plan, lag) / n_bands)
+        share = 1 - lags[lag] / max_lag_m
+        for energy in energies:
+            # Twice the share, for both signs.
+            weights = 2 * share * ndtr(-ratio * np.sqrt(energy))
+            total, confused = (np.bincount(plan, values, minlength=len(mismatch))
+                               for values in (weights, weights * lags[lag]**2))
+            errors[start:start + _BLOCK] += confused / (0.5 + total) / len(energies)
+    return errors
+
+
+def range_confusion_error_of(
+        model: MeasurementModel, positions: np.ndarray, rng: np.random.Generator) -> float:
+    """Estimate the squared error by confusion of ranges with a codebook [m^2].
+
+    The error is that of the posterior mean, if the user is at a position or at one of those that
+    can be confused with it: the lags are the minima of the mismatch along the line of sight. The
+    differences of the signals are those that remain after a small displacement of the confused
+    position, to first order. Noise is drawn several times for each position.
+
+    Parameters
+    ----------
+    positions
+        Positions of the user, float64 [N, 3] [m], to average over.
+
+    Raises
+    ------
+    ValueError
+        If the positions are not a finite [N, 3] array.
+    """
+    positions = checked_positions(positions)
+    scenario = model.scenario
+    low, high = scenario.roi_bounds_m
+    frequencies = np.array(scenario.center_frequencies_hz)
+    lags = _lags(float(frequencies.max()), float(np.linalg.norm(high - low)))
+    mismatch = np.sum(
+        1 - np.cos(2 * np.pi / SPEED_OF_LIGHT_MPS * np.outer(frequencies, lags)), axis=0)
+    lags = lags[_is_minimum(mismatch[None])[0]]
+    lags = np.concatenate([-lags, lags])
+    means = model.mean(positions)
+    error = 0.0
+    for position, mean in zip(positions, means, strict=True):
+        confused = position * (1 + lags[:, None] / np.linalg.norm(position))
+        inside = ((confused >= low) & (confused <= high)).all(axis=1)
+        if not inside.any():
+            continue
+        difference = _differences(model, mean, confused[inside])
+        # The real and imaginary parts of the noise have variance 1/2 each.
+        noise = rng.normal(scale=np.sqrt(0.5), size=(_DRAWS, difference.shape[1]))
+        exponents = 2 * noise @ difference.T - np.sum(difference**2, axis=1)
+        # The true position has the exponent 0.
+        largest = exponents.max(axis=1, initial=0.0)[:, None]
+        weights = np.exp(exponents - largest)
+        total = np.exp(-largest[:, 0]) + weights.sum(axis=1)
+        error += float(np.mean((weights @ lags[inside] / total)**2))
+    return error / len(positions)
+
+
+def _differences(
+        model: MeasurementModel, mean: np.ndarray, confused: np.ndarray) -> np.ndarray:
+    """Whitened differences from a mean that no small displacement explains, float64 [n, R]."""
+    means, jacobians = model.mean_and_jacobian(confused)
+    difference = _real(model.whiten(means - mean))
+    slopes = _real(model.whiten(jacobians))
+    by_position = np.einsum('nur,nr->nu', slopes, difference)
+    information = np.einsum('nur,nvr->nuv', slopes, slopes)
+    displacement = np.linalg.solve(information, by_position[..., None])[..., 0]
+    remaining: np.ndarray = difference - np.einsum('nu,nur->nr', displacement, slopes)
+    return remaining
+
+
+def _lags(highest_hz: float, max_lag_m: float) -> np.ndarray:
+    """Lags from 0 to the longest [m]."""
+    shortest = SPEED_OF_LIGHT_MPS / highest_hz
+    return np.linspace(0, max_lag_m, 3 + int(max_lag_m / shortest * _LAGS_PER_WAVELENGTH))
+
+
+def _is_minimum(mismatch: np.ndarray) -> np.ndarray:
+    """Local minima of rows, except at their ends, bool [P, L]."""
+    inside = mismatch[:, 1:-1]
+    is_minimum = (inside <= mismatch[:, :-2]) & (inside < mismatch[:, 2:])
+    return np.pad(is_minimum, ((0, 0), (1, 1)))
+
+
+def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndarray:
+    """Minima of the parabolas through minima and their neighbours, at least 0 [n]."""
+    before, at, after = (mismatch[plan, lag + step] for step in (-1, 0, 1))
+    lowest = at - (after - before)**2 / (8 * (before - 2 * at + after))
+    refined: np.ndarray = np.maximum(lowest, 0.0)
+    return refined
+
+
+def _real(signals: np.ndarray) -> np.ndarray:
+    """Complex signals [..., N_B, R] as real vectors [..., 2 N_B R]."""
+    flat = np.ascontiguousarray(signals).reshape(*signals.shape[:-2], -1)
+    parts: np.ndarray = flat.view(float)
+    return parts

@@ -1,0 +1,273 @@
+"""Choice of the centre frequencies together with the codebook.
+
+Frequencies move on a raster. Three stages of growing cost compare band plans: the range ambiguity
+function, in closed form, of all plans or along a coordinate search; short codebook optimisations
+of a few plans that differ; and a full optimisation for the best of these.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from rhs_isac_ros.bounds import crlb_of
+from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error, range_confusion_error_of
+from rhs_isac_ros.codebook.optimize import OptimizeResult, optimize
+from rhs_isac_ros.codebook.start import random_codebook
+from rhs_isac_ros.model import MeasurementModel, Scenario, streams
+
+DEFAULT_RASTER_HZ = 10e6
+# Plans that are all compared; of more, a coordinate search compares some.
+MAX_EXHAUSTIVE = 20_000
+# Starts of the coordinate search.
+_STARTS = 8
+# Energies of a codebook relative to a random one, for each of which the screening proposes plans:
+# with more energy, wider plans are better. Energies from 8 proposed plans with more confusion of
+# directions, which the screening does not see.
+_ENERGY_LEVELS = (2.0, 3.0, 4.0)
+# Plans with a codebook, and the positions and steps of their optimisations.
+_CANDIDATES = 6
+_SHORT_POSITIONS, _SHORT_STEPS = 64, 200
+# Positions at which energies and errors are averaged, and quantiles that represent the energies.
+_POSITIONS, _QUANTILES = 256, 16
+# Candidates differ from each other by this many steps of the raster in some frequency.
+_MIN_DIFFERENCE = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A band plan that was compared with others.
+
+    Attributes
+    ----------
+    frequencies_hz
+        Centre frequencies in ascending order.
+    screening_m2
+        Squared error by confusion of ranges, from the range ambiguity function.
+    error_m2
+        Average bound plus squared error by confusion, with an optimised codebook; NaN before.
+    """
+
+    frequencies_hz: tuple[float, ...]
+    screening_m2: float
+    error_m2: float = math.nan
+
+
+@dataclasses.dataclass(frozen=True)
+class BandPlan:
+    """Result of `optimize_band_plan`: the scenario with its bands, and its codebook.
+
+    `candidates` are the plans that `choose_bands` compared, the best one first.
+    """
+
+    scenario: Scenario
+    result: OptimizeResult
+    candidates: tuple[Candidate, ...]
+
+
+def optimize_band_plan(
+        scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
+        raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
+        max_steps: int | None = None) -> BandPlan:
+    """Choose centre frequencies as `choose_bands` does, and optimise the codebook for them.
+
+    `max_steps` limits the last optimisation, for which `optimize` describes the default.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, or no plan has the gap.
+    """
+    candidates = choose_bands(
+        scenario, spectrum_hz, n_bands, raster_hz=raster_hz, min_gap_hz=min_gap_hz, seed=seed)
+    best = with_bands(scenario, candidates[0].frequencies_hz)
+    result = optimize(best, objective='ambiguity', seed=seed, max_steps=max_steps)
+    return BandPlan(best, result, candidates)
+
+
+def choose_bands(
+        scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
+        raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
+        n_candidates: int = _CANDIDATES,
+        report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
+    """Choose centre frequencies with which users are located accurately.
+
+    Returns the plans for which codebooks were compared, the best one first.
+
+    Parameters
+    ----------
+    spectrum_hz
+        Intervals of centre frequencies [Hz], ends included.
+    raster_hz
+        Spacing of possible centre frequencies, from the low end of each interval [Hz].
+    min_gap_hz
+        Smallest distance of two centre frequencies [Hz]; by default, the width of a band.
+    seed
+        Seed of the samples and of the optimisations.
+    n_candidates
+        Number of plans for which codebooks are compared.
+    report
+        Called with each of these.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, or no plan has the gap.
+    """
+    if n_candidates < 1:
+        raise ValueError(f'n_candidates: {n_candidates}, expected at least 1')
+    if n_bands < 1 or scenario.n_bands * scenario.n_frames % n_bands:
+        raise ValueError(
+            f'bands: {n_bands}, expected a divisor of {scenario.n_bands * scenario.n_frames}, '
+            'the number of frames of all bands')
+    gap_hz = (scenario.n_subbands * scenario.subband_width_hz if min_gap_hz is None
+              else min_gap_hz)
+    frequencies_hz = raster(spectrum_hz, raster_hz)
+    if _first_fit(frequencies_hz, n_bands, gap_hz) is None:
+        raise ValueError(
+            f'bands: {n_bands} with gaps of {gap_hz:g} Hz, expected fewer on the '
+            f'{len(frequencies_hz)} frequencies of the raster')
+    candidates = []
+    for plan, screening in _proposals(
+            scenario, frequencies_hz, n_bands, gap_hz, _MIN_DIFFERENCE * raster_hz,
+            n_candidates, streams.generator(seed, streams.PLANS)):
+        error = _short_error(with_bands(scenario, plan), seed)
+        candidates.append(Candidate(plan, screening, error))
+        if report:
+            report(candidates[-1])
+    return tuple(sorted(candidates, key=lambda candidate: candidate.error_m2))
+
+
+def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:
+    """Return the scenario with other bands and the same number of frames over all bands."""
+    return dataclasses.replace(
+        scenario, center_frequencies_hz=tuple(frequencies_hz),
+        n_frames=scenario.n_bands * scenario.n_frames // len(frequencies_hz))
+
+
+def raster(spectrum_hz: Sequence[tuple[float, float]], raster_hz: float) -> np.ndarray:
+    """Return the possible centre frequencies, ascending, float64 [n] [Hz].
+
+    Raise ValueError if an interval or the raster is invalid.
+    """
+    if not 0 < raster_hz < math.inf:
+        raise ValueError(f'raster: {raster_hz:g} Hz, expected a positive number')
+    if not spectrum_hz:
+        raise ValueError('spectrum: no interval, expected at least one')
+    for low, high in spectrum_hz:
+        if not 0 < low <= high < math.inf:
+            raise ValueError(f'spectrum: {low:g}:{high:g}, expected LOW:HIGH with 0 < LOW <= HIGH')
+    return np.unique(np.concatenate([
+        low + raster_hz * np.arange(math.floor((high - low) / raster_hz * (1 + 1e-9)) + 1)
+        for low, high in spectrum_hz]))
+
+
+def _proposals(
+        scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
+        difference_hz: float, n: int, rng: np.random.Generator
+) -> list[tuple[tuple[float, ...], float]]:
+    """Up to n plans that differ, from the energy levels in turn, with their screening values."""
+    spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
+    energies = _energies(with_bands(scenario, spread.tolist()))
+    low, high = scenario.roi_bounds_m
+    max_lag_m = float(np.linalg.norm(high - low))
+    ranked = []
+    for level in _ENERGY_LEVELS:
+        def errors(plans: np.ndarray, level: float = level) -> np.ndarray:
+            return range_confusion_error(plans, level * energies, max_lag_m)
+        plans, values = screen(frequencies_hz, n_bands, gap_hz, errors, rng)
+        order = np.argsort(values, kind='stable')
+        ranked.append(iter(zip(plans[order], values[order], strict=True)))
+    chosen: list[tuple[tuple[float, ...], float]] = []
+    while ranked and len(chosen) < n:
+        source = ranked.pop(0)
+        for plan, value in source:
+            if all(np.abs(plan - other).max() >= difference_hz for other, _ in chosen):
+                chosen.append((tuple(map(float, plan)), float(value)))
+                ranked.append(source)
+                break
+    return chosen
+
+
+def screen(
+        frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
+        errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator,
+        max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
+    """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
+
+    Up to `max_exhaustive` plans are all evaluated. Of more, the ends of a coordinate search from
+    several starts are returned: it moves one frequency at a time to its best place on the raster.
+    """
+    if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
+        return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)
+    plans = np.array(list(itertools.combinations(frequencies_hz, n_bands)))
+    plans = plans[_has_gap(plans, gap_hz)]
+    return plans, errors(plans)
+
+
+def _coordinate_search(
+        frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
+        errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the searches from several starts, which are random as far as the gap permits."""
+    drawn = np.sort([rng.choice(frequencies_hz, n_bands, replace=False)
+                     for _ in range(_STARTS)], axis=1)
+    first = _first_fit(frequencies_hz, n_bands, gap_hz)
+    starts = [*drawn[_has_gap(drawn, gap_hz)], *([] if first is None else [first])]
+    ends: dict[tuple[float, ...], float] = {}
+    for plan in starts:
+        value = np.inf
+        while True:
+            moves = np.repeat(plan[None], n_bands * len(frequencies_hz), axis=0)
+            moves.reshape(n_bands, -1, n_bands)[
+                np.arange(n_bands), :, np.arange(n_bands)] = frequencies_hz
+            moves = np.unique(np.sort(moves, axis=1), axis=0)
+            moves = moves[_has_gap(moves, gap_hz)]
+            values = errors(moves)
+            if not values.min() < value:
+                break
+            plan, value = moves[values.argmin()], values.min()
+        ends[tuple(plan)] = value
+    return np.array(list(ends)), np.array(list(ends.values()))
+
+
+def _short_error(scenario: Scenario, seed: int) -> float:
+    """Average bound plus squared error by confusion, with a codebook of a short search [m^2]."""
+    codebook = optimize(
+        scenario, objective='ambiguity', seed=seed, n_positions=_SHORT_POSITIONS,
+        max_steps=_SHORT_STEPS).codebook
+    model = MeasurementModel(scenario, codebook)
+    rng = streams.generator(seed, streams.PLANS, 1)
+    positions = scenario.sample_positions(_POSITIONS, rng)
+    return (float(crlb_of(model, positions).mean())
+            + range_confusion_error_of(model, positions, rng))
+
+
+def _energies(scenario: Scenario) -> np.ndarray:
+    """Energies of the whitened mean signals over the region, as quantiles, float64 [n]."""
+    rng = streams.generator(0, streams.PLANS, 2)
+    model = MeasurementModel(scenario, random_codebook(scenario, rng))
+    whitened = model.whiten(model.mean(scenario.sample_positions(_POSITIONS, rng)))
+    energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
+    quantiles: np.ndarray = np.quantile(
+        energies, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
+    return quantiles
+
+
+def _has_gap(plans: np.ndarray, gap_hz: float) -> np.ndarray:
+    """Which ascending plans have a gap between all bands, up to rounding, bool [P]."""
+    enough: np.ndarray = np.all(np.diff(plans, axis=1) >= gap_hz * (1 - 1e-9), axis=1)
+    return enough
+
+
+def _first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.ndarray | None:
+    """Return the plan of the lowest frequencies that have the gap, or None."""
+    plan: list[float] = []
+    for frequency in frequencies_hz:
+        if not plan or frequency - plan[-1] >= gap_hz * (1 - 1e-9):
+            plan.append(float(frequency))
+        if len(plan) == n_bands:
+            return np.array(plan)
+    return None

@@ -1,0 +1,129 @@
+"""Choice of the bands: the raster, the screening, and its comparison with an exhaustive search."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error
+from rhs_isac_ros.codebook import band_plan
+from rhs_isac_ros.codebook.band_plan import (
+    choose_bands,
+    optimize_band_plan,
+    raster,
+    screen,
+    with_bands,
+)
+from rhs_isac_ros.model import Scenario
+
+SPECTRUM = [(2.5e9, 2.7e9)]
+
+
+@pytest.fixture
+def small():
+    """Two bands with four frames each."""
+    return Scenario(n_subbands=2, n_feeds=2, elements_per_side=3, max_power_w=0.02,
+                    roi_center_m=(4, 0, 0), roi_size_m=(4, 4, 2))
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Make the optimisations short."""
+    monkeypatch.setattr(band_plan, '_SHORT_POSITIONS', 4)
+    monkeypatch.setattr(band_plan, '_SHORT_STEPS', 3)
+    monkeypatch.setattr(band_plan, '_POSITIONS', 16)
+
+
+def test_the_raster_begins_at_the_low_end_of_each_interval():
+    np.testing.assert_allclose(
+        raster([(2.5e9, 2.6e9), (1.0e9, 1.0e9), (2.59e9, 2.66e9)], 50e6),
+        [1.0e9, 2.5e9, 2.55e9, 2.59e9, 2.6e9, 2.64e9])
+    # 0.3 / 0.1 is less than 3 in floating-point numbers.
+    assert len(raster([(0.1, 0.4)], 0.1)) == 4
+
+
+@pytest.mark.parametrize(('spectrum', 'spacing', 'message'), [
+    ([], 1e6, '^spectrum: no interval'), ([(2e9, 1e9)], 1e6, '^spectrum: 2e.09:1e.09, '),
+    ([(0.0, 1e9)], 1e6, '^spectrum: '), ([(1e9, np.inf)], 1e6, '^spectrum: '),
+    (SPECTRUM, 0.0, '^raster: 0 Hz'), (SPECTRUM, np.nan, '^raster: nan Hz')])
+def test_invalid_intervals_and_rasters_are_errors(spectrum, spacing, message):
+    with pytest.raises(ValueError, match=message):
+        raster(spectrum, spacing)
+
+
+def errors(plans):
+    return range_confusion_error(plans, np.array([50.0, 200.0]), 12.0)
+
+
+@pytest.mark.parametrize('n_bands', [2, 3, 4])
+@pytest.mark.parametrize('seed', range(2))
+def test_the_coordinate_search_finds_the_best_plan_of_a_small_raster(n_bands, seed):
+    frequencies, gap = raster([(2.5e9, 2.8e9)], 20e6), 20e6
+    every, values = screen(frequencies, n_bands, gap, errors, np.random.default_rng(0))
+    assert len(every) == len(list(itertools.combinations(frequencies, n_bands)))
+    found, found_values = screen(
+        frequencies, n_bands, gap, errors, np.random.default_rng(seed), max_exhaustive=0)
+    assert len(found) < len(every)
+    assert found_values.min() <= 1.05 * values.min()
+    np.testing.assert_allclose(errors(found), found_values, rtol=0.01)
+
+
+@pytest.mark.parametrize('max_exhaustive', [0, 10**6])
+def test_all_plans_keep_the_gap_and_the_raster(max_exhaustive):
+    frequencies, gap = raster([(2.5e9, 2.6e9), (2.8e9, 2.9e9)], 10e6), 40e6
+    plans, _ = screen(
+        frequencies, 3, gap, errors, np.random.default_rng(0), max_exhaustive=max_exhaustive)
+    assert len(plans)
+    assert (np.diff(plans, axis=1) >= gap - 1).all()
+    assert np.isin(plans, frequencies).all()
+
+
+def test_the_number_of_pilots_stays_the_same(small):
+    four = with_bands(small, (1e9, 2e9, 3e9, 4e9))
+    assert (four.n_bands, four.n_frames) == (4, 2)
+    assert dataclasses.replace(
+        four, center_frequencies_hz=small.center_frequencies_hz, n_frames=4) == small
+
+
+def test_the_candidates_are_sorted_and_reported(small, short):
+    reported = []
+    candidates = choose_bands(
+        small, SPECTRUM, 4, raster_hz=10e6, seed=1, n_candidates=3, report=reported.append)
+    assert sorted(reported, key=lambda candidate: candidate.error_m2) == list(candidates)
+    assert len({candidate.frequencies_hz for candidate in candidates}) == 3
+    for one, other in itertools.combinations(candidates, 2):
+        assert np.abs(np.subtract(one.frequencies_hz, other.frequencies_hz)).max() >= 40e6 - 1
+    for candidate in candidates:
+        assert np.isin(candidate.frequencies_hz, raster(SPECTRUM, 10e6)).all()
+        assert (np.diff(candidate.frequencies_hz) >= 2 * 125e3).all()
+        assert candidate.error_m2 > 0
+
+
+def test_a_raster_with_few_plans_has_few_candidates(small, short):
+    (only,) = choose_bands(small, [(2.5e9, 2.5e9), (3e9, 3e9)], 2, raster_hz=10e6)
+    assert only.frequencies_hz == (2.5e9, 3e9)
+
+
+def test_the_result_is_the_best_candidate_with_its_codebook(small, short, monkeypatch):
+    plan = optimize_band_plan(small, SPECTRUM, 2, raster_hz=50e6, seed=1, max_steps=2)
+    assert plan.scenario == with_bands(small, plan.candidates[0].frequencies_hz)
+    plan.result.codebook.check(plan.scenario)
+    assert 'objective=ambiguity' in plan.result.codebook.provenance
+    # Equal seeds give equal results.
+    other = optimize_band_plan(small, SPECTRUM, 2, raster_hz=50e6, seed=1, max_steps=2)
+    assert other.candidates == plan.candidates
+    assert other.result.codebook.id == plan.result.codebook.id
+
+
+@pytest.mark.parametrize(('n_bands', 'options', 'message'), [
+    (3, {}, '^bands: 3, expected a divisor of 8, '),
+    (0, {}, '^bands: 0, '),
+    (8, {'raster_hz': 100e6}, '^bands: 8 with gaps of 250000 Hz, .* 3 frequencies'),
+    (4, {'min_gap_hz': 80e6}, '^bands: 4 with gaps of 8e.07 Hz'),
+    (2, {'n_candidates': 0}, '^n_candidates: 0, ')])
+def test_what_does_not_fit_is_an_error(small, n_bands, options, message):
+    with pytest.raises(ValueError, match=message):
+        choose_bands(small, SPECTRUM, n_bands, **options)
+
+
