@@ -136,6 +136,22 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
             strict=True)]
 
 
+def share_percent(count: int, total: int) -> tuple[float, float, float]:
+    """Return a share with its 95 % interval by Wilson, value, low and high [%].
+
+    Raises
+    ------
+    ValueError
+        If `total` is not positive.
+    """
+    if total < 1:
+        raise ValueError(f'total: {total}, expected at least 1')
+    z2 = float(ndtri(0.975))**2
+    centre = (count + z2 / 2) / (total + z2)
+    half = np.sqrt(z2 * (count * (total - count) / total + z2 / 4)) / (total + z2)
+    return 100 * count / total, 100 * float(centre - half), 100 * float(centre + half)
+
+
 def _mean(results: np.ndarray, members: np.ndarray, cases: np.ndarray) -> np.ndarray:
     """Return the mean for each row of weights of members and cases, float64 [1, rows]."""
     present = np.isfinite(results)

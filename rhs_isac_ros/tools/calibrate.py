@@ -20,7 +20,7 @@ from rhs_isac_ros.calibration import Calibration, SurfacePrior, calibrate, prior
 from rhs_isac_ros.calibration.pilots import Pilots
 from rhs_isac_ros.calibration.report import report
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
@@ -91,9 +91,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.file:
             _read(options, scenario, log)
         elif not _listen(options, scenario, log, arguments):
-            print(f'error: {log.n_pilots} pilots within {options.timeout:g} s, expected '
-                  f'{options.cycles}, in the domain {os.environ.get("ROS_DOMAIN_ID", "0")} and '
-                  'this namespace', file=sys.stderr)
+            print_error(
+                f'{log.n_pilots} pilots within {options.timeout:g} s, expected {options.cycles}, '
+                f'in the domain {os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace',
+                parser.prog)
             return 1
         pilots = _checked(log, options)
         calibration = calibrate(scenario, pilots, _prior(scenario, options))
@@ -102,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f'position error of the pilots {text}: {_error(scenario, pilots, surface)}')
         _write(calibration, options.output)
     except (RecordingError, ScenarioError, CodebookError, ValueError, OSError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print_error(error, parser.prog)
         return 2
     return 0
 

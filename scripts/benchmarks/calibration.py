@@ -3,7 +3,8 @@
 Problem: coefficients of the elements deviate and some elements have failed. A reference user sends
 pilots at known positions, and the calibration estimates the surface from the received
 signals. How large are the errors of fresh users with the calibration, compared with those before
-it, and with exact knowledge of the surface?
+it, and with exact knowledge of the surface? The benchmark `robustness` has the errors with a
+scenario that declares the deviations.
 
 Each surface has its own pilots; all surfaces share the fresh positions. Brackets contain 95 %
 intervals: of a bootstrap over surfaces and positions together for mean squared errors and their
@@ -29,7 +30,7 @@ from scipy.special import chdtri
 from rhs_isac_ros.calibration import Calibration, Pilots, calibrate
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.experiments.resampling import replicate
+from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import (
     MeasurementModel,
     Scenario,
@@ -122,7 +123,7 @@ def measure(declared: Scenario, silent: Scenario, codebook: Codebook,
         received = model.sample(positions, rng)
         undamaged = MeasurementModel(silent, codebook).sample(positions, rng)
         cases: dict[str, tuple[Scenario, Any, np.ndarray]] = {
-            'silent': (silent, None, received), 'declared': (declared, None, received),
+            'silent': (silent, None, received),
             'after': (silent, calibration.surface, received),
             'exact': (silent, surface, received), 'undamaged': (silent, None, undamaged)}
         of_surface.append({
@@ -163,25 +164,17 @@ def interval(results: np.ndarray, baseline: np.ndarray | None = None
     return 1 - value / 100, 1 - high / 100, 1 - low / 100
 
 
-def wilson(count: int, total: int) -> tuple[float, float, float]:
-    """Return a share with its 95 % interval by Wilson [%]."""
-    z = 1.96
-    center = (count + z**2 / 2) / (total + z**2)
-    half = z * np.sqrt(count * (total - count) / total + z**2 / 4) / (total + z**2)
-    return 100 * count / total, 100 * float(center - half), 100 * float(center + half)
-
-
 def report(surface: str, knowledge: str, squares: np.ndarray, covered: np.ndarray,
            exact: np.ndarray) -> dict[str, Any]:
     """Print a row of the table and return it."""
     fixes = np.isfinite(squares)
     row: dict[str, Any] = {
         'surface': surface, 'knowledge': knowledge,
-        'no_fix_share': wilson(int(np.sum(~fixes)), squares.size)}
+        'no_fix_share': share_percent(int(np.sum(~fixes)), squares.size)}
     # Few fixes are not a sample of all positions.
     if fixes.mean() > 0.5:
         row |= {'mse_m2': interval(squares), 'to_exact': interval(squares, exact),
-                'covered_share': wilson(int(np.sum(covered)), int(np.sum(fixes)))}
+                'covered_share': share_percent(int(np.sum(covered)), int(np.sum(fixes)))}
 
     def text(key: str, digits: int) -> str:
         if key not in row:

@@ -34,7 +34,7 @@ from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.experiments import positive_int
-from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.experiments.resampling import reduction, share_percent
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.imperfections import SurfaceImperfection, draw_deviations
 from rhs_isac_ros.positioning import Estimate, exhaustive_posterior, make_estimator
@@ -213,14 +213,15 @@ def figures(estimate: Estimate, positions: np.ndarray, n_windows: int) -> dict[s
     # The covariance of users who may be outside includes the positions there.
     certain = np.isfinite(np.asarray(estimate.expected_residual)[fix])
     return {
-        'positions': n, 'no_fix': n - n_fixes, 'no_fix_share': share(n - n_fixes, n),
+        'positions': n, 'no_fix': n - n_fixes, 'no_fix_share': share_percent(n - n_fixes, n),
         'reasons': {text: sum(reason.startswith(text) for reason in estimate.reason)
                     for text in ('position', 'residual', 'energy')},
-        'mse_m2': mean_interval(squares), 'covered_share': share(covered, n_fixes),
-        'missed_share': share(n_fixes - covered, n),
+        'mse_m2': mean_interval(squares),
+        'covered_share': share_percent(covered, n_fixes) if n_fixes else None,
+        'missed_share': share_percent(n_fixes - covered, n),
         'predicted_mse_m2': float(np.trace(covariance, axis1=1, axis2=2)[certain].mean())
         if certain.any() else None,
-        'possibly_outside_share': share(n_fixes - int(certain.sum()), n),
+        'possibly_outside_share': share_percent(n_fixes - int(certain.sum()), n),
         'median_residual': float(np.median(residual)) if n_fixes else None,
         **warnings(estimate, n_windows),
     }
@@ -238,7 +239,8 @@ def warnings(estimate: Estimate, n_windows: int) -> dict[str, Any]:
     residuals = np.stack([estimate.residual, estimate.expected_residual], axis=1)
     order = np.random.default_rng(0).integers(len(residuals), size=(n_windows, WINDOW))
     n_warned = sum(first_warning(residuals[window]) is not None for window in order)
-    return {'warns_after': first_warning(residuals), 'warned_share': share(n_warned, n_windows)}
+    return {'warns_after': first_warning(residuals),
+            'warned_share': share_percent(n_warned, n_windows)}
 
 
 def first_warning(residuals: np.ndarray) -> int | None:
@@ -249,16 +251,6 @@ def first_warning(residuals: np.ndarray) -> int | None:
         if monitor.drifts:
             return count
     return None
-
-
-def share(count: int, total: int) -> tuple[float, float, float] | None:
-    """Return a share with its 95 % interval by Wilson [%]."""
-    if not total:
-        return None
-    z = 1.96
-    center = (count + z**2 / 2) / (total + z**2)
-    half = z * np.sqrt(count * (total - count) / total + z**2 / 4) / (total + z**2)
-    return 100 * count / total, 100 * float(center - half), 100 * float(center + half)
 
 
 def mean_interval(samples: np.ndarray) -> tuple[float, float, float] | None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.experiments.resampling import reduction, replicate
+from rhs_isac_ros.experiments.resampling import reduction, replicate, share_percent
 
 
 def mean(values):
@@ -112,3 +112,18 @@ def test_the_variance_of_the_cases_alone_does_not_widen_the_interval():
     value, low, high = replicate(results, 0)[0].interval()
     assert high - low == pytest.approx(2 * 1.96 * results.std() / 20, rel=0.1)
     assert low < value < high
+
+
+def test_the_interval_of_a_share_is_that_of_wilson():
+    """Both ends solve |p - share| = z sqrt(p (1 - p) / n)."""
+    value, *ends = share_percent(3, 40)
+    assert value == 7.5
+    for end in ends:
+        p = end / 100
+        assert abs(p - 0.075) == pytest.approx(1.959964 * np.sqrt(p * (1 - p) / 40), rel=1e-5)
+    assert share_percent(0, 10)[:2] == (0.0, pytest.approx(0.0, abs=1e-12))
+
+
+def test_the_share_of_nothing_is_an_error():
+    with pytest.raises(ValueError, match='^total: 0, expected at least 1$'):
+        share_percent(0, 0)

@@ -148,7 +148,7 @@ def test_the_pilots_may_come_from_the_running_network(built_scripts, process, re
 def test_an_unusable_recording_or_prior_is_named(recording, capsys, tmp_path, arguments, error):
     done = call(capsys, recording, '--output', tmp_path / 'x.npz', *arguments)
     assert done.code == 2
-    assert done.err.startswith('error: ')
+    assert done.err.startswith('calibrate: error: ')
     assert error in done.err
     assert len(done.err.splitlines()) == 1
     assert not list(tmp_path.iterdir())
