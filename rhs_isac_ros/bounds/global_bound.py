@@ -1,0 +1,248 @@
+"""A bound on the mean squared error that includes ambiguities: the error of an informed estimator.
+
+The position is uniform in the region of interest and q = (r, u, v) are its range and direction
+cosines. No estimator has a smaller mean squared error than the posterior mean, and the posterior
+mean of an estimator that is also given q modulo a lattice has a smaller one still. Given q modulo
+the lattice, the position is one of M known points. With the whitened differences
+d_k = L^-1 (mu(p_k) - mu(p)), Lambda = L L^H, and white noise n of unit covariance, the
+log-likelihood of the point k relative to the true one is -|d_k|^2 + 2 Re(d_k^H n), so that the
+error of the informed estimator is an M-ary average over n, which is drawn at random. This extends
+the pairs of hypotheses of the Ziv-Zakai bound, Bell, Steinberg, Ephraim and Van Trees, Extended
+Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2), 1997, to all
+hypotheses at once; two points instead of M give their P_min = Q(|d| / sqrt 2).
+
+The finer the lattice, the tighter the bound. Steps of one to two local standard deviations lose
+little, because the variance of a Gaussian that is sampled so coarsely is almost exact.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.bounds.fisher import position_information_of
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.surface import Beamforming
+
+# Lattice steps of (r, u, v), in standard deviations of one coordinate with the others known, and
+# the smallest number of steps across the region. With Table I, halving them changes the bound by
+# about 1 %.
+_STEPS = np.array([2.4, 1.2, 1.2])
+_MIN_STEPS = 24
+# Largest number of lattice points in the box around the region; steps grow beyond it.
+_MAX_POINTS = 2_000_000
+# Phases evaluated with one offset of the lattice, and at a time.
+_PER_OFFSET = 512
+_BLOCK = 16
+# Points this much less likely than the true one have no effect.
+_MARGIN = 20.0
+# Nodes of the interpolation over the range, in addition to those for the phase of the sub-bands,
+# and ranges at which the likelihood of a ray is bounded.
+_N_NODES = 10
+_N_CHECKS = 32
+
+
+class GlobalBound(NamedTuple):
+    """Bound on the mean squared error of any estimator, for a uniform prior on the region.
+
+    Attributes
+    ----------
+    value, standard_error
+        The bound and the standard error of its Monte-Carlo average [m^2].
+    range_part
+        Part of the value that is an error of the range [m^2].
+    positions
+        Positions of the phases that were drawn, float64 [n, 3] [m].
+    squared_errors
+        Squared error of the informed estimator in each, float64 [n] [m^2].
+    """
+
+    value: float
+    standard_error: float
+    range_part: float
+    positions: np.ndarray
+    squared_errors: np.ndarray
+
+
+def global_bound(
+        scenario: Scenario, codebook: Beamforming, rng: np.random.Generator,
+        n_phases: int = 2048) -> GlobalBound:
+    """Compute the bound from the posterior of `n_phases` random positioning phases.
+
+    Nuisance parameters of the scenario are taken as known, which keeps the result a bound.
+
+    Raises
+    ------
+    ValueError
+        If `n_phases` is less than 2.
+    """
+    if n_phases < 2:
+        raise ValueError(f'n_phases: {n_phases}, expected at least 2')
+    model = MeasurementModel(scenario, codebook).prepare()
+    steps = _steps(model, rng)
+    parts = []
+    for first in range(0, n_phases, _PER_OFFSET):
+        # The offset of a random position, so that positions of all phases are uniform.
+        lattice = _Lattice(model, steps, scenario.sample_positions(1, rng)[0])
+        parts.append(np.stack(list(lattice.phases(min(_PER_OFFSET, n_phases - first), rng))))
+    moments = np.concatenate(parts)
+    # The variance of the posterior has the same mean as the squared error, and a smaller spread.
+    variances = moments[:, 3]
+    return GlobalBound(
+        float(variances.mean()), float(variances.std(ddof=1) / np.sqrt(n_phases)),
+        float(moments[:, 4].mean()), moments[:, :3], moments[:, 5])
+
+
+class _Lattice:
+    """The points of a lattice in (r, u, v) inside the region of interest; one is given.
+
+    Along a ray, the mean signals of a band are a carrier times a smooth function of the range,
+    which is interpolated between Chebyshev nodes. All ranges of a ray then cost one product of
+    small matrices, and rays on which no phase of the carriers yields a likely point cost none.
+    """
+
+    def __init__(self, model: MeasurementModel, steps: np.ndarray, point: np.ndarray) -> None:
+        self._model, scenario = model, model.scenario
+        distance = np.linalg.norm(point)
+        given = distance, point[1] / distance, point[2] / distance
+        box = _polar_box(scenario)
+        ranges, *directions = (
+            np.arange(q - np.ceil((q - low) / step) * step, high + step, step)
+            for q, low, high, step in zip(given, *box, steps, strict=True))
+        u, v = (axis.ravel() for axis in np.meshgrid(*directions, indexing='ij'))
+        sight = np.stack([np.sqrt(np.maximum(1 - u**2 - v**2, 0)), u, v], axis=1)
+        inside = np.ones((len(sight), len(ranges)), bool)
+        for axis, (least, most) in enumerate(scenario.roi_bounds_m.T):
+            coordinate = sight[:, axis, None] * ranges
+            inside &= (coordinate >= least) & (coordinate <= most)
+        used = inside.any(axis=1)
+        sight, inside = sight[used], inside[used]
+        self._sight, self._ranges = sight, ranges
+        with np.errstate(divide='ignore'):
+            # The density of (r, u, v) is that of the position times r^2 / w.
+            self._prior = np.log(np.where(inside, ranges**2 / sight[:, :1], 0.0))
+        self._interpolate(sight, ranges, box[:, 0])
+
+    def _interpolate(self, sight: np.ndarray, ranges: np.ndarray, limits: np.ndarray) -> None:
+        """Compute signals at the nodes and the weights that continue them to all ranges."""
+        model, scenario = self._model, self._model.scenario
+        span_hz = scenario.n_subbands * scenario.subband_width_hz
+        turns = span_hz * np.ptp(limits) / SPEED_OF_LIGHT_MPS
+        n_nodes = _N_NODES + int(np.ceil(2 * np.pi * turns))
+        angles = np.pi * (np.arange(n_nodes) + 0.5) / n_nodes
+        nodes = np.mean(limits) - np.ptp(limits) / 2 * np.cos(angles)
+        checks = np.linspace(limits[0], limits[1], _N_CHECKS)
+        at_ranges, self._at_checks = _weights(nodes, angles, ranges), _weights(
+            nodes, angles, checks)
+        wavenumbers = 2 * np.pi * np.array(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS
+        signals = model.whiten(model.mean((sight[:, None] * nodes[:, None]).reshape(-1, 3)))
+        signals = signals.reshape(len(sight), n_nodes, *model.shape)
+        carriers = nodes[:, None] * np.exp(1j * nodes[:, None] * wavenumbers)
+        # [bands, measurements, rays nodes]
+        smooth = np.moveaxis(signals * carriers[..., None], (2, 3), (0, 1))
+        self._smooth = smooth.reshape(*model.shape, -1)
+        phases = ranges * wavenumbers[:, None]
+        basis = np.stack([np.cos(phases), np.sin(phases)], axis=1)[:, None]
+        # Re(z exp(-i k r)) = Re z cos k r + Im z sin k r: [bands, nodes, 2, ranges].
+        basis = 2 * basis * (at_ranges / ranges)[:, None]
+        self._basis = basis.reshape(-1, len(ranges)).astype(np.float32)
+        energy = np.sum(np.abs(smooth)**2, axis=(0, 1))
+        self._offset = (self._prior - energy @ at_ranges / ranges**2).astype(np.float32)
+        self._checks = 2 / checks
+        self._least_loss = (energy @ self._at_checks / checks**2
+                            - np.max(self._prior, axis=1, keepdims=True))
+
+    def phases(self, n: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+        """Draw true points and signals.
+
+        Yields for each the position [3], the variance of the posterior, that of the range, and the
+        squared error.
+        """
+        model = self._model
+        # Systematic sampling spreads the points evenly over the region.
+        shares = np.cumsum(np.exp(self._prior - self._prior.max()))
+        chosen = np.searchsorted(shares / shares[-1], (np.arange(n) + rng.uniform()) / n)
+        rays, ranges = np.divmod(np.minimum(chosen, shares.size - 1), self._prior.shape[1])
+        truth = self._sight[rays] * self._ranges[ranges, None]
+        signals = model.whiten(model.mean(truth))
+        noise = rng.standard_normal((2, *signals.shape)) / np.sqrt(2)
+        signals += noise[0] + 1j * noise[1]
+        for first in range(0, n, _BLOCK):
+            block = slice(first, first + _BLOCK)
+            for products, ray, index in zip(
+                    self._products(signals[block]), rays[block], ranges[block], strict=True):
+                yield self._moments(products, ray, index)
+
+    def _products(self, signals: np.ndarray) -> np.ndarray:
+        """Products of signals and templates at the nodes, complex64 [n, rays, bands, nodes]."""
+        products = np.stack([
+            np.matmul(np.conj(signals[:, band]), smooth).reshape(
+                len(signals), len(self._offset), -1)
+            for band, smooth in enumerate(self._smooth)], axis=2)
+        return np.ascontiguousarray(products, np.complex64)
+
+    def _moments(self, products: np.ndarray, ray: int, index: int) -> np.ndarray:
+        parts = products.view(np.float32).reshape(len(products), -1)
+        least = parts[ray] @ self._basis[:, index] + self._offset[ray, index] - _MARGIN
+        envelope = np.abs(products @ self._at_checks).sum(axis=1) * self._checks
+        (rays,) = np.nonzero((envelope - self._least_loss).max(axis=1) > least)
+        values = parts[rays] @ self._basis + self._offset[rays]
+        chosen, at = np.nonzero(values > least)
+        values = values[chosen, at].astype(float)
+        weights = np.exp(values - values.max())
+        weights /= weights.sum()
+        truth, ranges = self._sight[ray] * self._ranges[index], self._ranges[at]
+        offsets = self._sight[rays[chosen]] * ranges[:, None] - truth
+        mean = weights @ offsets
+        return np.array([
+            *truth, weights @ np.sum((offsets - mean)**2, axis=1),
+            weights @ (ranges - weights @ ranges)**2, mean @ mean])
+
+
+def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Weights of interpolation from Chebyshev nodes of the first kind to points, [nodes, points].
+
+    This is the barycentric formula.
+    """
+    gaps = points - nodes[:, None]
+    gaps[gaps == 0] = np.finfo(float).tiny
+    terms = ((-1.0)**np.arange(len(nodes)) * np.sin(angles))[:, None] / gaps
+    weights: np.ndarray = terms / terms.sum(axis=0)
+    return weights
+
+
+def _polar_box(scenario: Scenario) -> np.ndarray:
+    """Lower and upper limits of (r, u, v) in the region of interest, float64 [2, 3]."""
+    low, high = scenario.roi_bounds_m
+    nearest = np.clip(0.0, low, high)
+    farthest = np.maximum(np.abs(low), np.abs(high))
+    limits = np.empty((2, 3))
+    limits[:, 0] = np.linalg.norm(nearest), np.linalg.norm(farthest)
+    for axis in (1, 2):
+        # A cosine is the largest where the other coordinates are the smallest, if it is positive.
+        for side, bound in enumerate((low, high)):
+            outward = bound[axis] > 0 if side else bound[axis] < 0
+            others = np.delete(nearest if outward else farthest, axis)
+            limits[side, axis] = bound[axis] / np.hypot(bound[axis], np.linalg.norm(others))
+    return limits
+
+
+def _steps(model: MeasurementModel, rng: np.random.Generator) -> np.ndarray:
+    """Steps of the lattice in (r [m], u, v), from the local deviations of each coordinate."""
+    positions = model.scenario.sample_positions(256, rng)
+    distance = np.linalg.norm(positions, axis=1)
+    sight = positions / distance[:, None]
+    slopes = np.zeros((len(positions), 3, 3))
+    slopes[:, :, 0] = sight
+    for axis in (1, 2):
+        slopes[:, 0, axis] = -distance * sight[:, axis] / sight[:, 0]
+        slopes[:, axis, axis] = distance
+    information = position_information_of(model, positions)
+    diagonal = np.einsum('nap,nab,nbp->np', slopes, information, slopes).mean(axis=0)
+    low, high = _polar_box(model.scenario)
+    steps: np.ndarray = np.minimum(
+        _STEPS / np.sqrt(np.maximum(diagonal, 1e-30)), (high - low) / _MIN_STEPS)
+    n_points = np.prod((high - low) / steps)
+    steps *= max(n_points / _MAX_POINTS, 1.0)**(1 / 3)
+    return steps

@@ -1,0 +1,74 @@
+"""The global bound: limits, and brute force where the posterior has a few ambiguous ranges."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import crlb, global_bound
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.model import MeasurementModel, Scenario
+
+SMALL = {'elements_per_side': 4, 'n_subbands': 2, 'n_frames': 2, 'n_feeds': 2}
+
+
+def bound_and_codebook(n_phases=1024, **fields):
+    scenario = Scenario(**{**SMALL, **fields})
+    codebook = random_codebook(scenario, np.random.default_rng(1))
+    bound = global_bound(scenario, codebook, np.random.default_rng(2), n_phases)
+    return scenario, codebook, bound
+
+
+def test_without_signal_the_bound_is_the_variance_of_the_region():
+    scenario, _, bound = bound_and_codebook(512, max_power_w=1e-15, noise_psd_dbm_hz=0.0)
+    assert bound.value == pytest.approx(
+        np.sum(np.square(scenario.roi_size_m)) / 12, rel=0.02)
+
+
+def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
+    scenario, codebook, bound = bound_and_codebook(
+        512, multipath_to_los_db=-33.0, roi_center_m=(5.0, 0.3, 0.2), roi_size_m=(0.1, 0.4, 0.4))
+    local = crlb(scenario, codebook, bound.positions).mean()
+    size = np.square(scenario.roi_size_m).sum() / 12
+    assert local < size / 20
+    assert bound.value == pytest.approx(local, rel=0.1)
+
+
+def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
+    # In a thin region, only the range is unknown. Its phases repeat every 0.6 m.
+    scenario, codebook, bound = bound_and_codebook(
+        2048, multipath_to_los_db=-5.0, roi_center_m=(7.0, 0.0, 0.0), roi_size_m=(3.0, 1e-6, 1e-6))
+    rng = np.random.default_rng(3)
+    model = MeasurementModel(scenario, codebook)
+    grid = np.zeros((1501, 3))
+    grid[:, 0] = np.linspace(5.5, 8.5, len(grid))
+    means = model.whiten(model.mean(grid)).reshape(len(grid), -1)
+    truth = scenario.sample_positions(2048, rng)
+    received = model.whiten(model.sample(truth, rng)).reshape(len(truth), -1)
+    log = 2 * (received @ means.conj().T).real - np.sum(np.abs(means)**2, axis=1)
+    weights = np.exp(log - log.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    variances = weights @ grid[:, 0]**2 - (weights @ grid[:, 0])**2
+    local = crlb_of_range(model, truth)
+    assert variances.mean() > 5 * local
+    spread = np.hypot(variances.std() / np.sqrt(len(truth)), bound.standard_error)
+    assert abs(bound.value - variances.mean()) < 4 * spread
+    assert spread < 0.05 * bound.value
+    assert bound.range_part == pytest.approx(bound.value, rel=1e-3)
+
+
+def crlb_of_range(model, truth):
+    slope = model.whiten(model.jacobian(truth)[:, 0])
+    return np.mean(1 / (2 * np.sum(np.abs(slope)**2, axis=(1, 2))))
+
+
+def test_squared_errors_have_the_mean_of_the_bound():
+    scenario, _, bound = bound_and_codebook(512)
+    spread = np.std(bound.squared_errors) / np.sqrt(len(bound.squared_errors))
+    assert abs(bound.squared_errors.mean() - bound.value) < 4 * np.hypot(
+        spread, bound.standard_error)
+    low, high = scenario.roi_bounds_m
+    assert ((bound.positions >= low) & (bound.positions <= high)).all()
+
+
+def test_too_few_phases_are_an_error():
+    with pytest.raises(ValueError, match='n_phases: 1, expected at least 2'):
+        bound_and_codebook(1)
