@@ -1,0 +1,143 @@
+"""Mean squared error of the posterior mean beside the local and the global bound.
+
+Problem: the average Cramer-Rao bound ignores ambiguities of the range, so that it is up to fifteen
+times below the error. How close is the global bound, which includes them, for several plans of
+bands and codebooks? The plans have the same spectrum, 2.5 to 3 GHz, and the same number of pilots.
+Codebooks of the plans with four bands are optimised with few steps. Errors are those of `bayes`,
+and intervals are twice the standard error. The bound and the errors have random numbers of their
+own.
+"""
+
+import os
+
+# One thread, as in the positioner node. This must be set before NumPy is imported.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rhs_isac_ros.bounds import crlb, global_bound
+from rhs_isac_ros.codebook import (
+    Codebook,
+    CodebookError,
+    directional_codebook,
+    optimize,
+    random_codebook,
+)
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.experiments import markdown_table
+from rhs_isac_ros.model import Scenario, ScenarioError, streams
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    input_file,
+    integer,
+    output_file,
+    positive_int,
+    seed,
+)
+from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+
+CONFIG = Path(__file__).parents[2] / 'config'
+PLANS = {'equal': (2.5e9, 2.667e9, 2.833e9, 3.0e9), 'unequal': (2.5e9, 2.55e9, 2.7e9, 3.0e9)}
+# Update steps and positions of the optimisations: seconds for the bound, a minute for ambiguity.
+STEPS, POSITIONS = {'crlb': 300, 'ambiguity': 150}, {'crlb': 256, 'ambiguity': 64}
+BATCH = 50
+HEADER = ('plan', 'codebook', 'MSE [m²]', '±', 'CRLB [m²]', 'bound [m²]', '±', 'MSE / CRLB',
+          'MSE / bound', 'time of the bound [s]')
+
+
+def main() -> None:
+    """Run the benchmark."""
+    options = parse_options()
+    print(f'{options.positions} positions, {options.phases} phases for the bound, seed '
+          f'{options.seed}\n')
+    figures, rows = [], []
+    for plan, name, scenario, codebook in pairs(options):
+        figures.append({'plan': plan, 'codebook': name,
+                        **compare(scenario, codebook, options)})
+        numbers = [value for value in figures[-1].values() if isinstance(value, float)]
+        rows.append([plan, name, *(f'{value:.3g}' for value in numbers)])
+        print('  '.join(rows[-1]), file=sys.stderr, flush=True)
+    print(markdown_table(HEADER, rows))
+    ratios = [entry['mse_to_bound'] for entry in figures]
+    print(f'\nMSE / bound from {min(ratios):.3f} to {max(ratios):.3f} over {len(ratios)} pairs')
+    if options.json:
+        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+
+
+def parse_options() -> argparse.Namespace:
+    """Parse the command line."""
+    parser = ArgumentParser(
+        prog='scripts/benchmark bounds', description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add('--positions', type=integer(2), default=2000,
+        help='positions of the errors (default: %(default)s)')
+    add('--phases', type=integer(2), default=2048,
+        help='positioning phases of the bound (default: %(default)s)')
+    add('--seed', type=seed, default=1, help='seed of all random numbers (default: %(default)s)')
+    add('--steps', type=positive_int, help='steps of the optimisations')
+    add('--plan', type=input_file, nargs=2, action='append', default=[],
+        metavar=('SCENARIO', 'CODEBOOK'), help='another scenario and its codebook')
+    add('--only-plans', action='store_true', help='leave out the pairs that are built in')
+    add('--json', type=output_file, help='JSON file for the results')
+    return parser.parse_args()
+
+
+def pairs(options: argparse.Namespace) -> Iterator[tuple[str, str, Scenario, Codebook]]:
+    """Yield the names of plan and codebook, with both."""
+    if not options.only_plans:
+        scenario = Scenario()
+        rng = streams.generator(options.seed, streams.START)
+        codebooks = {
+            'ambiguity': Codebook.load(CONFIG / 'codebook_ambiguity.yaml'),
+            'crlb': Codebook.load(CONFIG / 'codebook_crlb.yaml'),
+            'directional, width': directional_codebook(scenario),
+            'directional, grid': directional_codebook(scenario, scan='grid'),
+            'random': random_codebook(scenario, rng)}
+        for name, codebook in codebooks.items():
+            yield 'Table I', name, scenario, codebook
+        for plan, centers in PLANS.items():
+            scenario = Scenario(center_frequencies_hz=centers, n_frames=2)
+            for objective, steps in STEPS.items():
+                result = optimize(
+                    scenario, objective=objective, max_steps=options.steps or steps,
+                    n_positions=POSITIONS[objective], seed=options.seed)
+                yield plan, objective, scenario, result.codebook
+    for scenario_file, codebook_file in options.plan:
+        scenario = Scenario.from_yaml(scenario_file)
+        yield scenario_file.stem, codebook_file.stem, scenario, Codebook.load(codebook_file)
+
+
+def compare(
+        scenario: Scenario, codebook: Codebook, options: argparse.Namespace
+) -> dict[str, float | str]:
+    """Measure the error and compute the bounds."""
+    positions, received = simulate_pairs(scenario, codebook, options.positions, options.seed)
+    estimator = make_estimator('bayes', scenario, codebook)
+    means = np.concatenate([estimator.estimate(received[k:k + BATCH]).mean
+                            for k in range(0, len(received), BATCH)])
+    means[~np.isfinite(means).all(axis=1)] = scenario.roi_center_m
+    errors = np.sum((means - positions)**2, axis=1)
+    local = float(crlb(scenario, codebook, positions).mean())
+    begin = time.process_time()
+    bound = global_bound(
+        scenario, codebook, np.random.default_rng([options.seed, 1]), options.phases)
+    seconds = time.process_time() - begin
+    return {
+        'id': codebook.id, 'mse_m2': float(errors.mean()),
+        'mse_interval_m2': 2 * float(errors.std()) / np.sqrt(len(errors)),
+        'average_crlb_m2': local, 'bound_m2': bound.value,
+        'bound_interval_m2': 2 * bound.standard_error, 'mse_to_crlb': float(errors.mean()) / local,
+        'mse_to_bound': float(errors.mean()) / bound.value, 'bound_seconds': seconds}
+
+
+if __name__ == '__main__':
+    sys.exit(exit_code_of(main, (CodebookError, ScenarioError)))

@@ -1,0 +1,237 @@
+"""Errors and bounds of band plans over one parameter of the scenario: points, jobs and figures."""
+
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros import __version__
+from rhs_isac_ros.bounds import crlb, global_bound
+from rhs_isac_ros.codebook import Codebook, optimize
+from rhs_isac_ros.codebook.optimize import INTERRUPTED
+from rhs_isac_ros.experiments import Job, markdown_table, run_jobs
+from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+
+Changes = Mapping[str, Any]
+# Band-frames of every plan, unless the curve varies them.
+N_PILOTS = 8
+LOW_HZ, HIGH_HZ = 2.5e9, 3.0e9
+# Carriers as fractions of the spectrum. The unequal ones have many different distances.
+SPACINGS: Mapping[str, Callable[[int], Sequence[float]]] = {
+    'equal': lambda n: np.linspace(0, 1, n).tolist() if n > 1 else [0.5],
+    'unequal': lambda n: {1: [0.5], 2: [0, 1], 3: [0, 0.2, 1], 4: [0, 0.1, 0.4, 1],
+                          8: [k / 34 for k in (0, 1, 4, 9, 15, 22, 32, 34)]}[n]}
+# Positions of a trial, and the seed of all signals.
+BLOCK, SEED = 250, 1
+# Positions of an optimisation.
+SAMPLES = 64
+
+
+class Plan(NamedTuple):
+    """A plan of bands: its deviations from Table I, and its codebook unless that is optimised."""
+
+    changes: Changes
+    codebook: Changes | None = None
+
+
+class Curve(NamedTuple):
+    """Values of one parameter.
+
+    Attributes
+    ----------
+    label
+        Label of the axis.
+    values
+        Values on the axis.
+    change
+        Function from a value and a plan's changes to the further changes; None varies the number
+        of bands of the spacings.
+    reoptimise
+        Whether each value has a codebook of its own.
+    bounds
+        Whether to compute the bounds.
+    """
+
+    label: str
+    values: Sequence[float]
+    change: Callable[[float, Changes], Changes] | None
+    reoptimise: bool = False
+    bounds: bool = True
+
+
+class Point(NamedTuple):
+    """One value of a curve on one line; the codebook is that of the plan."""
+
+    curve: str
+    line: str
+    value: float
+    changes: Changes
+    plan: Plan
+
+
+def spaced(spacing: str, n_bands: int) -> Changes:
+    """Return the changes of a plan with N_PILOTS band-frames."""
+    fractions = SPACINGS[spacing](n_bands)
+    return {'center_frequencies_hz': [LOW_HZ + (HIGH_HZ - LOW_HZ) * f for f in fractions],
+            'n_frames': N_PILOTS // n_bands}
+
+
+PLANS = {'2 bands (Table I)': Plan({}), '4 equally spaced': Plan(spaced('equal', 4)),
+         '4 unequally spaced': Plan(spaced('unequal', 4))}
+
+
+def read_plans(files: Sequence[tuple[Path, Path]]) -> dict[str, Plan]:
+    """Return the built-in plans and those of pairs of a scenario and a codebook file."""
+    return PLANS | {
+        scenario.stem: Plan(Scenario.from_yaml(scenario).changes(),
+                            plain(Codebook.load(codebook))) for scenario, codebook in files}
+
+
+def plain(codebook: Codebook) -> Changes:
+    """Return the parameters of a codebook as plain lists."""
+    return {name: np.asarray(value).tolist() for name, value in codebook.to_parameters().items()}
+
+
+def points_of(name: str, curve: Curve, plans: Mapping[str, Plan]) -> list[Point]:
+    """List the points of a curve, line by line."""
+    if curve.change is None:
+        return [Point(name, spacing, n, changes, Plan(changes)) for spacing in SPACINGS
+                for n in curve.values for changes in [spaced(spacing, int(n))]]
+    points = []
+    for line, plan in plans.items():
+        for value in curve.values:
+            changes = {**plan.changes, **curve.change(value, plan.changes)}
+            own = Plan(changes) if curve.reoptimise else plan
+            points.append(Point(name, line, value, changes, own))
+    return points
+
+
+def optimise(scenario: Changes, steps: int) -> Changes:
+    """Return the codebook of a plan, optimised against ambiguities."""
+    result = optimize(Scenario(**scenario), objective='ambiguity', n_positions=SAMPLES, seed=SEED,
+                      max_steps=steps)
+    if result.reason == INTERRUPTED:
+        raise KeyboardInterrupt
+    return plain(result.codebook)
+
+
+def locate(scenario: Changes, codebook: Changes, trial: int) -> dict[str, Any]:
+    """Return the squared errors of the posterior mean at a block of positions."""
+    world, book = Scenario(**scenario), Codebook.from_parameters(codebook)
+    positions, received = simulate_pairs(world, book, BLOCK, SEED, trial * BLOCK)
+    means = make_estimator('bayes', world, book).estimate(received).mean
+    means[~np.isfinite(means).all(axis=1)] = world.roi_center_m
+    return {'squared_errors_m2': np.sum((means - positions)**2, axis=1).round(8).tolist()}
+
+
+def bounds(scenario: Changes, codebook: Changes, phases: int) -> dict[str, Any]:
+    """Return the average local bound and the global bound."""
+    world, book = Scenario(**scenario), Codebook.from_parameters(codebook)
+    bound = global_bound(world, book, streams.generator(SEED, streams.HELD_OUT), phases)
+    return {'crlb_m2': float(crlb(world, book, bound.positions).mean()),
+            'bound_m2': bound.value, 'bound_error_m2': bound.standard_error}
+
+
+class Sizes(NamedTuple):
+    """Trials of each point, phases of a bound, and steps of an optimisation."""
+
+    trials: int
+    phases: int
+    steps: int
+
+
+def evaluate(curves: Mapping[str, Curve], plans: Mapping[str, Plan], sizes: Sizes, folder: Path,
+             n_jobs: int, dask: str | None) -> list[dict[str, Any]]:
+    """Run the jobs that have no results, and return an entry for each point."""
+    points = [point for name, curve in curves.items() for point in points_of(name, curve, plans)]
+
+    def run(function: Callable[..., dict[str, Any]], jobs: Mapping[Any, Job]) -> dict[Any, Any]:
+        return dict(zip(jobs, run_jobs(function, list(jobs.values()), folder, n_jobs, dask),
+                        strict=True))
+
+    wanted = {Scenario(**point.plan.changes).id: point.plan.changes for point in points
+              if point.plan.codebook is None}
+    books = run(optimise, {key: Job(f'codebook-{key}', {
+        'scenario': changes, 'steps': sizes.steps}) for key, changes in wanted.items()})
+    cases = [(point, {'scenario': point.changes, 'codebook': point.plan.codebook or books[
+        Scenario(**point.plan.changes).id]}) for point in points]
+    slugs = [f'{Scenario(**point.changes).id}-{Codebook.from_parameters(case["codebook"]).id}'
+             for point, case in cases]
+    located = run(locate, {
+        (slug, trial): Job(f'errors-{slug}-{trial}', {**case, 'trial': trial})
+        for slug, (_, case) in zip(slugs, cases, strict=True) for trial in range(sizes.trials)})
+    bounded = run(bounds, {
+        slug: Job(f'bounds-{slug}', {**case, 'phases': sizes.phases})
+        for slug, (point, case) in zip(slugs, cases, strict=True) if curves[point.curve].bounds})
+    entries = []
+    for slug, point in zip(slugs, points, strict=True):
+        errors = np.concatenate([located[slug, trial]['squared_errors_m2']
+                                 for trial in range(sizes.trials)])
+        entries.append({
+            'curve': point.curve, 'line': point.line, 'value': point.value,
+            'mse_m2': float(errors.mean()), 'median_m2': float(np.median(errors)),
+            'mse_error_m2': float(errors.std() / np.sqrt(len(errors))), **bounded.get(slug, {})})
+    return entries
+
+
+def table(entries: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table with a row for each point."""
+    names = [name for name in ('mse_m2', 'mse_error_m2', 'median_m2', 'crlb_m2', 'bound_m2')
+             if name in entries[0]]
+    heads = {'mse_m2': 'MSE [m²]', 'mse_error_m2': 'standard error', 'median_m2': 'median [m²]',
+             'crlb_m2': 'CRLB [m²]', 'bound_m2': 'bound [m²]'}
+    return markdown_table(
+        ['plan', 'value', *(heads[name] for name in names)],
+        [[entry['line'], f'{entry["value"]:g}', *(f'{entry[name]:.3g}' for name in names)]
+         for entry in entries])
+
+
+def picture(curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]]) -> bytes:
+    """Draw a panel for each curve as PNG: root mean squared errors and the roots of the bounds."""
+    with optional_import('drawing the figure', extra='plot'):
+        from matplotlib import colormaps
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=(1.5 + 4 * len(curves), 4.2), layout='constrained')
+    panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
+    for axes, (name, curve) in zip(panels, curves.items(), strict=True):
+        own = [entry for entry in entries if entry['curve'] == name]
+        lines = list(dict.fromkeys(entry['line'] for entry in own))
+        shades = colormaps['cividis'](np.linspace(0, 0.8, len(lines)))
+        for line, shade, marker in zip(lines, shades, 'os^Dv' * len(lines), strict=False):
+            part = [entry for entry in own if entry['line'] == line]
+            places = np.arange(len(part))
+            for key, label, style in (('mse_m2', line, '-'), ('bound_m2', 'global bound', '--'),
+                                      ('crlb_m2', 'root of the average CRLB', ':')):
+                if key in part[0]:
+                    axes.plot(places, np.sqrt([entry[key] for entry in part]), style, color=shade,
+                              marker=marker if style == '-' else '', label=label
+                              if style == '-' or line == lines[-1] else None)
+        axes.set(xlabel=curve.label, yscale='log')
+        axes.set_xticks(range(len(curve.values)), [f'{value:g}' for value in curve.values])
+        axes.grid(axis='y', which='both', alpha=0.3)
+        axes.tick_params(labelleft=True)
+    panels[0].set_ylabel('root mean squared error [m]')
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside lower center', ncols=5)
+    stream = io.BytesIO()
+    figure.savefig(stream, format='png', dpi=120)
+    return stream.getvalue()
+
+
+def write(name: str, curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]],
+          sentences: Sequence[str], output: Path) -> None:
+    """Print the report, and write it with the figure and the numbers."""
+    tables = [f'{curve.label}\n\n{table([e for e in entries if e["curve"] == key])}'
+              for key, curve in curves.items()]
+    report = '\n\n'.join([*tables, *sentences])
+    write_whole(output / f'{name}.png', picture(curves, entries))
+    write_whole(output / f'{name}.json', json.dumps(
+        {'version': __version__, 'points': entries}, indent=1) + '\n')
+    write_whole(output / f'{name}.md', f'# {name}\n\n![{name}]({name}.png)\n\n{report}\n')
+    print(f'{report}\n\nwritten: {output}/{name}.png, {name}.md and {name}.json')
