@@ -5,7 +5,7 @@ Problem: how do the error of `bayes` and the bounds depend on the number of band
 the transmit power (`power`), on the Rice factor (`rice`: power of the direct path relative to the
 multipath) and on the number of elements (`elements`)? NAME restricts the run to some of them. Each
 curve compares the plans of Table I, of four equally spaced and of four unequally spaced bands,
-with the same spectrum, and those of --plan.
+with the same spectrum, and those of --plan (their codebooks serve `power` and `rice`).
 
 A trial is a block of 250 positions. Codebooks are optimised against ambiguities, anew at each
 value of `bands`, `pilots` and `elements`.
@@ -19,11 +19,10 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import argparse
 from collections.abc import Sequence
 
-from parts.plan_curves import Changes, Curve, Sizes, evaluate, read_plans, write
+from parts.plan_curves import Changes, Curve, Sizes, add_plan_options, evaluate, read_plans, write
 
 from rhs_isac_ros.experiments import parse_options, run_command
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arguments import input_file, positive_int
 
 TRIALS, QUICK_TRIALS = 20, 1
 PHASES, QUICK_PHASES = 4096, 256
@@ -50,11 +49,7 @@ CURVES = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment."""
     parser.add_argument('names', nargs='*', metavar='NAME', help=f'one of {", ".join(CURVES)}')
-    parser.add_argument('--plan', type=input_file, nargs=2, action='append', default=[],
-                        metavar=('SCENARIO', 'CODEBOOK'),
-                        help='another plan, and its codebook for power and rice')
-    parser.add_argument('--steps', type=positive_int, metavar='N',
-                        help=f'steps of an optimisation (default: {STEPS}, quick {QUICK_STEPS})')
+    add_plan_options(parser, STEPS, QUICK_STEPS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,10 +20,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts.plan_curves import Curve, Sizes, evaluate, read_plans, write
+from parts.plan_curves import Curve, Sizes, add_plan_options, evaluate, read_plans, write
 
 from rhs_isac_ros.experiments import parse_options, run_command
-from rhs_isac_ros.model.arguments import input_file, positive_int
 
 TRIALS, QUICK_TRIALS = 20, 1
 STEPS, QUICK_STEPS = 600, 100
@@ -74,10 +73,7 @@ def doubling(values: Sequence[float], errors: Sequence[float]) -> float:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment."""
-    parser.add_argument('--plan', type=input_file, nargs=2, action='append', default=[],
-                        metavar=('SCENARIO', 'CODEBOOK'), help='another plan and its codebook')
-    parser.add_argument('--steps', type=positive_int, metavar='N',
-                        help=f'steps of an optimisation (default: {STEPS}, quick {QUICK_STEPS})')
+    add_plan_options(parser, STEPS, QUICK_STEPS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

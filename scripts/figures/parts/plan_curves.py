@@ -1,5 +1,6 @@
 """Errors and bounds of band plans over one parameter of the scenario: points, jobs and figures."""
 
+import argparse
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +15,7 @@ from rhs_isac_ros.codebook import Codebook, optimize
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.experiments import Job, markdown_table, run_jobs
 from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.arguments import input_file, positive_int
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
@@ -91,6 +93,14 @@ def read_plans(files: Sequence[tuple[Path, Path]]) -> dict[str, Plan]:
     return PLANS | {
         scenario.stem: Plan(Scenario.from_yaml(scenario).changes(),
                             plain(Codebook.load(codebook))) for scenario, codebook in files}
+
+
+def add_plan_options(parser: argparse.ArgumentParser, steps: int, quick_steps: int) -> None:
+    """Add the options for further plans and for the optimisation."""
+    parser.add_argument('--plan', type=input_file, nargs=2, action='append', default=[],
+                        metavar=('SCENARIO', 'CODEBOOK'), help='another plan and its codebook')
+    parser.add_argument('--steps', type=positive_int, metavar='N',
+                        help=f'steps of an optimisation (default: {steps}, quick {quick_steps})')
 
 
 def plain(codebook: Codebook) -> Changes:

@@ -1,0 +1,145 @@
+"""Maps of the positioning error and of its bounds over the region of interest.
+
+Problem: where in the region is the error of `bayes` large, and which bound shows it? The maps are
+the root of the average Cramer-Rao bound, the root mean squared error of the informed estimator of
+the global bound, and that of `bayes`, in squares of the horizontal plane, for each band plan: that
+of Table I, four equally and four unequally spaced bands, and those of --plan.
+
+A trial is a block of 250 positions of `bayes`. Codebooks are optimised against ambiguities.
+"""
+
+import os
+
+# One thread per job. This must be set before NumPy is imported.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import io
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from parts import plan_curves
+from parts.plan_curves import BLOCK, SEED, Changes, Sizes
+
+from rhs_isac_ros import __version__
+from rhs_isac_ros.bounds import crlb, global_bound
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.experiments import Job, markdown_table, parse_options, run_command, run_jobs
+from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.positioning import simulate_pairs
+
+TRIALS, QUICK_TRIALS = 40, 4
+PHASES, QUICK_PHASES = 10_240, 1024
+STEPS, QUICK_STEPS = 600, 100
+SQUARES = 8
+TITLES = {'crlb': 'root of the CRLB', 'bound': 'root of the global bound',
+          'error': 'root mean squared error'}
+
+
+def bound_map(scenario: Changes, codebook: Changes, phases: int) -> dict[str, Any]:
+    """Return maps of both bounds [m^2], from the phases of the global bound."""
+    world, book = Scenario(**scenario), Codebook.from_parameters(codebook)
+    bound = global_bound(world, book, streams.generator(SEED, streams.HELD_OUT), phases)
+    local = crlb(world, book, bound.positions)
+    return {'crlb': mean_map(world, bound.positions, local).tolist(),
+            'bound': mean_map(world, bound.positions, bound.squared_errors).tolist()}
+
+
+def mean_map(scenario: Scenario, positions: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return mean values in squares of the horizontal plane, [x, y]; NaN without a position."""
+    low, high = scenario.roi_bounds_m
+    edges = [np.linspace(low[axis], high[axis], SQUARES + 1) for axis in (0, 1)]
+    sums, counts = (np.histogram2d(positions[:, 0], positions[:, 1], edges, weights=weights)[0]
+                    for weights in (values, None))
+    with np.errstate(invalid='ignore'):
+        means: np.ndarray = sums / counts
+    return means
+
+
+def maps_of(options: argparse.Namespace, sizes: Sizes) -> dict[str, dict[str, np.ndarray]]:
+    """Run the jobs that have no results, and return the maps [m^2] and corners of each plan."""
+    plans = plan_curves.read_plans(options.plan)
+
+    def run(function: Any, jobs: Sequence[Job]) -> list[dict[str, Any]]:
+        return run_jobs(function, jobs, options.output / 'jobs', options.jobs, options.dask)
+
+    cases = {}
+    for name, plan in plans.items():
+        key = Scenario(**plan.changes).id
+        book = plan.codebook or run(plan_curves.optimise, [Job(
+            f'codebook-{key}', {'scenario': plan.changes, 'steps': sizes.steps})])[0]
+        cases[name] = {'scenario': plan.changes, 'codebook': book}
+    maps = {}
+    for name, case in cases.items():
+        world, book = Scenario(**case['scenario']), Codebook.from_parameters(case['codebook'])
+        slug = f'{world.id}-{book.id}'
+        (bounds,) = run(bound_map, [Job(f'map-{slug}', {**case, 'phases': sizes.phases})])
+        errors = np.concatenate([entry['squared_errors_m2'] for entry in run(
+            plan_curves.locate, [Job(f'errors-{slug}-{trial}', {**case, 'trial': trial})
+                                 for trial in range(sizes.trials)])])
+        positions, _ = simulate_pairs(world, book, sizes.trials * BLOCK, SEED)
+        maps[name] = {key: np.array(bounds[key]) for key in ('crlb', 'bound')}
+        maps[name]['corners'] = world.roi_bounds_m[:, :2]
+        maps[name]['error'] = mean_map(world, positions, errors)
+    return maps
+
+
+def picture(maps: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
+    """Draw a row for each plan as PNG, with one scale for all maps."""
+    with optional_import('drawing the figure', extra='plot'):
+        from matplotlib.colors import LogNorm
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=(10.5, 3.1 * len(maps)), layout='constrained')
+    panels = figure.subplots(len(maps), 3, sharex=True, sharey=True, squeeze=False)
+    roots = {name: {key: np.sqrt(own[key]) for key in TITLES} for name, own in maps.items()}
+    values = np.concatenate([own[key].ravel() for own in roots.values() for key in TITLES])
+    scale = LogNorm(np.nanmin(values), np.nanmax(values))
+    for row, (name, own) in zip(panels, roots.items(), strict=True):
+        for axes, (key, title) in zip(row, TITLES.items(), strict=True):
+            # left, right, bottom, top
+            extent = maps[name]['corners'].T.ravel().tolist()
+            image = axes.imshow(
+                own[key].T, origin='lower', cmap='cividis', norm=scale, extent=extent)
+            axes.set_title(f'{name}\n{title}', fontsize=9)
+        row[0].set_ylabel('y [m]')
+    for axes in panels[-1]:
+        axes.set_xlabel('x, distance from the surface [m]')
+    figure.colorbar(image, ax=panels, label='[m]', shrink=0.8)
+    stream = io.BytesIO()
+    figure.savefig(stream, format='png', dpi=120)
+    return stream.getvalue()
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this experiment."""
+    plan_curves.add_plan_options(parser, STEPS, QUICK_STEPS)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    options = parse_options(__doc__, 'map', TRIALS, QUICK_TRIALS, arguments, add_options)
+    sizes = Sizes(options.trials, QUICK_PHASES if options.quick else PHASES,
+                  options.steps or (QUICK_STEPS if options.quick else STEPS))
+
+    def reproduce() -> None:
+        maps = maps_of(options, sizes)
+        rows = [[name, *('{:.3g} to {:.3g}'.format(*np.sqrt(
+            [np.nanmin(own[key]), np.nanmax(own[key])])) for key in TITLES)]
+            for name, own in maps.items()]
+        report = markdown_table(['plan', *(f'{title} [m]' for title in TITLES.values())], rows)
+        write_whole(options.output / 'map.png', picture(maps))
+        write_whole(options.output / 'map.json', json.dumps({'version': __version__, 'maps_m2': {
+            name: {key: own[key].tolist() for key in TITLES} for name, own in maps.items()}},
+            indent=1) + '\n')
+        write_whole(options.output / 'map.md', f'# Map\n\n![map](map.png)\n\n{report}\n')
+        print(f'{report}\n\nwritten: {options.output}/map.png, map.md and map.json')
+
+    return run_command(reproduce)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
