@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import position_information_of
+from rhs_isac_ros.bounds.fisher import fisher_information_of
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
@@ -40,7 +40,7 @@ _MARGIN = 20.0
 # Nodes of the interpolation over the range, in addition to those for the phase of the sub-bands,
 # and ranges at which the likelihood of a ray is bounded.
 _N_NODES = 10
-_N_CHECKS = 32
+_N_CHECKS = 64
 
 
 class GlobalBound(NamedTuple):
@@ -70,7 +70,8 @@ def global_bound(
         n_phases: int = 2048) -> GlobalBound:
     """Compute the bound from the posterior of `n_phases` random positioning phases.
 
-    Nuisance parameters of the scenario are taken as known, which keeps the result a bound.
+    Nuisance parameters of the scenario are not included: the bound is that of a user who is
+    synchronised.
 
     Raises
     ------
@@ -149,9 +150,8 @@ class _Lattice:
         self._basis = basis.reshape(-1, len(ranges)).astype(np.float32)
         energy = np.sum(np.abs(smooth)**2, axis=(0, 1))
         self._offset = (self._prior - energy @ at_ranges / ranges**2).astype(np.float32)
-        self._checks = 2 / checks
-        self._least_loss = (energy @ self._at_checks / checks**2
-                            - np.max(self._prior, axis=1, keepdims=True))
+        self._energy = np.maximum(energy @ self._at_checks, np.finfo(float).tiny)
+        self._best_prior = np.max(self._prior, axis=1)
 
     def phases(self, n: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
         """Draw true points and signals.
@@ -185,8 +185,11 @@ class _Lattice:
     def _moments(self, products: np.ndarray, ray: int, index: int) -> np.ndarray:
         parts = products.view(np.float32).reshape(len(products), -1)
         least = parts[ray] @ self._basis[:, index] + self._offset[ray, index] - _MARGIN
-        envelope = np.abs(products @ self._at_checks).sum(axis=1) * self._checks
-        (rays,) = np.nonzero((envelope - self._least_loss).max(axis=1) > least)
+        # 2 a / r - b / r^2 is at most a^2 / b; a and b vary slowly with the range.
+        envelope = np.abs(products @ self._at_checks).sum(axis=1)**2 / self._energy
+        likely = envelope.max(axis=1) + self._best_prior > least
+        likely[ray] = True
+        (rays,) = np.nonzero(likely)
         values = parts[rays] @ self._basis + self._offset[rays]
         chosen, at = np.nonzero(values > least)
         values = values[chosen, at].astype(float)
@@ -238,7 +241,7 @@ def _steps(model: MeasurementModel, rng: np.random.Generator) -> np.ndarray:
     for axis in (1, 2):
         slopes[:, 0, axis] = -distance * sight[:, axis] / sight[:, 0]
         slopes[:, axis, axis] = distance
-    information = position_information_of(model, positions)
+    information = fisher_information_of(model, positions)
     diagonal = np.einsum('nap,nab,nbp->np', slopes, information, slopes).mean(axis=0)
     low, high = _polar_box(model.scenario)
     steps: np.ndarray = np.minimum(

@@ -50,8 +50,8 @@ def advice(entries: Sequence[Mapping[str, Any]]) -> list[str]:
             unit = curve.label.rpartition('[')[2].rstrip(']')
             at = doubling(curve.values, errors)
             quantity = curve.label.partition(',')[0]
-            limits.append(f'a {quantity} of {at:.2g} {unit}' if np.isfinite(at) else
-                          f'no {quantity} up to {curve.values[-1]:g} {unit}')
+            limits.append(f'a {quantity} of {at:.3g} {unit}' if np.isfinite(at) else
+                          f'no {quantity} up to {curve.values[-1]:.4g} {unit}')
         sentences.append(f'{line}: the squared error doubles at {", ".join(limits)}.')
     uniform = [next(entry for entry in reversed(entries)
                     if (entry['line'], entry['curve']) == (line, 'band_phase_std_rad'))

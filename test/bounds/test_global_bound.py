@@ -18,7 +18,7 @@ def bound_and_codebook(n_phases=1024, **fields):
 
 
 def test_without_signal_the_bound_is_the_variance_of_the_region():
-    scenario, _, bound = bound_and_codebook(512, max_power_w=1e-15, noise_psd_dbm_hz=0.0)
+    scenario, _, bound = bound_and_codebook(256, max_power_w=1e-15, noise_psd_dbm_hz=0.0)
     assert bound.value == pytest.approx(
         np.sum(np.square(scenario.roi_size_m)) / 12, rel=0.02)
 
@@ -35,13 +35,13 @@ def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
 def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
     # In a thin region, only the range is unknown. Its phases repeat every 0.6 m.
     scenario, codebook, bound = bound_and_codebook(
-        2048, multipath_to_los_db=-5.0, roi_center_m=(7.0, 0.0, 0.0), roi_size_m=(3.0, 1e-6, 1e-6))
+        1024, multipath_to_los_db=-5.0, roi_center_m=(7.0, 0.0, 0.0), roi_size_m=(3.0, 1e-6, 1e-6))
     rng = np.random.default_rng(3)
     model = MeasurementModel(scenario, codebook)
     grid = np.zeros((1501, 3))
     grid[:, 0] = np.linspace(5.5, 8.5, len(grid))
     means = model.whiten(model.mean(grid)).reshape(len(grid), -1)
-    truth = scenario.sample_positions(2048, rng)
+    truth = scenario.sample_positions(1024, rng)
     received = model.whiten(model.sample(truth, rng)).reshape(len(truth), -1)
     log = 2 * (received @ means.conj().T).real - np.sum(np.abs(means)**2, axis=1)
     weights = np.exp(log - log.max(axis=1, keepdims=True))
@@ -51,7 +51,7 @@ def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
     assert variances.mean() > 5 * local
     spread = np.hypot(variances.std() / np.sqrt(len(truth)), bound.standard_error)
     assert abs(bound.value - variances.mean()) < 4 * spread
-    assert spread < 0.05 * bound.value
+    assert spread < 0.07 * bound.value
     assert bound.range_part == pytest.approx(bound.value, rel=1e-3)
 
 
@@ -61,12 +61,17 @@ def crlb_of_range(model, truth):
 
 
 def test_squared_errors_have_the_mean_of_the_bound():
-    scenario, _, bound = bound_and_codebook(512)
+    scenario, _, bound = bound_and_codebook(256)
     spread = np.std(bound.squared_errors) / np.sqrt(len(bound.squared_errors))
     assert abs(bound.squared_errors.mean() - bound.value) < 4 * np.hypot(
         spread, bound.standard_error)
     low, high = scenario.roi_bounds_m
     assert ((bound.positions >= low) & (bound.positions <= high)).all()
+
+
+def test_the_amplitude_of_strong_signals_does_not_exclude_the_truth():
+    scenario, codebook, bound = bound_and_codebook(64, multipath_to_los_db=-30.0)
+    assert 0 < bound.value < crlb(scenario, codebook, bound.positions).mean()
 
 
 def test_too_few_phases_are_an_error():

@@ -203,10 +203,14 @@ def table(entries: Sequence[Mapping[str, Any]]) -> str:
 
 
 def picture(curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]]) -> bytes:
-    """Draw a panel for each curve as PNG: root mean squared errors and the roots of the bounds."""
+    """Draw a panel for each curve as PNG: root mean squared errors and the roots of the bounds.
+
+    Bars are intervals of two standard errors.
+    """
     with optional_import('drawing the figure', extra='plot'):
         from matplotlib import colormaps
         from matplotlib.figure import Figure
+        from matplotlib.ticker import LogLocator, NullFormatter
     figure = Figure(figsize=(1.5 + 4 * len(curves), 4.2), layout='constrained')
     panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
     for axes, (name, curve) in zip(panels, curves.items(), strict=True):
@@ -216,19 +220,28 @@ def picture(curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]]) -
         for line, shade, marker in zip(lines, shades, 'os^Dv' * len(lines), strict=False):
             part = [entry for entry in own if entry['line'] == line]
             places = np.arange(len(part))
-            for key, label, style in (('mse_m2', line, '-'), ('bound_m2', 'global bound', '--'),
+            mean, spread = (np.array([entry[key] for entry in part])
+                            for key in ('mse_m2', 'mse_error_m2'))
+            low, high = np.sqrt(np.maximum(mean - 2 * spread, 0)), np.sqrt(mean + 2 * spread)
+            axes.errorbar(places, np.sqrt(mean), [np.sqrt(mean) - low, high - np.sqrt(mean)],
+                          color=shade, marker=marker, capsize=3, label=line)
+            for key, label, style in (('bound_m2', 'global bound', '--'),
                                       ('crlb_m2', 'root of the average CRLB', ':')):
                 if key in part[0]:
                     axes.plot(places, np.sqrt([entry[key] for entry in part]), style, color=shade,
-                              marker=marker if style == '-' else '', label=label
-                              if style == '-' or line == lines[-1] else None)
-        axes.set(xlabel=curve.label, yscale='log')
-        axes.set_xticks(range(len(curve.values)), [f'{value:g}' for value in curve.values])
-        axes.grid(axis='y', which='both', alpha=0.3)
-        axes.tick_params(labelleft=True)
+                              label=label if line == lines[-1] else None)
+        axes.set(xlabel=curve.label)
+        axes.set_xticks(range(len(curve.values)), [f'{value:.4g}' for value in curve.values])
+        axes.grid(axis='y', alpha=0.3)
+    if any(curve.bounds for curve in curves.values()):
+        panels[0].set_yscale('log')
+        panels[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panels[0].yaxis.set_major_formatter('{x:g}')
+        panels[0].yaxis.set_minor_formatter(NullFormatter())
+    else:
+        panels[0].set_ylim(0, None)
     panels[0].set_ylabel('root mean squared error [m]')
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside lower center', ncols=5)
+    panels[0].legend()
     stream = io.BytesIO()
     figure.savefig(stream, format='png', dpi=120)
     return stream.getvalue()
