@@ -25,7 +25,7 @@ from rhs_isac_ros.experiments import parse_options, run_command
 from rhs_isac_ros.model import Scenario
 
 TRIALS, QUICK_TRIALS = 20, 1
-PHASES, QUICK_PHASES = 4096, 256
+PHASES, QUICK_PHASES = 4096, 1024
 STEPS, QUICK_STEPS = 600, 100
 
 

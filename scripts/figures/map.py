@@ -93,6 +93,7 @@ def picture(maps: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
     with optional_import('drawing the figure', extra='plot'):
         from matplotlib.colors import LogNorm
         from matplotlib.figure import Figure
+        from matplotlib.ticker import LogLocator
     figure = Figure(figsize=(10.5, 3.1 * len(maps)), layout='constrained')
     panels = figure.subplots(len(maps), 3, sharex=True, sharey=True, squeeze=False)
     roots = {name: {key: np.sqrt(own[key]) for key in TITLES} for name, own in maps.items()}
@@ -108,7 +109,8 @@ def picture(maps: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
         row[0].set_ylabel('y [m]')
     for axes in panels[-1]:
         axes.set_xlabel('x, distance from the surface [m]')
-    figure.colorbar(image, ax=panels, label='[m]', shrink=0.8)
+    figure.colorbar(image, ax=panels, label='error or bound [m]', shrink=0.8,
+                    ticks=LogLocator(subs=(1, 2, 5)), format='%g').minorticks_off()
     stream = io.BytesIO()
     figure.savefig(stream, format='png', dpi=120)
     return stream.getvalue()
