@@ -5,11 +5,11 @@ cosines. No estimator has a smaller mean squared error than the posterior mean, 
 mean of an estimator that is also given q modulo a lattice has a smaller one still. Given q modulo
 the lattice, the position is one of M known points. With the whitened differences
 d_k = L^-1 (mu(p_k) - mu(p)), Lambda = L L^H, and white noise n of unit covariance, the
-log-likelihood of the point k relative to the true one is -|d_k|^2 + 2 Re(d_k^H n), so that the
+log-likelihood of the point k relative to the true one is -d_k^H d_k + 2 Re(d_k^H n), so that the
 error of the informed estimator is an M-ary average over n, which is drawn at random. This extends
-the pairs of hypotheses of the Ziv-Zakai bound, Bell, Steinberg, Ephraim and Van Trees, Extended
-Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2), 1997, to all
-hypotheses at once; two points instead of M give their P_min = Q(|d| / sqrt 2).
+the pairs of hypotheses of the Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees, Extended
+Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2), 1997) to all
+hypotheses at once; of two points, the wrong one is chosen with probability Q(sqrt(d^H d / 2)).
 
 The finer the lattice, the tighter the bound. Steps of one to two local standard deviations lose
 little, because the variance of a Gaussian that is sampled so coarsely is almost exact.

@@ -241,7 +241,10 @@ def picture(curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]]) -
     else:
         panels[0].set_ylim(0, None)
     panels[0].set_ylabel('root mean squared error [m]')
-    panels[0].legend()
+    handles, labels = panels[0].get_legend_handles_labels()
+    # Bars come last by default.
+    order = np.argsort([not isinstance(handle, tuple) for handle in handles], kind='stable')
+    panels[0].legend([handles[k] for k in order], [labels[k] for k in order])
     stream = io.BytesIO()
     figure.savefig(stream, format='png', dpi=120)
     return stream.getvalue()
