@@ -26,8 +26,8 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 
 # Lattice steps of (r, u, v), in standard deviations of one coordinate with the others known, and
-# the smallest number of steps across the region. With Table I, halving them changes the bound by
-# about 1 %.
+# the smallest number of steps across the region. With Table I, steps half as large across the
+# line of sight change the bound by (1 +- 2) %.
 _STEPS = np.array([2.4, 1.2, 1.2])
 _MIN_STEPS = 24
 # Largest number of lattice points in the box around the region; steps grow beyond it.
