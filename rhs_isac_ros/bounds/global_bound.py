@@ -56,6 +56,9 @@ class GlobalBound(NamedTuple):
         Positions of the phases that were drawn, float64 [n, 3] [m].
     squared_errors
         Squared error of the informed estimator in each, float64 [n] [m^2].
+    coarseness
+        Factor by which a limit on the number of lattice points has enlarged the steps; 1 if the
+        lattice resolves the posterior. The bound is loose if this is above about 2.
     """
 
     value: float
@@ -63,6 +66,7 @@ class GlobalBound(NamedTuple):
     range_part: float
     positions: np.ndarray
     squared_errors: np.ndarray
+    coarseness: float
 
 
 def global_bound(
@@ -81,7 +85,7 @@ def global_bound(
     if n_phases < 2:
         raise ValueError(f'n_phases: {n_phases}, expected at least 2')
     model = MeasurementModel(scenario, codebook).prepare()
-    steps = _steps(model, rng)
+    steps, coarseness = _steps(model, rng)
     parts = []
     for first in range(0, n_phases, _PER_OFFSET):
         # The offset of a random position, so that positions of all phases are uniform.
@@ -92,7 +96,7 @@ def global_bound(
     variances = moments[:, 3]
     return GlobalBound(
         float(variances.mean()), float(variances.std(ddof=1) / np.sqrt(n_phases)),
-        float(moments[:, 4].mean()), moments[:, :3], moments[:, 5])
+        float(moments[:, 4].mean()), moments[:, :3], moments[:, 5], coarseness)
 
 
 class _Lattice:
@@ -231,8 +235,8 @@ def _polar_box(scenario: Scenario) -> np.ndarray:
     return limits
 
 
-def _steps(model: MeasurementModel, rng: np.random.Generator) -> np.ndarray:
-    """Steps of the lattice in (r [m], u, v), from the local deviations of each coordinate."""
+def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """Steps of the lattice in (r [m], u, v), from local deviations, and their coarseness."""
     positions = model.scenario.sample_positions(256, rng)
     distance = np.linalg.norm(positions, axis=1)
     sight = positions / distance[:, None]
@@ -247,5 +251,5 @@ def _steps(model: MeasurementModel, rng: np.random.Generator) -> np.ndarray:
     steps: np.ndarray = np.minimum(
         _STEPS / np.sqrt(np.maximum(diagonal, 1e-30)), (high - low) / _MIN_STEPS)
     n_points = np.prod((high - low) / steps)
-    steps *= max(n_points / _MAX_POINTS, 1.0)**(1 / 3)
-    return steps
+    coarseness = float(max(n_points / _MAX_POINTS, 1.0))**(1 / 3)
+    return steps * coarseness, coarseness

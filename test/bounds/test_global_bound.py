@@ -30,6 +30,7 @@ def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
     size = np.square(scenario.roi_size_m).sum() / 12
     assert local < size / 20
     assert bound.value == pytest.approx(local, rel=0.1)
+    assert bound.coarseness == 1
 
 
 def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
@@ -72,6 +73,7 @@ def test_squared_errors_have_the_mean_of_the_bound():
 def test_the_amplitude_of_strong_signals_does_not_exclude_the_truth():
     scenario, codebook, bound = bound_and_codebook(64, multipath_to_los_db=-30.0)
     assert 0 < bound.value < crlb(scenario, codebook, bound.positions).mean()
+    assert bound.coarseness > 2
 
 
 def test_too_few_phases_are_an_error():

@@ -83,6 +83,14 @@ def test_curves_write_a_figure_each(curves, parts, tmp_path, capsys):
     assert 'Rice factor [dB]' in capsys.readouterr().out
 
 
+def test_codebooks_get_the_power_of_the_scenario(curves, parts, tmp_path):
+    call = ['--quick', '--jobs', '1', '--output', str(tmp_path)]
+    assert curves.main(['power', *call]) == 0
+    for file in (tmp_path / 'jobs').glob('errors-*.json'):
+        case = json.loads(file.read_text(encoding='utf-8'))['arguments']
+        parts.Codebook.from_parameters(case['codebook']).check(Scenario(**case['scenario']))
+
+
 def test_an_unknown_curve_is_an_error(curves):
     with pytest.raises(SystemExit, match='NAME: fame, expected some of bands, pilots'):
         curves.main(['fame'])

@@ -31,6 +31,8 @@ SPACINGS: Mapping[str, Callable[[int], Sequence[float]]] = {
                           8: [k / 34 for k in (0, 1, 4, 9, 15, 22, 32, 34)]}[n]}
 # Positions of a trial, and the seed of all signals.
 BLOCK, SEED = 250, 1
+# A bound from a coarser lattice is too loose to be drawn.
+MAX_COARSENESS = 2.0
 # Positions of an optimisation.
 SAMPLES = 64
 
@@ -108,6 +110,16 @@ def plain(codebook: Codebook) -> Changes:
     return {name: np.asarray(value).tolist() for name, value in codebook.to_parameters().items()}
 
 
+def with_power(codebook: Changes, scenario: Changes) -> Changes:
+    """Scale the combining vectors of a codebook to the power of a scenario."""
+    if 'max_power_w' not in scenario:
+        return codebook
+    book = Codebook.from_parameters(codebook)
+    power = np.sum(np.abs(book.digital)**2, axis=(1, 3), keepdims=True)
+    return plain(Codebook(
+        book.analog, book.digital * np.sqrt(scenario['max_power_w'] / power)))
+
+
 def points_of(name: str, curve: Curve, plans: Mapping[str, Plan]) -> list[Point]:
     """List the points of a curve, line by line."""
     if curve.change is None:
@@ -145,7 +157,8 @@ def bounds(scenario: Changes, codebook: Changes, phases: int) -> dict[str, Any]:
     world, book = Scenario(**scenario), Codebook.from_parameters(codebook)
     bound = global_bound(world, book, streams.generator(SEED, streams.HELD_OUT), phases)
     return {'crlb_m2': float(crlb(world, book, bound.positions).mean()),
-            'bound_m2': bound.value, 'bound_error_m2': bound.standard_error}
+            'bound_m2': bound.value if bound.coarseness <= MAX_COARSENESS else np.nan,
+            'bound_error_m2': bound.standard_error}
 
 
 class Sizes(NamedTuple):
@@ -169,8 +182,9 @@ def evaluate(curves: Mapping[str, Curve], plans: Mapping[str, Plan], sizes: Size
               if point.plan.codebook is None}
     books = run(optimise, {key: Job(f'codebook-{key}', {
         'scenario': changes, 'steps': sizes.steps}) for key, changes in wanted.items()})
-    cases = [(point, {'scenario': point.changes, 'codebook': point.plan.codebook or books[
-        Scenario(**point.plan.changes).id]}) for point in points]
+    cases = [(point, {'scenario': point.changes, 'codebook': with_power(
+        point.plan.codebook or books[Scenario(**point.plan.changes).id], point.changes)})
+        for point in points]
     slugs = [f'{Scenario(**point.changes).id}-{Codebook.from_parameters(case["codebook"]).id}'
              for point, case in cases]
     located = run(locate, {
