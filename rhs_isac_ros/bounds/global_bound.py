@@ -58,7 +58,7 @@ class GlobalBound(NamedTuple):
         Squared error of the informed estimator in each, float64 [n] [m^2].
     coarseness
         Factor by which a limit on the number of lattice points has enlarged the steps; 1 if the
-        lattice resolves the posterior. The bound is loose if this is above about 2.
+        lattice resolves the posterior. The bound is loose if this is above about 3.
     """
 
     value: float

@@ -32,7 +32,7 @@ SPACINGS: Mapping[str, Callable[[int], Sequence[float]]] = {
 # Positions of a trial, and the seed of all signals.
 BLOCK, SEED = 250, 1
 # A bound from a coarser lattice is too loose to be drawn.
-MAX_COARSENESS = 2.0
+MAX_COARSENESS = 3.0
 # Positions of an optimisation.
 SAMPLES = 64
 
