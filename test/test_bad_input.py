@@ -14,6 +14,8 @@ CODEBOOK = str(ROOT / 'config' / 'codebook.yaml')
 QUICK_CODEBOOK = str(ROOT / 'config' / 'codebook_quick.yaml')
 QUICK = str(ROOT / 'config' / 'quick.yaml')
 LONG = 300 * 'x'
+NEEDS_MCAP = pytest.mark.skipif(
+    not importlib.util.find_spec('mcap'), reason='mcap is not installed')
 
 # Module whose main function is called, arguments, and a part of the error. Every call takes place
 # in a folder with the files of the fixture `folder`.
@@ -46,14 +48,14 @@ CALLS = [
     ('tools.record', ['x.mcap', '-p', 'a:=1'], 'ROS arguments follow --ros-args'),
     ('tools.record', ['x.mcap', '--ros-args', '--bogus'], "invalid ROS arguments: ['--bogus']"),
     ('tools.calibrate', ['none.mcap'], "'none.mcap', expected an existing file"),
-    ('tools.calibrate', ['garbage'], 'garbage: not a complete recording'),
+    pytest.param('tools.calibrate', ['garbage'], 'garbage: not a complete recording',
+                 marks=NEEDS_MCAP),
     ('tools.calibrate', ['--cycles', '0'], 'argument --cycles: 0, expected at least 1'),
     ('tools.calibrate', ['garbage', '--output', 'garbage'], 'another file than'),
     ('tools.replay', ['none.mcap'], "'none.mcap', expected an existing file"),
     ('tools.replay', ['folder'], 'folder: a directory'),
     pytest.param('tools.replay', ['garbage'], 'garbage: not a complete recording',
-                 marks=pytest.mark.skipif(not importlib.util.find_spec('mcap'),
-                                          reason='mcap is not installed')),
+                 marks=NEEDS_MCAP),
     ('tools.replay', ['garbage', '--estimator', 'magic'], "invalid choice: 'magic'"),
     ('tools.replay', ['garbage', '--publish', '--rate', 'nan'], 'expected a positive number'),
     ('tools.replay', ['garbage', '--publish', '--estimator', 'ml'], 'not allowed with'),
