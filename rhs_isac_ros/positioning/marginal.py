@@ -49,10 +49,13 @@ class Found(NamedTuple):
 
 
 class MarginalSearch:
-    """The search for modes with the nuisance parameters of a scenario eliminated."""
+    """The search for modes with the nuisance parameters of a scenario eliminated.
+
+    Without `surroundings`, the evidence outside of the region is zero.
+    """
 
     def __init__(self, model: WhitenedModel, table: TemplateTable,
-                 surroundings: Surroundings, error: ElementErrorModel | None) -> None:
+                 surroundings: Surroundings | None, error: ElementErrorModel | None) -> None:
         self._error = error
         self._model, self._table, self._surroundings = model, table, surroundings
         self.unknowns = Unknowns(model)
@@ -71,9 +74,13 @@ class MarginalSearch:
         samples = (draw_broad_samples(
             self._model, self.unknowns, received, joint, self._table.normal)
             if self._is_broad else None)
-        return Found(modes, residuals, whitened, *self._outside(whitened, aligned), samples)
+        outside = (-np.inf, 1.0)
+        if self._surroundings:
+            outside = self._outside(self._surroundings, whitened, aligned)
+        return Found(modes, residuals, whitened, *outside, samples)
 
-    def _outside(self, whitened: np.ndarray, aligned: np.ndarray) -> tuple[float, float]:
+    def _outside(self, surroundings: Surroundings, whitened: np.ndarray,
+                 aligned: np.ndarray) -> tuple[float, float]:
         """Compute the evidence outside, with the sharp parameters by Laplace's method.
 
         Returns
@@ -82,7 +89,7 @@ class MarginalSearch:
             Logarithm of the evidence, and the most probable factor of the signals.
         """
         unknowns, sharp = self.unknowns, self.unknowns.sharp
-        evidence, scale = self._over_gain(whitened)
+        evidence, scale = self._over_gain(surroundings, whitened)
         if sharp:
             precision = unknowns.precision[sharp]
             curvature = unknowns.information[np.ix_(sharp, sharp)] + np.diag(precision)
@@ -91,17 +98,18 @@ class MarginalSearch:
                 + np.sum(np.log(unknowns.std[sharp])))
         return evidence, scale
 
-    def _over_gain(self, whitened: np.ndarray) -> tuple[float, float]:
+    def _over_gain(
+            self, surroundings: Surroundings, whitened: np.ndarray) -> tuple[float, float]:
         """Average the evidence outside over the gain; also return the most probable scale."""
         unknowns = self.unknowns
         if unknowns.gain is None:
-            return float(self._surroundings.log_evidence(whitened)[0]), 1.0
+            return float(surroundings.log_evidence(whitened)[0]), 1.0
         std = unknowns.std[unknowns.gain]
         n_points = 2 * int(np.ceil(_GAIN_REACH * std / _GAIN_STEP)) + 3
         gain = std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
         prior = -gain**2 / (2 * std**2)
         prior -= np.log(np.sum(np.exp(prior)))
-        evidence = self._surroundings.log_evidence(whitened, np.exp(-gain))
+        evidence = surroundings.log_evidence(whitened, np.exp(-gain))
         evidence += prior - 2 * whitened.size * gain
         best = int(np.argmax(evidence))
         total = evidence[best] + np.log(np.sum(np.exp(evidence - evidence[best])))

@@ -102,7 +102,8 @@ class SearchEstimator(abc.ABC):
         self._max_power = 10**(_GAIN_REACH * scenario.user_gain_std_db / 10)
         if nuisance_parameters(scenario):
             self._marginal = MarginalSearch(
-                self._model, self._table, self._surroundings, self._error)
+                self._model, self._table, self._surroundings if reject_outside else None,
+                self._error)
         n_fitted = _N_COORDINATES + (len(self._marginal.unknowns.names) if self._marginal else 0)
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted parameter.
@@ -173,18 +174,19 @@ class SearchEstimator(abc.ABC):
         return (*moments, reason, residual, expected), None if reason else found.modes
 
     def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
-        modes = find_modes(self._model, self._table, whitened)
-        if self._test.residual_test(-modes.roi_log_likelihood.max()):
-            # Strong signals may need more steps to reach the maximum.
-            modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
-        residuals = -modes.roi_log_likelihood
         if self._failures:
             modes = find_modes(
                 self._model, self._table, whitened, extra_margin=self._failures.search_margin)
             modes, residuals = self._failures.refine(modes, received)
-        elif self._error:
-            signals = np.broadcast_to(received, (len(modes.points), *received.shape))
-            modes, residuals = self._error.refine(modes, signals, step=True)
+        else:
+            modes = find_modes(self._model, self._table, whitened)
+            if self._test.residual_test(-modes.roi_log_likelihood.max()):
+                # Strong signals may need more steps to reach the maximum.
+                modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
+            residuals = -modes.roi_log_likelihood
+            if self._error:
+                signals = np.broadcast_to(received, (len(modes.points), *received.shape))
+                modes, residuals = self._error.refine(modes, signals, step=True)
         outside = (float(self._surroundings.log_evidence(whitened)[0])
                    if self._rejects_outside else -np.inf)
         return Found(modes, residuals, whitened, outside)

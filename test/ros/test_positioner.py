@@ -74,21 +74,30 @@ def test_the_estimate_equals_that_of_the_library(bench, node, send, codebooks, t
     assert len(list((tmp_path / 'tables').iterdir())) == 1
 
 
-def test_each_user_has_a_pose(bench, node, send, codebooks):
-    receiver, poses = bench.add(Node, 'receiver'), []
-    estimates = bench.collect(receiver, m.PositionEstimate)
-    subscription = receiver.create_subscription(
-        PoseWithCovarianceStamped, 'users/user_1/pose', poses.append, qos.EXCHANGE)
-    node.dispatch(CodebookOffered(codebooks[0]))
-    # The first estimate creates the topic.
-    send(3)
-    bench.until(subscription.get_publisher_count, 'the topic')
-    send(4)
-    bench.until(lambda: len(estimates) == 2, 'the estimates')
-    last = estimates[-1]
-    bench.until(lambda: poses and poses[-1].pose.pose.position.x == last.position[0], 'the pose')
-    assert poses[-1].header.frame_id == 'map'
-    assert poses[-1].pose.covariance[0] == last.covariance_m2[0, 0]
+@pytest.fixture
+def second_estimate(bench, node, send, codebooks):
+    """Function that returns the second estimate of user 1 and its message on another topic."""
+    def of(kind, topic):
+        receiver, messages = bench.add(Node, 'receiver'), []
+        estimates = bench.collect(receiver, m.PositionEstimate)
+        subscription = receiver.create_subscription(kind, topic, messages.append, qos.EXCHANGE)
+        node.dispatch(CodebookOffered(codebooks[0]))
+        # The first estimate creates the topic.
+        send(3)
+        bench.until(subscription.get_publisher_count, 'the topic')
+        send(4)
+        bench.until(lambda: len(estimates) == 2, 'the estimates')
+        last = estimates[-1]
+        bench.until(lambda: messages and messages[-1].pose.pose.position.x == last.position[0],
+                    'the message')
+        return last, messages[-1]
+    return of
+
+
+def test_each_user_has_a_pose(second_estimate):
+    last, pose = second_estimate(PoseWithCovarianceStamped, 'users/user_1/pose')
+    assert pose.header.frame_id == 'map'
+    assert pose.pose.covariance[0] == last.covariance_m2[0, 0]
 
 
 def test_signals_are_answered_while_another_estimator_is_built(
@@ -153,21 +162,8 @@ class TestTrack:
     def values(self):
         return {'prior': 'track'}
 
-    def test_each_user_has_odometry(self, bench, node, send, codebooks):
-        receiver, tracks = bench.add(Node, 'receiver'), []
-        estimates = bench.collect(receiver, m.PositionEstimate)
-        subscription = receiver.create_subscription(
-            Odometry, 'users/user_1/odometry', tracks.append, qos.EXCHANGE)
-        node.dispatch(CodebookOffered(codebooks[0]))
-        # The first estimate creates the topic.
-        send(3)
-        bench.until(subscription.get_publisher_count, 'the topic')
-        send(4)
-        bench.until(lambda: len(estimates) == 2, 'the estimates')
-        last = estimates[-1]
-        bench.until(lambda: tracks and tracks[-1].pose.pose.position.x == last.position[0],
-                    'the odometry')
-        track = tracks[-1]
+    def test_each_user_has_odometry(self, second_estimate):
+        last, track = second_estimate(Odometry, 'users/user_1/odometry')
         assert (track.header.frame_id, track.child_frame_id) == ('map', 'user_1')
         covariance = np.reshape(track.pose.covariance, (6, 6))
         np.testing.assert_array_equal(covariance[:3, :3], last.covariance_m2)
