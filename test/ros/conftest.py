@@ -94,6 +94,13 @@ def bench():
     bench.close()
 
 
+@pytest.fixture(scope='module')
+def module_bench():
+    bench = Bench(EventsExecutor)
+    yield bench
+    bench.close()
+
+
 @pytest.fixture(params=[EventsExecutor, SingleThreadedExecutor], ids=['events', 'single'])
 def each_bench(request):
     """A bench with each executor that the nodes support."""

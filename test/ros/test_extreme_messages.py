@@ -1,9 +1,11 @@
 """Well-formed messages with extreme values do not crash a node.
 
 The executor raises the exceptions of callbacks in the test, so a node that would crash fails it.
+The tests of a node share it where they can, each with cycles of its own.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -28,19 +30,21 @@ PLACE = np.array([10.0, 0.5, 0.2])
 HUGE = (1e100, 1e200, 1e308)
 
 
+def add(bench, files, kind, **values):
+    values['scenario_file'] = files / 'scenario.yaml'
+    return bench.add(kind, parameter_overrides=[
+        Parameter(name, value=str(value)) for name, value in values.items()])
+
+
 class NodeUnderTest:
     """A node under test and publishers for the messages that it receives."""
 
-    def __init__(self, bench, files, kind, inputs, answers, **values):
-        overrides = [Parameter('scenario_file', value=str(files / 'scenario.yaml'))]
-        if kind is not ChannelNode:
-            bench.add(OptimizerNode, parameter_overrides=[
-                *overrides, Parameter('codebook_file', value=str(files / 'first.yaml'))])
-        overrides += [Parameter(name, value=value) for name, value in values.items()]
-        self.node = bench.add(kind, parameter_overrides=overrides)
+    def __init__(self, bench, files, kind, inputs, answers):
+        self.node = add(bench, files, kind)
         self._bench = bench
         probe = bench.add(Node, 'probe')
         self._publishers = {kind: bench.publisher(probe, kind) for kind in inputs}
+        self._cycles = itertools.count(1)
         self._dispatched, self._dispatch = 0, self.node.dispatch
         self.node.dispatch = self._count
         self.received = bench.collect(probe, answers)
@@ -58,6 +62,10 @@ class NodeUnderTest:
         """Number of messages that the role has handled or the node has dropped."""
         return self._dispatched + self.node.role.counters['malformed']
 
+    def new_cycle(self):
+        """Return the number of a cycle that no message has named."""
+        return next(self._cycles)
+
     def send(self, *messages):
         """Send messages, each once the previous one has been handled: topics share no order."""
         stamp = self.node.get_clock().now().to_msg()
@@ -74,17 +82,29 @@ class NodeUnderTest:
             check(message, self.scenario.sizes)
 
 
-@pytest.fixture
-def make_node(bench, small_files):
-    def make(*args, **values):
-        return NodeUnderTest(bench, small_files, *args, **values)
-    return make
+@pytest.fixture(scope='module')
+def channel(module_bench, small_files):
+    return NodeUnderTest(
+        module_bench, small_files, ChannelNode,
+        (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data), m.FeedSignals)
 
 
-@pytest.fixture
-def channel(make_node):
-    return make_node(
-        ChannelNode, (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data), m.FeedSignals)
+@pytest.fixture(scope='module')
+def optimizer(module_bench, small_files):
+    return add(module_bench, small_files, OptimizerNode, codebook_file=small_files / 'first.yaml')
+
+
+@pytest.fixture(scope='module')
+def transmission(module_bench, optimizer, small_files):
+    return NodeUnderTest(
+        module_bench, small_files, TransmissionNode,
+        (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth), m.Beam)
+
+
+@pytest.fixture(scope='module')
+def positioner(module_bench, optimizer, small_files):
+    return NodeUnderTest(
+        module_bench, small_files, PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
 
 
 def truth(cycle_id, place=PLACE):
@@ -111,39 +131,42 @@ def beam(scenario, cycle_id, amplitude=1e-3, expected_bps=1e6):
 
 
 def send_plausible_pilot(node):
-    node.send(truth(9), applied(node.scenario, 9), pilot(9))
-    node.until_answer(9)
+    cycle = node.new_cycle()
+    node.send(truth(cycle), applied(node.scenario, cycle), pilot(cycle))
+    node.until_answer(cycle)
 
 
 @pytest.mark.parametrize('rows', [1, 3, 5])
 def test_channel_continues_after_configurations_for_another_number_of_frames(channel, rows):
-    channel.send(truth(1), applied(channel.scenario, 1, rows=rows), pilot(1))
+    cycle = channel.new_cycle()
+    channel.send(truth(cycle), applied(channel.scenario, cycle, rows=rows), pilot(cycle))
     send_plausible_pilot(channel)
 
 
 @pytest.mark.parametrize('place', [
     (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
 def test_channel_continues_after_positions_outside_the_model(channel, place):
-    scenario = channel.scenario
+    scenario, cycle = channel.scenario, channel.new_cycle()
     place = element_positions(scenario)[1] if place == 'on an element' else place
-    channel.send(truth(1, place), applied(scenario, 1), pilot(1),
-                 applied(scenario, 1, m.Mode.TRANSMISSION), beam(scenario, 1),
-                 m.Data(cycle_id=1, user=1, direction=m.Direction.DOWNLINK,
+    channel.send(truth(cycle, place), applied(scenario, cycle), pilot(cycle),
+                 applied(scenario, cycle, m.Mode.TRANSMISSION), beam(scenario, cycle),
+                 m.Data(cycle_id=cycle, user=1, direction=m.Direction.DOWNLINK,
                      stage=m.Stage.OFFERED, duration_s=1.0, bits=1.0))
     send_plausible_pilot(channel)
 
 
 @pytest.mark.parametrize('number', HUGE)
 def test_channel_continues_after_huge_numbers(channel, number):
-    scenario = channel.scenario
+    scenario, first, second = channel.scenario, channel.new_cycle(), channel.new_cycle()
     channel.send(
-        truth(1), applied(scenario, 1), pilot(1, number),
-        applied(scenario, 1, m.Mode.TRANSMISSION), beam(scenario, 1),
+        truth(first), applied(scenario, first), pilot(first, number),
+        applied(scenario, first, m.Mode.TRANSMISSION), beam(scenario, first),
         m.Data(
-            cycle_id=1, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
+            cycle_id=first, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
             duration_s=number, bits=number),
-        truth(2), applied(scenario, 2, m.Mode.TRANSMISSION), beam(scenario, 2, number),
-        m.Data(cycle_id=2, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
+        truth(second), applied(scenario, second, m.Mode.TRANSMISSION),
+        beam(scenario, second, number),
+        m.Data(cycle_id=second, user=1, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
             duration_s=1.0, bits=1.0))
     send_plausible_pilot(channel)
 
@@ -167,26 +190,24 @@ def estimate(node, cycle_id, place=PLACE):
 @pytest.mark.parametrize('place', [
     (0, 0, 0), 'on an element', (-10, 0, 0), *((number, 0, 0) for number in HUGE)])
 @pytest.mark.parametrize('what', ['estimate', 'truth'])
-def test_transmission_continues_after_positions_outside_the_model(
-        make_node, place, what):
-    node = make_node(
-        TransmissionNode, (m.PositionEstimate, m.RhsConfiguration, m.GroundTruth), m.Beam)
-    scenario = node.scenario
+def test_transmission_continues_after_positions_outside_the_model(transmission, place, what):
+    node, scenario = transmission, transmission.scenario
+    first, second = node.new_cycle(), node.new_cycle()
     place = element_positions(scenario)[1] if place == 'on an element' else place
     places = {'estimate': PLACE, 'truth': PLACE, what: place}
-    node.send(truth(1, places['truth']), estimate(node, 1, places['estimate']),
-              applied(scenario, 1, m.Mode.TRANSMISSION), estimate(node, 2))
-    node.until_answer(2)
+    node.send(truth(first, places['truth']), estimate(node, first, places['estimate']),
+              applied(scenario, first, m.Mode.TRANSMISSION), estimate(node, second))
+    node.until_answer(second)
 
 
 @pytest.mark.parametrize('number', HUGE)
-def test_positioner_continues_after_huge_signals(make_node, number):
-    node = make_node(PositionerNode, (m.ReceivedSignals,), m.PositionEstimate)
+def test_positioner_continues_after_huge_signals(positioner, number):
+    node, first, second = positioner, positioner.new_cycle(), positioner.new_cycle()
     scenario, codebook = node.scenario, node.codebook
     shape = codebook.digital.shape[:3]
     plausible = simulate_received(scenario, codebook, PLACE[None], np.random.default_rng(0))[0]
-    received = m.ReceivedSignals(cycle_id=1, user=1, codebook_id=codebook.id,
+    received = m.ReceivedSignals(cycle_id=first, user=1, codebook_id=codebook.id,
         signals=np.full(shape, number * (1 + 1j)))
     node.send(received)
-    node.send(dataclasses.replace(received, cycle_id=9, signals=plausible.reshape(shape)))
-    node.until_answer(9)
+    node.send(dataclasses.replace(received, cycle_id=second, signals=plausible.reshape(shape)))
+    node.until_answer(second)
