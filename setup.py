@@ -42,18 +42,18 @@ setup(
     python_requires='>=3.10',
     # The library requires nothing else. The nodes also require ROS 2, which pip cannot install:
     # rosdep reads package.xml, and scripts/setup reads requirements.txt.
-    install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6'],
+    install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6', 'threadpoolctl>=3.1'],
     # Tests and the documentation read this table as a literal.
     extras_require={
         'plot': ['matplotlib'],
         'experiments': ['joblib', 'dask', 'distributed', 'tqdm'],
-        'neural': ['scikit-learn', 'threadpoolctl'],
+        'neural': ['scikit-learn'],
         'genetic': ['pymoo'],
         'recording': ['mcap'],
         'watch': ['rich'],
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
-            'threadpoolctl', 'pymoo', 'mcap', 'rich'],
+            'pymoo', 'mcap', 'rich'],
         'docs': ['sphinx'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'rosbags'],
     },

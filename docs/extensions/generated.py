@@ -136,8 +136,8 @@ def dependency_table():
     keys = (ROOT / 'package.xml').read_text(encoding='utf-8')
     rows = []
     for extra, names in extras.items():
-        # The extra `all` repeats the others, and scikit-learn depends on threadpoolctl.
-        missing = [name for name in names if extra != 'all' and name != 'threadpoolctl'
+        # The extra `all` repeats the others.
+        missing = [name for name in names if extra != 'all'
                    and f'>python3-{name.replace("scikit-learn", "sklearn")}<' not in keys]
         if missing:
             rows.append((code(extra), code(' '.join(missing)),

@@ -20,6 +20,7 @@ from rhs_isac_ros.bounds.quadratic_gradient import quadratic_gradients
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses
 # [n] and their negative derivatives with respect to the forms, float64 [n, G, G].
@@ -96,6 +97,7 @@ class Average:
         If the tolerance is neither 0 nor large enough.
     """
 
+    @one_blas_thread
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                  loss: Loss, tolerance: float, patterns: Sequence[Pattern] = PLAIN,
                  combination: Combination | None = None) -> None:
@@ -106,11 +108,13 @@ class Average:
             ExactRows(scenario, source, n_items, n_rows, patterns) if tolerance == 0
             else CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns))
 
+    @one_blas_thread
     def value(self, codebook: Beamforming) -> float:
         """Compute the average without its gradients."""
         total = sum(float(losses.sum()) for losses, _ in self._losses(codebook))
         return total / self.rows.n_items
 
+    @one_blas_thread
     def __call__(self, codebook: Beamforming) -> Gradient:
         """Compute the average and its gradients."""
         model = self._model(codebook)

@@ -11,6 +11,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.model.surface import Beamforming
+from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
 # Positions evaluated at a time.
 _BLOCK = 256
@@ -18,6 +19,7 @@ _BLOCK = 256
 _MIN_PIVOT = 1e-14
 
 
+@one_blas_thread
 def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
          region_prior: bool = False) -> np.ndarray:
     """Implements Eq. (11). Cramer-Rao lower bound on the mean squared positioning error.
@@ -41,6 +43,7 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
     return crlb_of(MeasurementModel(scenario, codebook), positions, region_prior=region_prior)
 
 
+@one_blas_thread
 def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
             region_prior: bool = False) -> np.ndarray:
     """Compute `crlb` for a model, whose whitener is shared by all calls."""
@@ -93,6 +96,7 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
     return inverse
 
 
+@one_blas_thread
 def fisher_information(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (12). Fisher information of the received signals about the position.
@@ -111,11 +115,15 @@ def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.
     """Compute `fisher_information` for a model, whose whitener is shared by all calls."""
     positions = checked_positions(positions)
     information = np.zeros((len(positions), 3, 3))
-    for start in range(0, len(positions), _BLOCK):
+    whiteners = model.whitener
+
+    def fill(start: int) -> None:
         block = slice(start, start + _BLOCK)
-        for band, whitener in enumerate(model.whitener):
+        for band, whitener in enumerate(whiteners):
             whitened = model.band_jacobian(positions[block], band) @ whitener.T
             information[block] += quadratic_form(whitened)
+
+    map_blocks(fill, range(0, len(positions), _BLOCK))
     return information
 
 

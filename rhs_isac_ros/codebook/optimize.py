@@ -23,6 +23,7 @@ from rhs_isac_ros.codebook.search import BudgetSpent, Progress, Search
 from rhs_isac_ros.codebook.start import STARTS, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Sobol points; as good as 1200 independent positions.
 DEFAULT_POSITIONS = 256
@@ -70,6 +71,7 @@ class OptimizeResult:
     reason: str
 
 
+@one_blas_thread
 def optimize(
         scenario: Scenario, positions: np.ndarray | None = None, method: str = 'lbfgs', *,
         objective: str = 'crlb', sampling: str = 'sobol', n_positions: int = DEFAULT_POSITIONS,

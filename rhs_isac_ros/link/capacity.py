@@ -11,6 +11,7 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.shapes import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Quadrature nodes along each principal axis of the covariance.
 _N_NODES = 3
@@ -37,6 +38,7 @@ class Beam:
     band: int = 0
 
 
+@one_blas_thread
 def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
     """Implements Eq. (10). Capacity R_i of a beam at `positions`, float64 [N, 3] [m].
 
@@ -56,6 +58,7 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
     return rates
 
 
+@one_blas_thread
 def expected_capacity(
         scenario: Scenario, beam: Beam, mean: np.ndarray, covariance: np.ndarray) -> float:
     """Average Eq. (10) [bit/s] over a Gaussian posterior of the user's position.

@@ -13,6 +13,7 @@ from rhs_isac_ros.link.search import candidate_configurations
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface import matched_configuration
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Number of candidates to compare over all sub-bands and modes, and of ascents.
 _N_CANDIDATES = 8
@@ -45,6 +46,7 @@ class CapacityReport:
         return 100 * self.loss_bps / self.perfect_bps if self.perfect_bps else math.nan
 
 
+@one_blas_thread
 def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
           surface: SurfaceEstimate | None = None) -> Beam:
     """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
@@ -79,6 +81,7 @@ def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
                 beam.band)
 
 
+@one_blas_thread
 def choose_beam(
         scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
         bands: Sequence[int] | None = None, surface: SurfaceEstimate | None = None) -> Choice:
@@ -113,6 +116,7 @@ def choose_beam(
     return max(choices, key=lambda choice: choice.expected_bps)
 
 
+@one_blas_thread
 def capacity_report(
         scenario: Scenario, beam: Beam, position: np.ndarray,
         bands: Sequence[int] | None = None,

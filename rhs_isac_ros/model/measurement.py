@@ -24,6 +24,7 @@ from rhs_isac_ros.model.receive import received_signal
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
 # What may be known of the elements: their errors, or an estimate of them.
 Surface = SurfaceImperfection | SurfaceEstimate
@@ -91,6 +92,7 @@ class MeasurementModel:
         If the beamforming or the surface does not have the sizes of the scenario.
     """
 
+    @one_blas_thread
     def __init__(self, scenario: Scenario, beamforming: Beamforming,
                  surface: Surface | None = None) -> None:
         self.scenario, self._beams = scenario, beamforming
@@ -108,6 +110,7 @@ class MeasurementModel:
         n_bands, n_measurements, _ = self.radiation.shape
         return n_bands, n_measurements
 
+    @one_blas_thread
     def covariance(self) -> np.ndarray:
         """Compute Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W]; the result is not cached.
 
@@ -141,6 +144,7 @@ class MeasurementModel:
         """L_i^-1, lower triangular, complex128 [N_B, N_SB F, N_SB F], read-only."""
         return _read_only(np.linalg.inv(self.root))
 
+    @one_blas_thread
     def prepare(self, jacobian: bool = False) -> 'MeasurementModel':
         """Compute the whitener, and on request the weights of `mean_and_jacobian`, in advance."""
         _ = self.whitener
@@ -158,13 +162,16 @@ class MeasurementModel:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
         positions = checked_positions(positions)
         mean = np.empty((len(positions), *self.shape), complex)
+
         # A change of this kernel or its block size would change the simulated signals of all
         # seeds.
-        for band, radiation in enumerate(self.radiation):
-            for start in range(0, len(positions), _BLOCK):
-                block = slice(start, start + _BLOCK)
+        def fill(start: int) -> None:
+            block = slice(start, start + _BLOCK)
+            for band, radiation in enumerate(self.radiation):
                 los = los_gain(self.scenario, positions[block], band)
                 mean[block, band] = received_signal(los, 0.0, radiation, 0.0)
+
+        map_blocks(fill, range(0, len(positions), _BLOCK))
         return mean
 
     def band_jacobian(self, positions: np.ndarray, band: int) -> np.ndarray:
@@ -179,10 +186,13 @@ class MeasurementModel:
         """Compute the derivative of the mean signals, complex128 [N, 3, N_B, N_SB F] [1/m]."""
         positions = checked_positions(positions)
         jacobian = np.empty((len(positions), 3, *self.shape), complex)
-        for start in range(0, len(positions), _BLOCK):
+
+        def fill(start: int) -> None:
             block = slice(start, start + _BLOCK)
             for band in range(len(self.radiation)):
                 jacobian[block, :, band] = self.band_jacobian(positions[block], band)
+
+        map_blocks(fill, range(0, len(positions), _BLOCK))
         return jacobian
 
     def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -190,14 +200,18 @@ class MeasurementModel:
         positions = checked_positions(positions)
         mean = np.empty((len(positions), *self.shape), complex)
         jacobian = np.empty((len(positions), 3, *self.shape), complex)
-        for start in range(0, len(positions), _BLOCK):
+        weights = self._weights
+
+        def fill(start: int) -> None:
             block = slice(start, start + _BLOCK)
             for band in range(len(self.radiation)):
-                mean[block, band], by_position = self._weights.mean_and_jacobian(
-                    positions[block], band)
+                mean[block, band], by_position = weights.mean_and_jacobian(positions[block], band)
                 jacobian[block, :, band] = np.swapaxes(by_position, 0, 1)
+
+        map_blocks(fill, range(0, len(positions), _BLOCK))
         return mean, jacobian
 
+    @one_blas_thread
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw signals of independent phases, one at each position, complex128 [N, N_B, N_SB F].
 

@@ -7,6 +7,7 @@ from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Phases simulated at a time. The random numbers of a seed depend on it.
 _BLOCK = 256
@@ -41,6 +42,7 @@ def received_signal(
     return received
 
 
+@one_blas_thread
 def simulate_received(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
         rng: np.random.Generator, surface: SurfaceImperfection | None = None) -> np.ndarray:

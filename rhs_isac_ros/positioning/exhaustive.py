@@ -8,6 +8,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.imperfections import SurfaceImperfection, has_element_errors
 from rhs_isac_ros.model.nuisance import nuisance_parameters
+from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received, stack_parts
 from rhs_isac_ros.positioning.exhaustive_errors import ElementErrorLikelihood
 from rhs_isac_ros.positioning.exhaustive_nuisance import NuisanceLikelihood
@@ -15,6 +16,7 @@ from rhs_isac_ros.positioning.exhaustive_nuisance import NuisanceLikelihood
 _BLOCK = 4096
 
 
+@one_blas_thread
 def exhaustive_posterior(
         scenario: Scenario, codebook: Codebook, received: np.ndarray, log2_points: int = 22,
         progress: Callable[[float], None] | None = None, *,

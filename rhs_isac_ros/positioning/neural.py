@@ -7,6 +7,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.fit import FitTest
 from rhs_isac_ros.positioning.network import ModelError, Network
@@ -46,6 +47,7 @@ class NeuralEstimator:
         check_trained_for(self._network, scenario, codebook, source)
         self._test = FitTest(int(np.prod(self._model.shape)))
 
+    @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals, as `Estimator.estimate` describes."""
         model = self._model

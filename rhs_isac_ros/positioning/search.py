@@ -11,6 +11,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.model.nuisance import nuisance_parameters
+from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
@@ -80,6 +81,7 @@ class SearchEstimator(abc.ABC):
         If the codebook does not fit the scenario.
     """
 
+    @one_blas_thread
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None, *, reject_outside: bool = False,
@@ -109,11 +111,13 @@ class SearchEstimator(abc.ABC):
         # each fitted parameter.
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
 
+    @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals, as `Estimator.estimate` describes."""
         model = self._model
         return estimate_each(model.scenario, model.codebook, received, self._locate)
 
+    @one_blas_thread
     def posterior(self, received: np.ndarray) -> Posterior:
         """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F].
 

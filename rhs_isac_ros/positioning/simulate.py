@@ -4,6 +4,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
+from rhs_isac_ros.model.threads import map_blocks
 
 # Pairs that share a random generator and every matrix product. A different size changes the pairs
 # of every seed.
@@ -49,7 +50,8 @@ def simulate_pairs(
     model = MeasurementModel(scenario, codebook)
     positions = np.empty((n, 3))
     received = np.empty((n, *model.shape), complex)
-    for chunk in range(first // _CHUNK, -(-(first + n) // _CHUNK)):
+
+    def fill(chunk: int) -> None:
         begin = chunk * _CHUNK
         part = slice(max(first - begin, 0), min(first + n - begin, _CHUNK))
         target = slice(begin + part.start - first, begin + part.stop - first)
@@ -58,4 +60,6 @@ def simulate_pairs(
         drawn = scenario.sample_positions(_CHUNK, rng)
         positions[target] = drawn[part]
         received[target] = model.sample(drawn, rng)[part]
+
+    map_blocks(fill, range(first // _CHUNK, -(-(first + n) // _CHUNK)))
     return positions, received

@@ -8,6 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
+from rhs_isac_ros.model.threads import map_blocks
 from rhs_isac_ros.positioning.polar import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
@@ -48,7 +49,8 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
         'normal': _standard_normal(),
     }
     wavenumbers = carrier_wavenumbers(model.scenario)
-    for start in range(0, n, _BLOCK):
+
+    def fill(start: int) -> None:
         block = slice(start, start + _BLOCK)
         mean, by_position = model.mean_and_jacobian(to_positions(points[block]))
         by_point = np.matmul(
@@ -61,6 +63,8 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
         table['energy'][block] = np.sum(np.abs(flat)**2, axis=1)
         table['energy_slope'][block] = 2 * np.matmul(by_point.conj(), flat[..., None])[..., 0].real
         table['curvature'][block] = quadratic_form(by_point)
+
+    map_blocks(fill, range(0, n, _BLOCK))
     return table
 
 

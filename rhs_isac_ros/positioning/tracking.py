@@ -11,6 +11,7 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import time_correlation
+from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.estimate import Estimate
 from rhs_isac_ros.positioning.mixture import Mixture, concatenate, reduce
 from rhs_isac_ros.positioning.modes import Modes
@@ -77,6 +78,7 @@ class Tracker:
         self._time_s = self._latest_s = -np.inf
         self._n_phases = 0
 
+    @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
         """Return the position and velocity at the time of a phase, from it and earlier ones.
 

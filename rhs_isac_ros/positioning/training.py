@@ -19,6 +19,7 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.network import INPUTS, Network
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.whitened import WhitenedModel
@@ -46,6 +47,8 @@ class Epoch(NamedTuple):
     elapsed_s: float
 
 
+# One thread: more threads change the rounding and do not speed up such small products.
+@one_blas_thread
 def train(
         scenario: Scenario, codebook: Codebook, n_pairs: int = DEFAULT_PAIRS, seed: int = 0,
         n_hidden: int = DEFAULT_HIDDEN, max_epochs: int = DEFAULT_EPOCHS,
@@ -84,7 +87,7 @@ def train(
     if inputs not in INPUTS:
         raise ValueError(f'inputs: {inputs!r}, expected one of {sorted(INPUTS)}')
     start_s = time.monotonic()
-    regressor, limit_threads = _regressor(n_hidden, seed)
+    regressor = _regressor(n_hidden, seed)
     positions, received = simulate_pairs(scenario, codebook, n_pairs, seed)
     training, validation, test = _split(n_pairs)
     features, center = INPUTS[inputs](received), scenario.roi_bounds_m.mean(axis=0)
@@ -105,10 +108,8 @@ def train(
             progress(Epoch(number, mse, min(mse, best_mse), time.monotonic() - start_s))
         return mse
 
-    # A single thread: more threads change the rounding and do not speed up such small products.
-    with limit_threads(1):
-        best_epoch, best_mse = _fit(
-            regressor, scaled[training], targets[training], max_epochs, after_epoch)
+    best_epoch, best_mse = _fit(
+        regressor, scaled[training], targets[training], max_epochs, after_epoch)
     errors, test_errors = residuals(validation), residuals(test)
     (w_in, w_out), (b_in, b_out) = (
         [array.astype(float) for array in arrays]
@@ -157,16 +158,15 @@ def _fit(
     return best_epoch, best_mse
 
 
-def _regressor(n_hidden: int, seed: int) -> tuple[Any, Any]:
-    """Return the untrained network, and the context manager that limits its threads."""
+def _regressor(n_hidden: int, seed: int) -> Any:
+    """Return the untrained network."""
     with optional_import('training', extra='neural'):
         from sklearn.neural_network import MLPRegressor
-        from threadpoolctl import threadpool_limits
     state = int(streams.generator(seed, streams.TRAINING).integers(2**32))
     regressor = MLPRegressor(
         hidden_layer_sizes=(n_hidden,), activation='relu', solver='adam', alpha=0.0,
         learning_rate_init=_LEARNING_RATE, random_state=state)
-    return regressor, threadpool_limits
+    return regressor
 
 
 def _mean_square(errors: np.ndarray) -> float:

@@ -1,0 +1,158 @@
+"""Threads of the numerical functions of the package.
+
+Most matrix products here are so small that the threads of BLAS spend more time waiting for each
+other than computing; if another process occupies a core, a call takes up to fifty times as long.
+Public functions therefore run BLAS with one thread (`one_blas_thread`), and large tasks are
+divided into blocks that run side by side (`map_blocks`).
+"""
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from types import TracebackType
+from typing import Protocol, TypeVar
+
+from threadpoolctl import ThreadpoolController
+
+_Item = TypeVar('_Item')
+_Result = TypeVar('_Result')
+
+
+class _Library(Protocol):
+    """The setting of a BLAS library, as threadpoolctl represents it."""
+
+    def get_num_threads(self) -> int | None: ...
+
+    def set_num_threads(self, num_threads: int) -> None: ...
+
+
+class _OneBlasThread(contextlib.ContextDecorator):
+    """Context manager and decorator that runs BLAS with one thread.
+
+    The number of threads is a setting of the process: the first caller to enter changes it, and
+    the last one to leave restores it. A number that was changed in between is left as it is.
+    Libraries that use OpenMP have a setting of each thread, which every caller changes and
+    restores.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._own = threading.Lock(), threading.local()
+        self._depth, self._scanned = 0, (False, False)
+        self._shared: list[_Library] = []
+        self._per_thread: list[_Library] = []
+        self._saved: list[tuple[_Library, int]] = []
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._scan() or not self._depth:
+                self._saved += _limit(self._shared)
+            self._depth += 1
+        depth = getattr(self._own, 'depth', 0)
+        if not depth:
+            self._own.saved = _limit(self._per_thread)
+        self._own.depth = depth + 1
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        self._own.depth -= 1
+        if not self._own.depth:
+            _restore(self._own.saved)
+        with self._lock:
+            # A child process begins with no callers, even if its parent forked inside a call.
+            self._depth = max(self._depth - 1, 0)
+            if not self._depth:
+                _restore(self._saved)
+                self._saved = []
+
+    def allowed(self) -> int:
+        """Return the number of threads that BLAS may use outside of this context."""
+        with self._lock:
+            if self._scan() and self._depth:
+                self._saved += _limit(self._shared)
+            saved = [*self._saved, *getattr(self._own, 'saved', ())]
+        numbers = [number for _, number in saved]
+        numbers += [library.get_num_threads() or 1
+                    for library in (*self._shared, *self._per_thread)]
+        return max(numbers, default=1)
+
+    def after_fork(self) -> None:
+        """Restore the settings in a child process, to which the other callers do not belong."""
+        self._lock, self._own, self._depth = threading.Lock(), threading.local(), 0
+        _restore(self._saved)
+        self._saved = []
+
+    def _scan(self) -> bool:
+        """Find the libraries, again after SciPy has loaded its own; return whether it did so."""
+        loaded = True, 'scipy.linalg' in sys.modules
+        is_new = self._scanned != loaded
+        if is_new:
+            found = ThreadpoolController().select(user_api='blas').lib_controllers
+            self._per_thread = [
+                library for library in found
+                if getattr(library, 'threading_layer', '') == 'openmp']
+            self._shared = [library for library in found if library not in self._per_thread]
+            self._scanned = loaded
+        return is_new
+
+
+def _limit(libraries: Iterable[_Library]) -> list[tuple[_Library, int]]:
+    """Set libraries to one thread; return those that had more, with the number."""
+    numbers = [(library, library.get_num_threads() or 1) for library in libraries]
+    saved = [(library, number) for library, number in numbers if number > 1]
+    for library, _ in saved:
+        _set(library, 1)
+    return saved
+
+
+def _restore(saved: Iterable[tuple[_Library, int]]) -> None:
+    for library, number in saved:
+        if library.get_num_threads() == 1:
+            _set(library, number)
+
+
+def _set(library: _Library, number: int) -> None:
+    library.set_num_threads(number)
+    # Since threadpoolctl 3.7, only the thread that set a number first can change it, until it
+    # gives this up; here, the last thread restores what the first one has set.
+    release = getattr(library, 'clear_controlling_thread', None)
+    if release:
+        release()
+
+
+one_blas_thread = _OneBlasThread()
+if hasattr(os, 'register_at_fork'):
+    os.register_at_fork(after_in_child=one_blas_thread.after_fork)
+
+
+def map_blocks(
+        function: Callable[[_Item], _Result], blocks: Sequence[_Item]) -> list[_Result]:
+    """Call a function with each block, on as many threads as BLAS may use, up to all cores.
+
+    The results have the order of the blocks and do not depend on the number of threads. An
+    environment variable such as ``OPENBLAS_NUM_THREADS``, or a limit of threadpoolctl, therefore
+    also applies here. The function must not change data that other blocks use.
+    """
+    with one_blas_thread:
+        n_threads = min(one_blas_thread.allowed(), _n_cores(), len(blocks))
+        if n_threads < 2 or getattr(_worker, 'busy', False):
+            return [function(block) for block in blocks]
+        with ThreadPoolExecutor(n_threads, initializer=_mark_worker) as pool:
+            return list(pool.map(one_blas_thread(function), blocks))
+
+
+# Whether the current thread belongs to `map_blocks`, whose functions start no further threads.
+_worker = threading.local()
+
+
+def _mark_worker() -> None:
+    _worker.busy = True
+
+
+def _n_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
