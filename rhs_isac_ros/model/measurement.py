@@ -204,9 +204,7 @@ class MeasurementModel:
 
         def fill(start: int) -> None:
             block = slice(start, start + _BLOCK)
-            for band in range(len(self.radiation)):
-                mean[block, band], by_position = weights.mean_and_jacobian(positions[block], band)
-                jacobian[block, :, band] = np.swapaxes(by_position, 0, 1)
+            mean[block], jacobian[block] = weights.mean_and_jacobian(positions[block])
 
         map_blocks(fill, range(0, len(positions), _BLOCK))
         return mean, jacobian
