@@ -14,6 +14,10 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 _Terms: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 # Number of unit phasors in the table of `_phasors`.
 _N_PHASORS = 512
+# Memory for an array of all elements and sub-bands. Larger arrays leave the cache, and each call
+# gets new pages for them from the system.
+_ARRAY_BYTES = 3 << 18
+_MIN_BLOCK = 8
 
 
 class ElementSums:
@@ -26,19 +30,25 @@ class ElementSums:
     ----------
     radiation
         T_i, complex128 [N_B, N_SB F, N_E].
+
+    Attributes
+    ----------
+    block
+        Number of positions to evaluate at a time.
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray) -> None:
         self._scenario = scenario
         shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
+        self.block = max(_ARRAY_BYTES // (16 * shape[1] * shape[3]), _MIN_BLOCK)
         self._wavenumbers = 2 * np.pi * subband_frequencies_hz(scenario) / SPEED_OF_LIGHT_MPS
-        gains = scenario.element_gain, scenario.user_gain
-        self._has_pattern = any(isinstance(gain, GainPattern) for gain in gains)
+        element, user = scenario.element_gain, scenario.user_gain
+        self._has_pattern = isinstance(element, GainPattern) or isinstance(user, GainPattern)
         # T_i, complex128 [N_B, N_SB, N_E, F]; without a pattern, times the constant part of the
         # gain.
         self._frames = np.ascontiguousarray(np.swapaxes(radiation.reshape(shape), 2, 3))
-        if not self._has_pattern:
-            self._frames *= (gains[0] * gains[1] / 2 / self._wavenumbers)[..., None, None]
+        if not isinstance(element, GainPattern) and not isinstance(user, GainPattern):
+            self._frames *= (element * user / 2 / self._wavenumbers)[..., None, None]
         self._elements = element_positions(scenario)
         # Coordinates in which the elements differ from the origin; a plane has two.
         self._axes = np.flatnonzero(self._elements.any(axis=0))
@@ -60,8 +70,8 @@ class ElementSums:
             sums = sums.transpose(2, 1, 0, 3)
             for axis in range(3):
                 np.multiply(positions[:, axis, None, None], sums[0], out=jacobian[:, axis, band])
-            for moment, axis in enumerate(self._axes, start=1):
-                jacobian[:, axis, band] -= sums[moment]
+            for moment, coordinate in enumerate(self._axes, start=1):
+                jacobian[:, coordinate, band] -= sums[moment]
             if boresight_term is not None:
                 jacobian[:, 0, band] += np.matmul(boresight_term, frames).transpose(1, 0, 2)
         return mean.reshape(n, n_bands, -1), jacobian.reshape(n, 3, n_bands, -1)

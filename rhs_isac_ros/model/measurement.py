@@ -203,10 +203,10 @@ class MeasurementModel:
         weights = self._weights
 
         def fill(start: int) -> None:
-            block = slice(start, start + _BLOCK)
+            block = slice(start, start + weights.block)
             mean[block], jacobian[block] = weights.mean_and_jacobian(positions[block])
 
-        map_blocks(fill, range(0, len(positions), _BLOCK))
+        map_blocks(fill, range(0, len(positions), weights.block))
         return mean, jacobian
 
     @one_blas_thread

@@ -7,7 +7,8 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
-from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable, separate
+from rhs_isac_ros.positioning.separation import separate_each
+from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 # Largest number of modes.
@@ -60,7 +61,7 @@ class Modes(NamedTuple):
         points: np.ndarray = self.points + self.roi_offset
         return points
 
-    def select(self, chosen: np.ndarray) -> 'Modes':
+    def select(self, chosen: np.ndarray | slice) -> 'Modes':
         """Return the modes with the given indices or mask."""
         return Modes(*(field[chosen] for field in self))
 
@@ -74,22 +75,52 @@ def find_modes(
     mode. The most likely in the region comes first. At least one exact step is taken. Modes may
     be less likely than the best by `extra_margin` more than usual.
     """
-    points = table.modes(whitened, MAX_MODES, TABLE_MARGIN + extra_margin)
-    modes, gain = _gauss_newton_step(model, points, whitened)
-    value = modes.roi_log_likelihood
-    order = np.argsort(-value)
-    order = order[value[order] >= value[order[0]] - EXACT_MARGIN - extra_margin]
-    chosen = order[separate(modes.points[order] / _MIN_SEPARATION, MAX_MODES)]
-    modes, gain = modes.select(chosen), gain[chosen]
+    return find_modes_of_each(model, table, whitened[None], max_steps, extra_margin)[0]
+
+
+def find_modes_of_each(
+        model: WhitenedModel, table: TemplateTable, whitened: np.ndarray,
+        max_steps: int = _SHORT_SEARCH_STEPS, extra_margin: float = 0.0) -> list[Modes]:
+    """Apply `find_modes` to each of many phases, complex128 [N, N_B, N_SB F], at once."""
+    phases, points = table.modes_of_each(whitened, MAX_MODES, TABLE_MARGIN + extra_margin)
+    modes, gain = _gauss_newton_step(model, points, whitened[phases])
+    chosen = _choose(phases, modes, modes.points, EXACT_MARGIN + extra_margin)
+    phases, modes, gain = phases[chosen], modes.select(chosen), gain[chosen]
     for _ in range(max_steps - 1):
         (moving,) = np.nonzero(gain > MIN_GAIN)
         if not len(moving):
             break
-        moved, gain[moving] = _gauss_newton_step(model, modes.roi_points[moving], whitened)
+        moved, gain[moving] = _gauss_newton_step(
+            model, modes.roi_points[moving], whitened[phases[moving]])
         for field, new in zip(modes, moved, strict=True):
             field[moving] = new
-    order = np.argsort(-modes.roi_log_likelihood)
-    return modes.select(order[separate(modes.roi_points[order] / _MIN_SEPARATION, MAX_MODES)])
+    chosen = _choose(phases, modes, modes.roi_points)
+    modes = modes.select(chosen)
+    ends = np.searchsorted(phases[chosen], np.arange(len(whitened) + 1))
+    return [modes.select(slice(*pair)) for pair in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def _choose(phases: np.ndarray, modes: Modes, points: np.ndarray,
+            margin: float = np.inf) -> np.ndarray:
+    """Choose the separate modes of each phase within a margin, the most likely first.
+
+    Takes the phase of each mode, int [M], ascending; returns indices in the same order of phases.
+    """
+    value = modes.roi_log_likelihood
+    order = np.lexsort((-value, phases))
+    first = np.searchsorted(phases, phases)
+    # Modes of one phase are adjacent before and after sorting.
+    best = value[order][first]
+    place = np.arange(len(phases)) - first
+    lists = np.unique(phases, return_inverse=True)[1]
+    n_lists, n_places = lists[-1] + 1, place.max() + 1
+    index = np.zeros((n_lists, n_places), int)
+    valid = np.zeros((n_lists, n_places), bool)
+    index[lists, place] = order
+    valid[lists, place] = value[order] >= best - margin
+    rows, columns = separate_each(points[index] / _MIN_SEPARATION, valid, MAX_MODES)
+    chosen: np.ndarray = index[rows, columns]
+    return chosen
 
 
 def _gauss_newton_step(
@@ -111,8 +142,8 @@ def local_model(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute curvature, gradient and value of the log-likelihood in (r [m], u, v).
 
-    Takes points, float64 [M, 3], and whitened signals, complex128 [N_B, N_SB F]; returns float64
-    [M, 3, 3], [M, 3] and [M].
+    Takes points, float64 [M, 3], and whitened signals, complex128 [N_B, N_SB F], or those of each
+    point, [M, N_B, N_SB F]; returns float64 [M, 3, 3], [M, 3] and [M].
     """
     n = len(points)
     mean, by_position = model.mean_and_jacobian(to_positions(points))

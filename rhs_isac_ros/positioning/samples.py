@@ -1,5 +1,6 @@
 """Weighted samples of the posterior in the region of interest, drawn from its modes."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,14 @@ def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Sample
     bounds
         Lower and upper corner of the region, float64 [2, 3] [m].
     """
-    points, curvature, log_likelihood, roi_offset = modes
+    return draw_samples_of_each([modes], normal, bounds)[0]
+
+
+def draw_samples_of_each(
+        modes: Sequence[Modes], normal: np.ndarray, bounds: np.ndarray) -> list[Samples]:
+    """Apply `draw_samples` to the modes of each of many phases at once."""
+    points, curvature, log_likelihood, roi_offset = (
+        np.concatenate(field) for field in zip(*modes, strict=True))
     jacobians = jacobian(points)
     log_mass = (log_likelihood + np.log(np.linalg.det(jacobians))
                 - np.log(np.linalg.det(curvature)) / 2)
@@ -57,7 +65,14 @@ def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Sample
     positions = to_positions((points + roi_offset)[:, None] + spread)
     low, high = bounds
     inside = ((positions >= low) & (positions <= high)).all(axis=-1)
-    if not inside.any():
-        positions, inside = np.clip(positions, low, high), ~inside
+    all_spread = np.matmul(jacobians, factors)
+    samples, end = [], 0
+    for one in modes:
+        part = slice(end, end + len(one.points))
+        end = part.stop
+        if not inside[part].any():
+            positions[part] = np.clip(positions[part], low, high)
+            inside[part] = True
+        samples.append(Samples(positions[part], log_weights[part], all_spread[part]))
     log_weights[~inside] = -np.inf
-    return Samples(positions, log_weights, np.matmul(jacobians, factors))
+    return samples

@@ -1,7 +1,8 @@
 """The common part of the estimators that search for modes."""
 
 import abc
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.model.nuisance import nuisance_parameters
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
@@ -28,8 +29,13 @@ from rhs_isac_ros.positioning.fit import (
     outside_test,
 )
 from rhs_isac_ros.positioning.marginal import Found, MarginalSearch
-from rhs_isac_ros.positioning.modes import LONG_SEARCH_STEPS, Modes, find_modes
-from rhs_isac_ros.positioning.samples import Samples, draw_samples
+from rhs_isac_ros.positioning.modes import (
+    LONG_SEARCH_STEPS,
+    Modes,
+    find_modes,
+    find_modes_of_each,
+)
+from rhs_isac_ros.positioning.samples import Samples, draw_samples, draw_samples_of_each
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.surroundings import Surroundings
 from rhs_isac_ros.positioning.table import TemplateTable
@@ -39,6 +45,8 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _GAIN_REACH = 6
 # Coordinates fitted to the signals of each phase.
 _N_COORDINATES = 3
+# Number of phases that are located together: their arrays fit into the cache.
+_BLOCK = 32
 
 
 class Posterior(NamedTuple):
@@ -147,50 +155,86 @@ class SearchEstimator(abc.ABC):
         """The scenario of the signals."""
         return self._model.scenario
 
-    def _locate(self, batch: np.ndarray) -> Iterator[Located]:
-        for received, whitened in zip(batch, self._model.whiten(batch), strict=True):
-            yield self._analyse(received, whitened)[0]
+    def _locate(self, batch: np.ndarray) -> Iterable[Located]:
+        whitened = self._model.whiten(batch)
+        if self._marginal or self._failures or self._error:
+            return [self._analyse(*phase)[0] for phase in zip(batch, whitened, strict=True)]
+        starts = range(0, len(batch), _BLOCK)
+        blocks = map_blocks(
+            lambda start: self._locate_block(whitened[start:start + _BLOCK]), starts)
+        return itertools.chain.from_iterable(blocks)
+
+    def _locate_block(self, whitened: np.ndarray) -> list[Located]:
+        """Locate phases together whose signals depend on the position only."""
+        reasons = [self._too_weak(signals) for signals in whitened]
+        (usable,) = np.nonzero([not reason for reason in reasons])
+        located: list[Located] = [(*_no_fix(), reason, np.nan, np.nan) for reason in reasons]
+        if not len(usable):
+            return located
+        found = [self._found(*phase) for phase in zip(
+            whitened[usable], find_modes_of_each(self._model, self._table, whitened[usable]),
+            strict=True)]
+        samples = draw_samples_of_each(
+            [one.modes for one in found], self._table.normal, self._bounds)
+        for row, one, drawn in zip(usable.tolist(), found, samples, strict=True):
+            located[row] = self._judge(one, drawn)
+        return located
 
     def _analyse(
             self, received: np.ndarray, whitened: np.ndarray) -> tuple[Located, Modes | None]:
         """Locate one phase; also return the modes, None without a position."""
-        no_fix = np.full(3, np.nan), np.full((3, 3), np.nan)
-        reason = self._test.min_energy_test(
-            float(np.sum(np.abs(whitened)**2)) * self._max_power)
+        reason = self._too_weak(whitened)
         if reason:
-            return (*no_fix, reason, np.nan, np.nan), None
+            return (*_no_fix(), reason, np.nan, np.nan), None
         found = (self._marginal.find(received) if self._marginal
                  else self._find(received, whitened))
         samples = found.samples or draw_samples(
             found.modes, self._table.normal, self._bounds)
+        located = self._judge(found, samples)
+        return located, None if located[2] else found.modes
+
+    def _too_weak(self, whitened: np.ndarray) -> str:
+        """Return a reason if the signals are weaker than noise."""
+        return self._test.min_energy_test(
+            float(np.sum(np.abs(whitened)**2)) * self._max_power)
+
+    def _judge(self, found: Found, samples: Samples) -> Located:
+        """Return the position, or why there is none."""
         residual = float(found.residuals[np.argmax(found.modes.roi_log_likelihood)])
         outside = 0.0
         if self._rejects_outside:
             inside = samples.log_evidence(self._volume_m3)
             outside = outside_probability(inside - found.log_evidence_outside)
         reason = self._reason(found, residual, outside)
-        moments = no_fix if reason else self._moments(found.modes, samples)
+        moments = _no_fix() if reason else self._moments(found.modes, samples)
         expected = np.nan
         if outside <= DOUBT_LIMIT or self._test.residual_test(residual) == reason != '':
             expected = self._expected_residual(found.residuals, residual, samples)
         elif not reason:
             moments = self._with_outside(moments, found, outside)
-        return (*moments, reason, residual, expected), None if reason else found.modes
+        return (*moments, reason, residual, expected)
 
     def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
         if self._failures:
             modes = find_modes(
                 self._model, self._table, whitened, extra_margin=self._failures.search_margin)
-            modes, residuals = self._failures.refine(modes, received)
-        else:
-            modes = find_modes(self._model, self._table, whitened)
-            if self._test.residual_test(-modes.roi_log_likelihood.max()):
-                # Strong signals may need more steps to reach the maximum.
-                modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
-            residuals = -modes.roi_log_likelihood
-            if self._error:
-                signals = np.broadcast_to(received, (len(modes.points), *received.shape))
-                modes, residuals = self._error.refine(modes, signals, step=True)
+            return self._with_evidence(whitened, *self._failures.refine(modes, received))
+        found = self._found(whitened, find_modes(self._model, self._table, whitened))
+        if not self._error:
+            return found
+        signals = np.broadcast_to(received, (len(found.modes.points), *received.shape))
+        modes, residuals = self._error.refine(found.modes, signals, step=True)
+        return found._replace(modes=modes, residuals=residuals)
+
+    def _found(self, whitened: np.ndarray, modes: Modes) -> Found:
+        """Return the result of a search; continue it if it has not reached a maximum."""
+        if self._test.residual_test(-modes.roi_log_likelihood.max()):
+            # Strong signals may need more steps to reach the maximum.
+            modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
+        return self._with_evidence(whitened, modes, -modes.roi_log_likelihood)
+
+    def _with_evidence(
+            self, whitened: np.ndarray, modes: Modes, residuals: np.ndarray) -> Found:
         outside = (float(self._surroundings.log_evidence(whitened)[0])
                    if self._rejects_outside else -np.inf)
         return Found(modes, residuals, whitened, outside)
@@ -234,6 +278,10 @@ class SearchEstimator(abc.ABC):
     @abc.abstractmethod
     def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         """Return a position [3] and its covariance [3, 3] from the modes."""
+
+
+def _no_fix() -> tuple[np.ndarray, np.ndarray]:
+    return np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
 def surface_of(estimator: Estimator) -> Surface | None:

@@ -19,7 +19,7 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _MAX_TABLES = 16
 _PREFIX = 'table-'
 # Version of the contents of a table; tables of another version are not used.
-_FORMAT = 3
+_FORMAT = 4
 
 
 def default_folder() -> Path:

@@ -11,15 +11,15 @@ import numpy as np
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 from rhs_isac_ros.positioning.polar import to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
+from rhs_isac_ros.positioning.separation import separate as separate
+from rhs_isac_ros.positioning.separation import separate_each
 from rhs_isac_ros.positioning.templates import RANGE_CELL_M, carrier_wavenumbers
 
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
 STEPS_PER_WAVELENGTH = 8
 # Number of grid points, and of peaks along their range, that the search examines closely.
-_MAX_CELLS = 192
+_MAX_CELLS = 256
 _MAX_PEAKS = 256
-# Number of points to compare with each other at a time.
-_BLOCK = 64
 # Peaks closer than this in all of (r in wavelengths, u, v) are one mode.
 _MIN_SEPARATION = (0.3, 0.05, 0.05)
 # Error of a mode's log-likelihood due to the grid, as a share of the template's energy.
@@ -65,6 +65,7 @@ class TemplateTable:
             1j * self._wavenumbers[:, None] * self.points[:, 0]).astype(np.complex64)
         phase = np.exp(1j * self._wavenumbers * self.range_offsets_m[:, None])
         self._rotation = (2 * np.hstack([phase.real, -phase.imag])).astype(np.float32)
+        self._fine = np.ascontiguousarray(phase.T.astype(np.complex64))
 
     @property
     def energy(self) -> np.ndarray:
@@ -115,23 +116,95 @@ class TemplateTable:
         the grid. The result is (r [m], u, v), float64 [M, 3], the most likely first, with
         1 <= M <= max_modes.
         """
-        cell, offset_m, value = self._peaks(self.log_likelihood(whitened))
+        return self.modes_of_each(whitened[None], max_modes, margin)[1]
+
+    def modes_of_each(
+            self, whitened: np.ndarray, max_modes: int, margin: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Find the `modes` of many phases, complex128 [N, N_B, N_SB F].
+
+        Those of a phase do not depend on the other phases.
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            The phase of each mode, int [M], ascending, and the modes, float64 [M, 3].
+        """
+        signals = whitened.astype(np.complex64)
+        cells, outputs = self._best_cells(signals)
+        index, fine, value = self._peaks_of_each(cells, outputs)
+        cell = np.take_along_axis(cells, index, axis=1)
         # One Gauss-Newton step from each peak: between grid points, a sharp mode is much higher.
-        phase = np.exp(1j * self._wavenumbers * (self.points[cell, :1] + offset_m[:, None]))
-        rotated = (phase[..., None] * whitened).astype(np.complex64).reshape(len(cell), -1)
-        gradient = np.einsum('cqi,ci->cq', self._slope_filters[cell], rotated).real
-        gradient = 2 * gradient - self._energy_slope[cell]
-        step = np.matmul(self._inverse[cell], gradient[..., None])[..., 0]
-        value = value + np.sum(gradient * step, axis=1) / 2
+        slopes = self._products(self._slope_filters, cells, signals)
+        phase = np.moveaxis(self._carrier[:, cell] * self._fine[:, fine], 0, 1)
+        slopes = np.take_along_axis(slopes, index[:, None, :, None], axis=2)
+        gradient = 2 * np.sum(slopes * phase[..., None], axis=1).real - self._energy_slope[cell]
+        step = np.einsum('npij,npj->npi', self._inverse[cell], gradient)
+        value = value + np.sum(gradient * step, axis=2) / 2
         points = self.points[cell] + np.clip(step, -_STEP_LIMITS, _STEP_LIMITS)
-        points[:, 0] += offset_m
+        points[..., 0] += self.range_offsets_m[fine]
         value -= self._loss_outside(points, cell, value, margin)
-        order = np.argsort(-value)
-        margin += _GRID_ERROR * self._energy[cell[order[0]]]
-        order = order[value[order] >= value[order[0]] - margin]
+        order = np.argsort(-value, axis=1)
+        value, rows = np.take_along_axis(value, order, axis=1), np.arange(len(value))[:, None]
+        margins = margin + _GRID_ERROR * self._energy[cell[rows, order[:, :1]]]
+        points = points[rows, order]
         scale = np.array(_MIN_SEPARATION) * (self._wavelength_m, 1, 1)
-        chosen: np.ndarray = points[order][separate(points[order] / scale, max_modes)]
-        return chosen
+        phases, chosen = separate_each(points / scale, value >= value[:, :1] - margins, max_modes)
+        return phases, points[phases, chosen]
+
+    def _best_cells(self, signals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Grid points with the highest bounds of the log-likelihood, and the outputs there.
+
+        Takes complex64 [N, N_B, N_SB F]; returns int [N, C] and complex64 [N, N_B, C].
+        """
+        outputs = np.matmul(np.swapaxes(signals, 0, 1), np.swapaxes(self._filters, 1, 2))
+        # Along the range, the log-likelihood is at most that of outputs in phase.
+        highest = np.sqrt(outputs.real**2 + outputs.imag**2).sum(axis=0)
+        highest *= 2
+        highest -= self._energy
+        n_cells = min(_MAX_CELLS, highest.shape[1])
+        cells = np.sort(np.argpartition(highest, -n_cells, axis=1)[:, -n_cells:], axis=1)
+        # Products of equal sizes round the same, whatever the number of phases.
+        products = self._products(self._filters[:, :, None], cells, signals)[..., 0]
+        return cells, products * np.moveaxis(self._carrier[:, cells], 0, 1)
+
+    def _products(
+            self, filters: np.ndarray, cells: np.ndarray, signals: np.ndarray) -> np.ndarray:
+        """Products of filters [N_B, G, Q, N_SB F] with signals, complex64 [N, N_B, C, Q]."""
+        n, n_cells = cells.shape
+        products = np.empty((n, len(filters), n_cells * filters.shape[2]), np.complex64)
+        for row, chosen in enumerate(cells):
+            gathered = filters[:, chosen].reshape(len(filters), -1, filters.shape[-1])
+            products[row] = np.matmul(gathered, signals[row, ..., None])[..., 0]
+        return products.reshape(n, len(filters), n_cells, -1)
+
+    def _peaks_of_each(
+            self, cells: np.ndarray, outputs: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the highest peaks along the range among the grid points of each phase.
+
+        Returns the indices of the grid point in `cells` and of the range step, int [N, P], and
+        the value, float32 [N, P], which is -inf where there is no further peak.
+        """
+        likelihood = np.matmul(
+            self._rotation, np.concatenate([outputs.real, outputs.imag], axis=1))
+        likelihood -= self._energy[cells][:, None]
+        rising = likelihood[:, 1:] >= likelihood[:, :-1]
+        falling = likelihood[:, 1:] <= likelihood[:, :-1]
+        peak = np.ones(likelihood.shape, bool)
+        peak[:, 1:] &= rising
+        peak[:, :-1] &= falling
+        place = np.zeros((len(cells), _MAX_PEAKS), int)
+        value = np.full(place.shape, -np.inf, np.float32)
+        for row, (peaks, flat) in enumerate(zip(
+                peak.reshape(len(cells), -1), likelihood.reshape(len(cells), -1), strict=True)):
+            found = np.flatnonzero(peaks)
+            if len(found) > _MAX_PEAKS:
+                found = found[np.sort(np.argpartition(flat[found], -_MAX_PEAKS)[-_MAX_PEAKS:])]
+            place[row, :len(found)] = found
+            value[row, :len(found)] = flat[found]
+        fine, index = np.divmod(place, cells.shape[1])
+        return index, fine, value
 
     def peaks_under(self, whitened: np.ndarray, factor: np.ndarray, max_points: int) -> np.ndarray:
         """Find the highest separate points of the grid for another covariance of the signals.
@@ -165,18 +238,19 @@ class TemplateTable:
 
     def _loss_outside(self, points: np.ndarray, cell: np.ndarray, value: np.ndarray,
                       margin: float) -> np.ndarray:
-        """Loss of log-likelihood from points to the region, [C]: 0 inside.
+        """Loss of log-likelihood from points to the region, [N, P]: 0 inside.
 
         The loss is infinite for points that are too unlikely even without it.
         """
         low, high = self._bounds
         positions = to_positions(points)
-        inside = ((positions >= low) & (positions <= high)).all(axis=1)
+        inside = ((positions >= low) & (positions <= high)).all(axis=2)
         result = np.where(inside, 0.0, np.inf)
-        best = np.max(value, where=inside, initial=-np.inf)
-        margin += _GRID_ERROR * self._energy[cell[np.argmax(np.where(inside, value, -np.inf))]]
-        (outside,) = np.nonzero(~inside & (value >= best - margin))
-        if len(outside):
+        values = np.where(inside, value, -np.inf)
+        best, rows = values.argmax(axis=1)[:, None], np.arange(len(cell))[:, None]
+        limit = values[rows, best] - margin - _GRID_ERROR * self._energy[cell[rows, best]]
+        outside = ~inside & (value >= limit)
+        if outside.any():
             curvature = self._curvature[cell[outside]]
             offset = offset_to_roi(points[outside], curvature, self._bounds)
             result[outside] = likelihood_loss(offset, curvature)
@@ -200,29 +274,3 @@ class TemplateTable:
             best = np.argpartition(value, -_MAX_PEAKS)[-_MAX_PEAKS:]
             row, fine, value = row[best], fine[best], value[best]
         return cells[row], self.range_offsets_m[fine], value
-
-
-def separate(points: np.ndarray, max_points: int) -> list[int]:
-    """Return indices of points that are separate from each other; of close points, the first.
-
-    Points, float64 [N, D], are separate if they are at least 1 apart in some coordinate.
-    """
-    kept: list[int] = []
-    for start in range(0, len(points), _BLOCK):
-        block = np.arange(start, min(start + _BLOCK, len(points)))
-        block = block[~_close(points[block], points[kept]).any(axis=1)]
-        close = _close(points[block], points[block])
-        free = np.ones(len(block), bool)
-        for row, index in enumerate(block.tolist()):
-            if free[row]:
-                kept.append(index)
-                free &= ~close[row]
-        if len(kept) >= max_points:
-            break
-    return kept[:max_points]
-
-
-def _close(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return which points are closer than 1 in all coordinates, bool [N, M]."""
-    close: np.ndarray = (np.abs(points[:, None] - others) < 1).all(axis=2)
-    return close

@@ -32,7 +32,7 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
     dict of numpy.ndarray
         By name, for G grid points: ``points`` (r [m], u, v), float64 [G, 3]; ``filters``, the
         conjugate templates, complex64 [N_B, G, N_SB F]; ``slope_filters``, the conjugate
-        derivatives of the templates with respect to the point, complex64 [G, 3, N_B N_SB F];
+        derivatives of the templates with respect to the point, complex64 [N_B, G, 3, N_SB F];
         ``energy`` of the templates, float32 [G]; ``energy_slope``, its derivative, float64
         [G, 3]; ``curvature`` of the log-likelihood, float64 [G, 3, 3]; and, independent of the
         codebook, ``normal``, points that represent a standard Gaussian, float64 [128, 3].
@@ -42,7 +42,7 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
     table = {
         'points': points,
         'filters': np.empty((n_bands, n, n_rows), np.complex64),
-        'slope_filters': np.empty((n, 3, n_bands * n_rows), np.complex64),
+        'slope_filters': np.empty((n_bands, n, 3, n_rows), np.complex64),
         'energy': np.empty(n, np.float32),
         'energy_slope': np.empty((n, 3)),
         'curvature': np.empty((n, 3, 3)),
@@ -57,8 +57,8 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
             np.swapaxes(jacobian(points[block]), 1, 2), by_position.reshape(len(mean), 3, -1))
         carrier = np.exp(1j * wavenumbers * points[block, :1])[..., None]
         table['filters'][:, block] = np.swapaxes(mean * carrier, 0, 1).conj()
-        table['slope_filters'][block] = (
-            by_point.reshape(by_position.shape) * carrier[:, None]).conj().reshape(by_point.shape)
+        slopes = by_point.reshape(by_position.shape) * carrier[:, None]
+        table['slope_filters'][:, block] = np.moveaxis(slopes, 2, 0).conj()
         flat = mean.reshape(len(mean), -1)
         table['energy'][block] = np.sum(np.abs(flat)**2, axis=1)
         table['energy_slope'][block] = 2 * np.matmul(by_point.conj(), flat[..., None])[..., 0].real

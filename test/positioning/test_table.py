@@ -6,7 +6,7 @@ import pytest
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning.polar import to_polar
-from rhs_isac_ros.positioning.table import TemplateTable, separate
+from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.templates import RANGE_CELL_M, tabulate
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
@@ -108,16 +108,11 @@ def test_modes_are_sorted_separate_and_within_the_margin(scenario, model, table,
     assert exact.min() > exact.max() - 2 - tolerance
 
 
-def test_separate_keeps_the_first_of_close_points():
-    points = np.random.default_rng(5).uniform(0, 4, (200, 3))
-    kept = []
-    for n, point in enumerate(points):
-        if all(max(abs(point - points[k])) >= 1 for k in kept):
-            kept.append(n)
-    assert list(separate(points, 1000)) == kept
-    assert list(separate(points, 7)) == kept[:7]
-    assert len(kept) > 7
-
-
-def test_separate_accepts_no_points():
-    assert list(separate(np.zeros((0, 3)), 5)) == []
+def test_modes_of_each_phase_are_those_of_the_phase_alone(scenario, model, table):
+    rng = np.random.default_rng(6)
+    received = simulate_received(
+        scenario, model.codebook, scenario.sample_positions(9, rng), rng)
+    whitened = model.whiten(received)
+    phases, points = table.modes_of_each(whitened, 30, 10.0)
+    for phase, y in enumerate(whitened):
+        np.testing.assert_array_equal(points[phases == phase], table.modes(y, 30, 10.0))

@@ -65,7 +65,8 @@ def test_arrays_of_the_table_match_their_definitions(random_beams):
         up, down = template(points + shift), template(points - shift)
         slope = ((up - down) / (2 * step)).reshape(len(points), -1).conj()
         np.testing.assert_allclose(
-            table['slope_filters'][:, axis], slope, atol=1e-4 * np.abs(slope).max())
+            np.moveaxis(table['slope_filters'], 0, 2)[:, axis].reshape(slope.shape), slope,
+            atol=1e-4 * np.abs(slope).max())
         energy_slope = np.sum(np.abs(up)**2 - np.abs(down)**2, axis=(1, 2)) / (2 * step)
         np.testing.assert_allclose(table['energy_slope'][:, axis], energy_slope,
                                    atol=1e-4 * np.abs(energy_slope).max())
