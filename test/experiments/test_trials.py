@@ -196,6 +196,51 @@ def test_jobs_run_on_a_dask_cluster(tmp_path, cluster):
     assert numbers_run_again(tmp_path) == []
 
 
+@pytest.fixture
+def two_workers(tmp_path):
+    """Address of a scheduler with two workers, three processes that belong together only by it."""
+    distributed = pytest.importorskip('distributed')
+    file, processes = tmp_path / 'scheduler.json', []
+
+    def start(module, *arguments):
+        processes.append(subprocess.Popen(
+            [sys.executable, '-m', f'distributed.cli.{module}', '--scheduler-file', str(file),
+             '--no-dashboard', *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            env=os.environ | {'OPENBLAS_NUM_THREADS': '1'}))
+
+    start('dask_scheduler', '--host', '127.0.0.1', '--port', '0')
+    for _ in range(2):
+        start('dask_worker', '--no-nanny', '--nthreads', '1', '--local-directory', str(tmp_path))
+    try:
+        with distributed.Client(scheduler_file=str(file), timeout=30, set_as_default=False) as (
+                client):
+            client.wait_for_workers(2, timeout=30)
+            address = client.scheduler.address
+        yield address
+    finally:
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.wait()
+
+
+def test_a_cluster_that_loses_a_worker_gives_every_result(tmp_path, two_workers):
+    def work(number, killed):
+        import os
+        import signal
+        from pathlib import Path
+        if number == 3 and not Path(killed).exists():
+            Path(killed).write_text(str(os.getpid()), encoding='ascii')
+            os.kill(os.getpid(), signal.SIGKILL)
+        return {'square': number**2, 'process': os.getpid()}
+
+    killed = tmp_path / 'killed'
+    jobs = [Job(str(number), {'number': number, 'killed': str(killed)}) for number in range(8)]
+    results = run_jobs(work, jobs, tmp_path / 'results', dask=two_workers)
+    assert [result['square'] for result in results] == [number**2 for number in range(8)]
+    assert results[3]['process'] != int(killed.read_text(encoding='ascii'))
+
+
 def test_an_error_on_a_dask_cluster_names_its_job(tmp_path, cluster):
     worker = Worker(1, ValueError('no good'))
     with pytest.raises(JobError, match='(?s)job square-1 failed: .*ValueError: no good'):
