@@ -5,32 +5,32 @@ about the set: a single failure is far above the nulls of the multipath. The set
 substantial weight are found by adding elements to the most probable sets, one at a time.
 """
 
-from typing import TypeAlias
-
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning.failure_model import FailureModel, Site, Weighed
+from rhs_isac_ros.positioning.failure_search import FailureSearch, Key
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.region import offset_to_roi
 from rhs_isac_ros.positioning.table import TemplateTable, separate
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
-# Largest expected number of failures for which sets are searched, and the largest set.
+# Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
-_MAX_FAILURES = 6
 # Probability that an intact surface has a higher residual than the usual one, and the number of
 # modes from which sets are searched below that residual.
 _UNUSUAL = 0.01
 _N_USUAL = 2
-# Hypotheses to extend, in total, of each set, and of each site.
-_N_EXTENDED = 8
-_MAX_PER_SET = 3
-_MAX_PER_SITE = 4
+# Points of the table and their margin, besides the modes, and sites to search from otherwise.
+_MAX_POINTS = 64
+_POINT_MARGIN = 30.0
+_N_SITES = 24
+# Largest number of further searches, each under the most probable set, and their points.
+_MAX_SEARCHES = 2
+_N_PEAKS = 16
+_N_GROWN = 3
 # Sets to try at all sites.
 _N_SETS = 4
-# Points of a second search, under the most probable set.
-_N_PEAKS = 16
 # Hypotheses whose log-probability is lower than the best by more than this are dropped, before
 # and after the first exact step, and the number of those that remain.
 _MARGIN = 9.0
@@ -40,9 +40,6 @@ _N_STEPS = 2
 # Hypotheses with the same set that are closer than this in (r [m], u, v) have converged to the
 # same mode.
 _MIN_SEPARATION = 0.01
-
-# A set of failed elements and the index of a site.
-_Key: TypeAlias = tuple[tuple[int, ...], int]
 
 
 def can_enumerate(scenario: Scenario) -> bool:
@@ -80,52 +77,30 @@ class FailedElements:
         `ElementErrorModel.refine`. Signals are complex128 [N_B, N_SB F].
         """
         order = np.argsort(-modes.roi_log_likelihood)
-        sites = [self._model.site(point, received) for point in modes.roi_points[order]]
-        intact = self._model.surface(())
-        weighed = [self._model.weigh(intact, site) for site in sites]
-        values: dict[_Key, float] = {
-            ((), index): float(one.value[0]) for index, one in enumerate(weighed)}
-        parents = sorted(values, key=lambda key: -values[key])
-        if weighed[parents[0][1]].residual[0] <= self._usual_residual:
-            parents = parents[:_N_USUAL]
-        self._grow(values, sites, parents)
-        failed = max(values, key=lambda key: values[key])[0]
-        if failed:
-            self._search_again(values, sites, failed, received)
-        return self._converge(values, sites, received)
+        search = FailureSearch(self._model, received, _MARGIN, self._usual_residual)
+        keys = search.add(modes.roi_points[order])
+        if search.is_explained:
+            search.grow(keys[:_N_USUAL], partial=False)
+        else:
+            whitened = self._search_model.whiten(received[None])[0]
+            keys = [((), index) for index in range(len(search.sites))]
+            keys += search.add(self._table.modes(whitened, _MAX_POINTS, _POINT_MARGIN))
+            search.grow(keys[:_N_SITES], partial=True)
+            self._search_again(search, whitened)
+        search.try_neighbours(search.best)
+        return self._converge(search.values, search.sites, received)
 
-    def _grow(self, values: dict[_Key, float], sites: list[Site], parents: list[_Key]) -> None:
-        """Add failures to hypotheses as long as the result is probable."""
-        best = max(values.values())
-        for _ in range(_MAX_FAILURES):
-            children: dict[_Key, float] = {}
-            for failed, index in parents:
-                further = self._model.weigh_further(self._model.surface(failed), sites[index])
-                for element, value in enumerate(further.tolist()):
-                    if element not in failed:
-                        children[tuple(sorted((*failed, element))), index] = value
-            ranked = sorted(children, key=lambda key: -children[key])
-            values |= {key: children[key] for key in ranked[:_MAX_HYPOTHESES]}
-            if children[ranked[0]] < best - _MARGIN:
-                break
-            best = max(best, children[ranked[0]])
-            parents = _diverse(ranked)
-
-    def _search_again(self, values: dict[_Key, float], sites: list[Site],
-                      failed: tuple[int, ...], received: np.ndarray) -> None:
+    def _search_again(self, search: FailureSearch, whitened: np.ndarray) -> None:
         """Add sites that are probable under a set, which the average over sets may miss."""
-        points = self._table.peaks_under(
-            self._search_model.whiten(received[None])[0], self._model.search_factor(failed),
-            _N_PEAKS)
-        surface, first = self._model.surface(failed), len(sites)
-        sites += [self._model.site(point, received) for point in points]
-        found: dict[_Key, float] = {
-            (failed, index): float(self._model.weigh(surface, sites[index]).value[0])
-            for index in range(first, len(sites))}
-        values |= found
-        self._grow(values, sites, sorted(found, key=lambda key: -found[key])[:_MAX_PER_SET])
+        for _ in range(_MAX_SEARCHES):
+            failed, _ = search.best
+            points = self._table.peaks_under(
+                whitened, self._model.search_factor(failed), _N_PEAKS)
+            search.grow(search.add(points, failed)[:_N_GROWN], partial=False)
+            if search.best[0] == failed:
+                break
 
-    def _converge(self, values: dict[_Key, float], sites: list[Site],
+    def _converge(self, values: dict[Key, float], sites: list[Site],
                   received: np.ndarray) -> tuple[Modes, np.ndarray]:
         """Take exact steps from the most probable hypotheses."""
         best = max(values.values())
@@ -161,15 +136,3 @@ class FailedElements:
         offset = offset_to_roi(moved, weighed.curvature, self._model.scenario.roi_bounds_m)
         inside: np.ndarray = (moved + offset)[0]
         return inside
-
-
-def _diverse(ranked: list[_Key]) -> list[_Key]:
-    """Choose the first hypotheses to extend, few of each set and of each site."""
-    chosen: list[_Key] = []
-    for failed, index in ranked:
-        if (sum(other == failed for other, _ in chosen) < _MAX_PER_SET
-                and sum(other == index for _, other in chosen) < _MAX_PER_SITE):
-            chosen.append((failed, index))
-        if len(chosen) == _N_EXTENDED:
-            break
-    return chosen

@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.element_error import element_correlation
+from rhs_isac_ros.model.element_error import element_correlation, error_covariance
 from rhs_isac_ros.model.los import los_and_derivative
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -24,8 +23,11 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _STEP_LIMITS = np.array([0.02, 0.03, 0.03])
 # The residual decreases with the amplitudes; the derivative is that of the mean.
 _SIGNS = np.array([-1.0, 1.0, 1.0, 1.0])[:, None, None]
-# Number of surfaces to keep.
+# Number of surfaces to keep, and of those with the covariances of all further failures.
 _MAX_SURFACES = 256
+_MAX_FURTHER = 8
+# Share of elements that may have failed besides those of a set, relative to the declared share.
+_REMAINDER = 0.3
 
 
 class Surface(NamedTuple):
@@ -69,6 +71,22 @@ class Site(NamedTuple):
     spread: np.ndarray
 
 
+class Further(NamedTuple):
+    """A surface of which one more element has failed, for every element.
+
+    Attributes
+    ----------
+    whitener
+        Inverse Cholesky factor of the covariance as in `Surface`, complex128
+        [N_B, N_E, N_SB F, N_SB F].
+    volume
+        Logarithm of the determinant of the covariance, float64 [N_E].
+    """
+
+    whitener: np.ndarray
+    volume: np.ndarray
+
+
 class Weighed(NamedTuple):
     """H hypotheses after a Gauss-Newton step from their site.
 
@@ -107,7 +125,11 @@ class FailureModel:
         self._intact = Surface((), np.matmul(self._model.radiation, self._spatial),
                                self._model.covariance())
         self._surfaces: dict[tuple[int, ...], Surface] = {}
-        self._first_growth = self._growth(self._intact)
+        self._remainder = _REMAINDER * error_covariance(
+            dataclasses.replace(scenario, element_error_rms=0.0), codebook)
+        self._further: dict[tuple[tuple[int, ...], bool], Further] = {}
+        for partial in (False, True):
+            self._of_further((), partial)
         share = scenario.failed_element_share
         self._log_odds = float(np.log(share / (1 - share)))
 
@@ -142,16 +164,41 @@ class FailureModel:
 
     def weigh(self, surface: Surface, site: Site) -> Weighed:
         """Weigh a surface at a site: H is 1."""
-        columns, covariance = self._at(surface, site)
-        return self._weigh(len(surface.failed), columns[None], covariance[None])
+        columns, spread = self._at(surface, site)
+        direct = np.matmul(spread, np.conj(np.swapaxes(spread, 1, 2)))
+        roots = np.linalg.cholesky(surface.covariance + direct)
+        white = np.linalg.solve(roots, np.moveaxis(columns, 0, 2))
+        products = np.matmul(np.conj(np.swapaxes(white, 1, 2)), white).real.sum(axis=0)
+        return _weigh(len(surface.failed) * self._log_odds - _log_determinant(roots).sum(),
+                      products[None])
 
-    def weigh_further(self, surface: Surface, site: Site) -> np.ndarray:
-        """Compute the values of `weigh` if one more element fails, float64 [N_E]."""
-        columns, covariance = self._at(surface, site)
-        growth = self._growth(surface) if surface.failed else self._first_growth
-        one_more = covariance + growth
-        one_more += site.spread[..., :, None] * site.spread[..., None, :].conj()
-        return self._weigh(len(surface.failed) + 1, columns + site.changes, one_more).value
+    def weigh_further(self, surface: Surface, site: Site, partial: bool = False) -> np.ndarray:
+        """Compute the values of `weigh` if one more element fails, float64 [N_E].
+
+        If the set is `partial`, a few further elements may have failed. They add to the
+        covariance, so that elements which explain a part of the signals have a higher value
+        than elements which imitate the sum.
+        """
+        further = self._of_further(surface.failed, partial)
+        columns, spread = self._at(surface, site)
+        # For each band and element: residual and derivatives, then the spread of all failures.
+        parts = np.concatenate([
+            np.moveaxis(columns + site.changes, 2, 0),
+            np.broadcast_to(np.swapaxes(spread, 1, 2)[:, None], (
+                len(spread), len(site.spread), spread.shape[2], spread.shape[1])),
+            np.swapaxes(site.spread, 0, 1)[:, :, None]], axis=2)
+        white = np.matmul(parts, np.swapaxes(further.whitener, 2, 3))
+        columns, spread = white[:, :, :4], white[:, :, 4:]
+        # The spread is a change of low rank: Woodbury's identity.
+        adjoint = np.conj(np.swapaxes(columns, 2, 3))
+        roots = np.linalg.cholesky(
+            np.matmul(spread.conj(), np.swapaxes(spread, 2, 3)) + np.eye(spread.shape[2]))
+        explained = np.linalg.solve(roots, np.conj(np.matmul(spread, adjoint)))
+        products = (np.matmul(columns, adjoint).real - np.matmul(
+            np.conj(np.swapaxes(explained, 2, 3)), explained).real).sum(axis=0)
+        n_failed = len(surface.failed) + 1
+        volume = further.volume + _log_determinant(roots).sum(axis=0)
+        return _weigh(n_failed * self._log_odds - volume, products).value
 
     def search_factor(self, failed: tuple[int, ...]) -> np.ndarray:
         """Compute the factor of the inverse covariance of a set for `TemplateTable.peaks_under`.
@@ -169,26 +216,24 @@ class FailureModel:
         return factor
 
     def _at(self, surface: Surface, site: Site) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and covariance of a surface at a site."""
+        """Columns [4, N_B, S] of a surface at a site, and the spread [N_B, S, K] of failures."""
         failed = list(surface.failed)
-        spread = np.moveaxis(site.spread[failed], 0, 2)
-        direct = np.matmul(spread, np.conj(np.swapaxes(spread, 1, 2)))
-        return site.columns + site.changes[failed].sum(axis=0), surface.covariance + direct
+        return (site.columns + site.changes[failed].sum(axis=0),
+                np.moveaxis(site.spread[failed], 0, 2))
 
-    def _weigh(self, n_failed: int, columns: np.ndarray, covariance: np.ndarray) -> Weighed:
-        """Weigh hypotheses from columns [H, 4, N_B, S] and covariances [H, N_B, S, S]."""
-        roots = np.linalg.cholesky(covariance)
-        white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
-        white = np.moveaxis(white, 3, 1).reshape(len(columns), 4, -1)
-        volume = 2 * np.log(np.diagonal(roots, axis1=2, axis2=3).real).sum(axis=(1, 2))
-        energy = np.sum(np.abs(white[:, 0])**2, axis=1)
-        curvature = quadratic_form(white[:, 1:]) + np.diag(MIN_CURVATURE)
-        gradient = 2 * np.einsum('hgs,hs->hg', white[:, 1:].conj(), white[:, 0]).real
-        step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
-        step = np.clip(step, -_STEP_LIMITS, _STEP_LIMITS)
-        gain = np.sum(gradient * step, axis=1) - likelihood_loss(step, curvature)
-        value = n_failed * self._log_odds - energy - volume + gain
-        return Weighed(value, step, curvature, energy - gain)
+    def _of_further(self, failed: tuple[int, ...], partial: bool) -> Further:
+        if (failed, partial) not in self._further:
+            surface = self.surface(failed)
+            covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
+            if partial:
+                covariance += self._remainder[:, None]
+            roots = np.linalg.cholesky(covariance)
+            if len(self._further) >= _MAX_FURTHER:
+                # Those of the intact surface remain.
+                del self._further[next(key for key in self._further if key[0])]
+            self._further[failed, partial] = Further(
+                np.linalg.inv(roots), _log_determinant(roots).sum(axis=0))
+        return self._further[failed, partial]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
         """Change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""
@@ -201,3 +246,23 @@ class FailureModel:
         change: np.ndarray = np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
         change *= self._correlation
         return change
+
+
+def _weigh(log_weight: np.ndarray | float, products: np.ndarray) -> Weighed:
+    """Weigh hypotheses, from the log-probability without the energy, [H], and the columns.
+
+    Takes the products [H, 4, 4] of the whitened columns.
+    """
+    energy = products[:, 0, 0]
+    curvature = 2 * products[:, 1:, 1:] + np.diag(MIN_CURVATURE)
+    gradient = 2 * products[:, 1:, 0]
+    step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
+    step = np.clip(step, -_STEP_LIMITS, _STEP_LIMITS)
+    gain = np.sum(gradient * step, axis=1) - likelihood_loss(step, curvature)
+    return Weighed(log_weight - energy + gain, step, curvature, energy - gain)
+
+
+def _log_determinant(roots: np.ndarray) -> np.ndarray:
+    """Logarithm of the determinant from Cholesky factors [..., S, S]."""
+    value: np.ndarray = 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
+    return value
