@@ -43,7 +43,7 @@ def exhaustive_posterior(
 
     codebook.check(scenario)
     batch = checked_received(scenario, codebook, received)
-    log_likelihood_at = _likelihood(scenario, codebook, batch, surface)
+    log_likelihood_at = _likelihood(scenario, codebook, batch, surface, 2**log2_points)
     low, high = scenario.roi_bounds_m
     center = (low + high) / 2
     n = len(batch)
@@ -69,12 +69,13 @@ def exhaustive_posterior(
 
 
 def _likelihood(scenario: Scenario, codebook: Codebook, received: np.ndarray,
-                surface: SurfaceImperfection | None) -> Callable[[np.ndarray], np.ndarray]:
+                surface: SurfaceImperfection | None, n_points: int
+                ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function of positions [P, 3] with the log-likelihood of each phase, [P, N]."""
     if nuisance_parameters(scenario):
         return NuisanceLikelihood(scenario, codebook, received)
     if has_element_errors(scenario) and surface is None:
-        return ElementErrorLikelihood(scenario, codebook, received)
+        return ElementErrorLikelihood(scenario, codebook, received, n_points)
     model = MeasurementModel(scenario, codebook, surface).prepare()
     signals = stack_parts(model.whiten(received)).astype(np.float32).T
 
