@@ -17,7 +17,7 @@ _USER_WINDOW = 100
 class ResidualWatch:
     """Compares residuals with the model, over all users and for each user.
 
-    The signals of a single user with an unknown gain deviate without an effect on the mean over
+    The signals of a single user with an unknown gain deviate with little effect on the mean over
     many users.
     """
 
@@ -58,12 +58,14 @@ class ResidualWatch:
         -------
         dict
             ``residual.ratio``, the mean energy of the residuals relative to the expectation;
+            ``residual.spread``, the variance of the energy relative to the expectation;
             ``residual.fixes``, the number of fixes in the mean; and ``warning.residual`` during a
             warning. Empty before the first residual.
         """
         if not self._all.n_fixes:
             return {}
         values = {'residual.ratio': f'{self._all.ratio:.3f}',
+                  'residual.spread': f'{self._all.spread:.3f}',
                   'residual.fixes': str(self._all.n_fixes)}
         return values | ({'warning.residual': self._warning} if self._warning else {})
 
@@ -80,5 +82,5 @@ class ResidualWatch:
 
 
 def _deviation(prefix: str, monitor: ResidualMonitor) -> str:
-    return (f'{prefix}residuals {monitor.ratio:.3g} times as strong as expected over '
-            f'{monitor.n_fixes} cycles')
+    return (f'{prefix}residuals {monitor.ratio:.3g} times as strong as expected, with '
+            f'{monitor.spread:.3g} times the variance, over {monitor.n_fixes} cycles')

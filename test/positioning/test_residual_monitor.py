@@ -49,6 +49,27 @@ def test_slightly_wrong_residuals_cause_a_warning_after_some_fixes(scale):
         assert monitor.ratio == pytest.approx(scale, abs=0.03)
 
 
+def test_residuals_that_vary_too_much_cause_a_warning():
+    """Their mean alone would not: most of the excess of a few phases is made up by others."""
+    values = energies(WINDOW)
+    mean = EXPECTED * 1.02
+    monitor = filled(mean + 1.6 * (values - EXPECTED))
+    assert monitor.drifts
+    assert monitor.spread == pytest.approx(1.6**2, abs=0.4)
+    assert not filled(mean + values - EXPECTED).drifts
+
+
+@pytest.mark.parametrize('shape', [1.0, 10.0, 62.5])
+def test_the_variance_of_the_model_causes_no_warning(shape):
+    """Energies of few measurements have a skewed distribution."""
+    rng = np.random.default_rng(4)
+    for window in rng.standard_gamma(shape, (200, MIN_RETURN)):
+        monitor = ResidualMonitor(MIN_RETURN)
+        for value in window:
+            monitor.add(float(value), shape)
+            assert not monitor.drifts
+
+
 def test_few_residuals_are_not_judged():
     assert not filled([1e6] * (MIN_FIXES - 1)).drifts
     assert filled([1e6] * MIN_FIXES).drifts
@@ -82,6 +103,7 @@ def test_residuals_are_forgotten_on_request():
     assert not monitor.drifts
     assert monitor.n_fixes == 0
     assert math.isnan(monitor.ratio)
+    assert math.isnan(monitor.spread)
 
 
 @pytest.mark.parametrize(('energy', 'expected'), [

@@ -34,7 +34,8 @@ def test_the_watch_is_silent_without_residuals():
 def test_residuals_of_the_model_are_shown_without_a_warning():
     watch = ResidualWatch()
     assert add(watch, 1, 2 * WINDOW, 1.0) == []
-    assert watch.status() == {'residual.ratio': '1.000', 'residual.fixes': str(WINDOW)}
+    assert watch.status() == {'residual.ratio': '1.000', 'residual.spread': '0.000',
+                              'residual.fixes': str(WINDOW)}
 
 
 def test_a_deviation_is_logged_when_it_begins_and_when_it_ends():
