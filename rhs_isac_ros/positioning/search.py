@@ -49,6 +49,24 @@ _N_COORDINATES = 3
 _BLOCK = 32
 
 
+class Doubt(NamedTuple):
+    """The possibility that the user is outside of the region of interest.
+
+    Attributes
+    ----------
+    probability
+        Probability that the user is outside.
+    whitened
+        Whitened signals without the offsets of carrier and timing, complex128 [N_B, N_SB F].
+    scale
+        Factor of the signals, from the gain, that is most probable outside.
+    """
+
+    probability: float
+    whitened: np.ndarray
+    scale: float
+
+
 class Posterior(NamedTuple):
     """The posterior of one positioning phase, for a uniform prior on the region of interest.
 
@@ -60,11 +78,15 @@ class Posterior(NamedTuple):
         Its modes; None without a position.
     whitened
         Whitened signals, complex128 [N_B, N_SB F].
+    doubt
+        The possibility that the user is outside of the region, which the covariance includes;
+        None if it is negligible, or without a position.
     """
 
     estimate: Estimate
     modes: Modes | None
     whitened: np.ndarray
+    doubt: Doubt | None
 
 
 class SearchEstimator(abc.ABC):
@@ -137,8 +159,15 @@ class SearchEstimator(abc.ABC):
         model = self._model
         (signals,) = checked_received(model.scenario, model.codebook, received)
         (whitened,) = model.whiten(signals[None])
-        located, modes = self._analyse(signals, whitened)
-        return Posterior(Estimate(*located), modes, whitened)
+        located, modes, doubt = self._analyse(signals, whitened)
+        return Posterior(Estimate(*located), modes, whitened, doubt)
+
+    def with_outside(
+            self, mean: np.ndarray, covariance: np.ndarray, doubt: Doubt) -> np.ndarray:
+        """Add positions outside of the region to a covariance about a mean inside, [3, 3]."""
+        moment = self._surroundings.second_moment(doubt.whitened, mean, doubt.scale)
+        result: np.ndarray = (1 - doubt.probability) * covariance + doubt.probability * moment
+        return result
 
     @property
     def normal(self) -> np.ndarray:
@@ -177,29 +206,30 @@ class SearchEstimator(abc.ABC):
         samples = draw_samples_of_each(
             [one.modes for one in found], self._table.normal, self._bounds)
         for row, one, drawn in zip(usable.tolist(), found, samples, strict=True):
-            located[row] = self._judge(one, drawn)
+            located[row], _ = self._judge(one, drawn)
         return located
 
     def _analyse(
-            self, received: np.ndarray, whitened: np.ndarray) -> tuple[Located, Modes | None]:
-        """Locate one phase; also return the modes, None without a position."""
+            self, received: np.ndarray, whitened: np.ndarray
+    ) -> tuple[Located, Modes | None, Doubt | None]:
+        """Locate one phase; also return the modes, None without a position, and the doubt."""
         reason = self._too_weak(whitened)
         if reason:
-            return (*_no_fix(), reason, np.nan, np.nan), None
+            return (*_no_fix(), reason, np.nan, np.nan), None, None
         found = (self._marginal.find(received) if self._marginal
                  else self._find(received, whitened))
         samples = found.samples or draw_samples(
             found.modes, self._table.normal, self._bounds)
-        located = self._judge(found, samples)
-        return located, None if located[2] else found.modes
+        located, doubt = self._judge(found, samples)
+        return located, None if located[2] else found.modes, doubt
 
     def _too_weak(self, whitened: np.ndarray) -> str:
         """Return a reason if the signals are weaker than noise."""
         return self._test.min_energy_test(
             float(np.sum(np.abs(whitened)**2)) * self._max_power)
 
-    def _judge(self, found: Found, samples: Samples) -> Located:
-        """Return the position, or why there is none."""
+    def _judge(self, found: Found, samples: Samples) -> tuple[Located, Doubt | None]:
+        """Return the position, or why there is none, and the doubt."""
         residual = float(found.residuals[np.argmax(found.modes.roi_log_likelihood)])
         outside = 0.0
         if self._rejects_outside:
@@ -207,12 +237,13 @@ class SearchEstimator(abc.ABC):
             outside = outside_probability(inside - found.log_evidence_outside)
         reason = self._reason(found, residual, outside)
         moments = _no_fix() if reason else self._moments(found.modes, samples)
-        expected = np.nan
+        expected, doubt = np.nan, None
         if outside <= DOUBT_LIMIT or self._test.residual_test(residual) == reason != '':
             expected = self._expected_residual(found.residuals, residual, samples)
         elif not reason:
-            moments = self._with_outside(moments, found, outside)
-        return (*moments, reason, residual, expected)
+            doubt = Doubt(outside, found.whitened, found.scale_outside)
+            moments = moments[0], self.with_outside(*moments, doubt)
+        return (*moments, reason, residual, expected), doubt
 
     def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
         if self._failures:
@@ -250,14 +281,6 @@ class SearchEstimator(abc.ABC):
                 found.whitened, self._test.max_residual):
             return unexplained
         return outside_test(outside) or unexplained
-
-    def _with_outside(
-            self, moments: tuple[np.ndarray, np.ndarray], found: Found, outside: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Add positions outside, which have this probability, to the covariance."""
-        mean, covariance = moments
-        moment = self._surroundings.second_moment(found.whitened, mean, found.scale_outside)
-        return mean, (1 - outside) * covariance + outside * moment
 
     def _expected_residual(
             self, residuals: np.ndarray, residual: float, samples: Samples) -> float:

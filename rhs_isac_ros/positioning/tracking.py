@@ -62,6 +62,9 @@ class Tracker:
     `MAX_GAP_S`; signals without a position do not change it, and neither do those whose multipath
     is almost that of the phase before.
 
+    Positions of the track are inside the region of interest. If the signals of a phase may be from
+    outside, its covariance includes the positions there, as that of the estimator does.
+
     Parameters
     ----------
     estimator
@@ -117,6 +120,8 @@ class Tracker:
             mixture = self._updated(
                 mixture, posterior.modes, posterior.whitened, share, elapsed_s)
         mixture, mean, covariance = self._inside(mixture)
+        if posterior.doubt:
+            covariance = self.estimator.with_outside(mean, covariance, posterior.doubt)
         if share >= _MIN_SHARE:
             self._mixture, self._time_s = mixture, time_s
             self._n_phases += 1

@@ -8,8 +8,9 @@ from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.newest import NewestDict
 
-# Number of users with a track.
-_MAX_USERS = 64
+# Number of users with a track: more than are located before the first tracks end by their gap. A
+# track takes up to 20 kB.
+_MAX_USERS = 4096
 
 
 @dataclasses.dataclass
@@ -33,8 +34,8 @@ class _Track:
 class Tracks:
     """A track for each user, started and ended by the signals alone.
 
-    A track ends with a gap, with another instance of the user, or if many other users have been
-    located since. Signals of an earlier cycle are located without the track.
+    A track ends with a gap, with another instance of the user, or if thousands of other users have
+    been located since. Signals of an earlier cycle are located without the track.
     """
 
     def __init__(self) -> None:
@@ -80,6 +81,9 @@ class Tracks:
         return estimate
 
     def _end_old(self, now_s: float) -> None:
-        for user, track in list(self._tracks.items()):
-            if now_s > track.time_s + MAX_GAP_S:
-                del self._tracks[user]
+        # The oldest tracks come first.
+        while self._tracks:
+            user, track = next(iter(self._tracks.items()))
+            if now_s <= track.time_s + MAX_GAP_S:
+                break
+            del self._tracks[user]

@@ -155,6 +155,34 @@ def test_estimates_are_inside_the_region(tracker, sample):
         assert (estimate.mean <= high + 1e-9).all()
 
 
+def test_covariances_include_the_positions_outside_as_those_of_single_phases(random_beams):
+    """Weak signals of a user inside may be those of one outside."""
+    scenario = Scenario(n_subbands=2, n_frames=4, elements_per_side=5, roi_center_m=(3, 0, 0),
+                        roi_size_m=(1, 1, 1), max_power_w=1e-6)
+    rng = np.random.default_rng(4)
+    codebook = random_beams(scenario, rng)
+    alone = make_estimator('bayes', scenario, codebook, reject_outside=True)
+    certain = Tracker(make_estimator('bayes', scenario, codebook))
+    tracker, model = Tracker(alone), MeasurementModel(scenario, codebook)
+    doubts = []
+    for k in range(40):
+        signals = model.sample(np.array([[3.3, 0.3, 0.2]]), rng)[0]
+        posterior = alone.posterior(signals)
+        if posterior.modes is None:
+            continue
+        found, expected = (each.update(k * PERIOD_S, signals) for each in (tracker, certain))
+        np.testing.assert_allclose(found.mean, expected.mean)
+        doubts.append(posterior.doubt is not None)
+        assert np.isnan(found.expected_residual) == doubts[-1]
+        if doubts[-1]:
+            # Most of the half space is metres away.
+            added = np.trace(found.covariance - expected.covariance)
+            assert added > posterior.doubt.probability
+        else:
+            np.testing.assert_allclose(found.covariance, expected.covariance)
+    assert 5 < sum(doubts) < len(doubts) - 5
+
+
 def test_an_estimator_of_another_codebook_continues_the_track(table1, tracker, follow):
     assert follow(np.arange(10) * PERIOD_S).n_phases == 10
     tracker.estimator = make_estimator('bayes', table1.scenario, table1.codebook)

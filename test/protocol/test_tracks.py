@@ -92,10 +92,20 @@ def test_a_gap_ends_a_track(locate):
     assert len(locate.tracks) == 1
 
 
-def test_the_number_of_tracks_is_bounded(locate):
+def test_more_than_64_users_have_tracks(locate):
     for n in range(70):
         locate(n, user=1 + n, now_s=0.1 + n / 1000)
-    assert len(locate.tracks) == 64
+    assert len(locate.tracks) == 70
+    assert locate(70, user=1, now_s=0.3).n_phases == 2
+
+
+def test_the_number_of_tracks_is_bounded(monkeypatch, estimator, signals):
+    monkeypatch.setattr('rhs_isac_ros.protocol.tracks._MAX_USERS', 2)
+    tracks = Tracks()
+    counts = [tracks.locate(signals(n, user=user), estimator, 1.0, n / 10).n_phases
+              for n, user in enumerate([1, 2, 1, 3, 1, 2])]
+    assert counts == [1, 1, 2, 1, 3, 1]
+    assert len(tracks) == 2
 
 
 @pytest.fixture
