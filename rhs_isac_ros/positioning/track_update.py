@@ -15,8 +15,8 @@ _PAIR_MARGIN = 18.0
 _N_EXACT = 16
 # Squared Mahalanobis distance below which two updates of a component are the same maximum.
 _SAME_MAXIMUM = 1.0
-# Log-likelihood, relative to that of the best mode, at positions that are not near a mode: the
-# search for modes finds those above.
+# Log-likelihood, relative to that of the best mode, of a mode that the search has missed: it finds
+# those above.
 _FLOOR = -EXACT_MARGIN
 
 
@@ -25,8 +25,8 @@ def update(
         whitened: np.ndarray) -> Mixture:
     """Return the product of a predicted mixture and the likelihood of a phase, not normalised.
 
-    Every mode updates every component. The likelihood between the modes is not zero: components
-    also remain without an update, at a low likelihood.
+    Every mode updates every component. Components also remain without an update, as if a mode with
+    a low likelihood, as wide as the best one, had been missed at an unknown place inside them.
 
     Parameters
     ----------
@@ -59,7 +59,9 @@ def update(
             predicted.select(component[head]), updated.means[head, :3], share, model, whitened)
         exact = exact.select(_is_first(exact, component[head]))
         updated = concatenate(exact, updated.select(np.arange(len(head), len(order))))
-    floor = share * (modes.roi_log_likelihood.max() + _FLOOR)
+    best = int(np.argmax(modes.roi_log_likelihood))
+    floor, _ = _evidence(np.zeros(3), predicted.covariances[:, :3, :3], spread[best])
+    floor += share * (modes.roi_log_likelihood[best] + _FLOOR)
     return concatenate(
         updated, predicted._replace(log_weights=predicted.log_weights + floor))
 

@@ -87,6 +87,19 @@ def test_errors_and_covariances_of_walks(table1_estimator, sample):
     assert 1 < np.median(normalised) < 5
 
 
+def test_a_walk_of_metres_between_phases(tracker, sample):
+    """The predicted position is much less certain than that of each mode."""
+    tracker = Tracker(tracker.estimator, Motion(speed_mps=6.0))
+    velocity, errors = np.array([3.6, 4.8, 0.0]), []
+    start = np.array([7.0, -4.0, 0.1])
+    for k in range(5):
+        position = start + 0.3 * k * velocity
+        estimate = tracker.update(0.3 * k, sample(position))
+        errors.append(error(estimate, position))
+    assert np.mean(errors[2:]) < 1.0
+    assert np.linalg.norm(estimate.velocity - velocity) < 2.0
+
+
 def test_a_gap_widens_the_prior_and_a_longer_one_ends_the_track(follow, tracker, sample):
     times_s = np.arange(20) * PERIOD_S
     before = follow(times_s)
