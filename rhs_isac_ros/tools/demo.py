@@ -6,7 +6,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from rhs_isac_ros.model.arguments import (
     seed,
 )
 from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, max_processes, private_domain
@@ -83,8 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         processes = Processes(Path(logs), {'ROS_LOG_DIR': logs})
         try:
             with processes:
-                start_network(processes, options.users, options.seed, options.config,
-                              codebook_file, scenario)
+                start_network(
+                    processes, options.users, options.seed, options.config, codebook_file,
+                    scenario, positioner=positioner_parameters(options.prior, scenario))
                 problem = watch(observer, processes, options.cycles, _show_progress)
         except (KeyboardInterrupt, ExternalShutdownException):
             problem = ''
@@ -106,6 +108,14 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
                         help="scenario file; by default the paper's Table I")
     parser.add_argument('--codebook', type=input_file, metavar='FILE',
                         help='codebook file; by default that of the package')
+
+
+def positioner_parameters(prior: str, scenario: Scenario) -> dict[str, Any]:
+    """Return the parameters of the positioner for users that move at the maximum speed."""
+    if prior == REGION:
+        return {}
+    # The parameter does not admit 0.
+    return {'prior': prior, 'track_speed_mps': max(scenario.max_user_speed_mps, 0.01)}
 
 
 def check_users(parser: argparse.ArgumentParser, users: int, instead: str = '') -> None:
@@ -154,7 +164,8 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 def start_network(
         processes: Processes, users: int, seed: int, scenario_file: Path | None,
         codebook_file: Path, scenario: Scenario, rest_s: float = 0.1, first_cycle: int = 1,
-        impairments: Impairments | None = None) -> None:
+        impairments: Impairments | None = None,
+        positioner: Mapping[str, Any] | None = None) -> None:
     """Start each node of a network in a process of its own.
 
     Parameters
@@ -172,12 +183,15 @@ def start_network(
         numbers are derived from the clock, so that the base station can be restarted.
     impairments
         Impairments of signals and packets; by default none.
+    positioner
+        Further parameters of the positioner.
     """
     common: dict[str, Any] = {}
     if scenario_file:
         common['scenario_file'] = Path(scenario_file).resolve()
-    for executable in ('rhs_controller', 'positioner', 'transmission'):
+    for executable in ('rhs_controller', 'transmission'):
         processes.start(executable, **common)
+    processes.start('positioner', **(positioner or {}), **common)
     processes.start('optimizer', codebook_file=codebook_file, **common)
     impaired = dataclasses.asdict(impairments or Impairments())
     processes.start('channel', seed=seed, **impaired, **common)
@@ -226,6 +240,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--users', type=positive_int, default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=20, help='cycles to wait for')
     add_network_options(parser)
+    parser.add_argument('--prior', choices=PRIORS, default=REGION,
+                        help='prior of the positions: the region, or the track of each user')
     parser.add_argument('--record', type=output_file, metavar='FILE',
                         help='recording to write (MCAP)')
     parser.add_argument('--picture', type=picture_file, default='demo.png', metavar='FILE',
