@@ -4,8 +4,10 @@ import copy
 
 import numpy as np
 
-from rhs_isac_ros.bounds.average import Average
+from rhs_isac_ros.bounds.average import Average, Combination
 from rhs_isac_ros.bounds.compressed_rows import CompressedRows
+from rhs_isac_ros.bounds.measurement_rows import PLAIN
+from rhs_isac_ros.bounds.unknown_phases import best_phases, phase_scales
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming
@@ -21,7 +23,9 @@ class PairwiseErrorCost(Average):
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
     cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. The quadratic
-    form is that of Eq. (12), with the difference h(p) - h(p') instead of the derivative.
+    form is that of Eq. (12), with the difference h(p) - h(p') instead of the derivative. If the
+    scenario declares phases as unknown, the form is the smallest over the phases, see
+    `unknown_phases`; other nuisance parameters are not included.
 
     Parameters
     ----------
@@ -54,12 +58,20 @@ class PairwiseErrorCost(Average):
             raise ValueError(
                 f'weights: shape {weights.shape}, expected {(n,)}, none negative or NaN')
         self._costs = weights * np.sum((first_positions - second_positions)**2, axis=1)
+        self._scales = phase_scales(scenario)
+
+        def gains(block: slice, band: int) -> list[np.ndarray]:
+            return [_repeated_gain(scenario, first_positions[block], band),
+                    los_gain(scenario, second_positions[block], band)]
+
+        if not self._scales.size:
+            super().__init__(
+                scenario, lambda block, band: np.subtract(*gains(block, band))[:, None],
+                n, 1, self._confusion, tolerance)
+            return
         super().__init__(
-            scenario,
-            lambda block, band: (
-                _repeated_gain(scenario, first_positions[block], band)
-                - los_gain(scenario, second_positions[block], band))[:, None],
-            n, 1, self._confusion, tolerance)
+            scenario, lambda block, band: np.stack(gains(block, band), axis=1), n, 2,
+            self._confusion, tolerance, PLAIN, _rows_of_bands(scenario.n_bands))
 
     def sample(
             self, codebook: Beamforming, n: int, rng: np.random.Generator
@@ -104,11 +116,35 @@ class PairwiseErrorCost(Average):
         """Cost times Q(sqrt(q / 2)) [n], and minus its derivative d/d(2 q), [n, 1, 1]."""
         from scipy.special import ndtr
 
-        root = np.sqrt(forms[:, 0, 0])
+        squares, slopes = self._squares(forms)
+        root = np.sqrt(squares)
         costs = self._costs[block]
         # The derivative is undefined for equal signals; the limit keeps it finite.
         slope = np.exp(-root**2 / 8) / (4 * np.sqrt(2 * np.pi) * np.maximum(root, 1e-9))
-        return costs * ndtr(-root / 2), (costs * slope)[:, None, None]
+        return costs * ndtr(-root / 2), (costs * slope)[:, None, None] * slopes
+
+    def _squares(self, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values 2 q [n], and their derivatives with respect to the forms."""
+        if not self._scales.size:
+            return forms[:, 0, 0], np.ones((1, 1, 1))
+        first = np.arange(0, forms.shape[1], 3)
+        turned, second = first + 1, first + 2
+        phases, penalties = best_phases(
+            forms[:, first, second] + 1j * forms[:, turned, second], self._scales)
+        # The phases minimise the value, which therefore does not change with them.
+        slopes = np.zeros(forms.shape)
+        slopes[:, first, first] = slopes[:, second, second] = 1.0
+        slopes[:, first, second] = slopes[:, second, first] = -np.cos(phases)
+        slopes[:, turned, second] = slopes[:, second, turned] = -np.sin(phases)
+        squares = np.einsum('nab,nab->n', slopes, forms) + penalties
+        return np.maximum(squares, 0.0), slopes
+
+
+def _rows_of_bands(n_bands: int) -> Combination:
+    """Rows a_i, i a_i and b_i of each band, from the rows of the two signals."""
+    scale = np.zeros((n_bands, n_bands, 3), complex)
+    scale[np.arange(n_bands), np.arange(n_bands)] = 1, 1j, 1
+    return Combination(np.tile([0, 0, 1], n_bands), scale.reshape(n_bands, -1))
 
 
 def _repeated_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:

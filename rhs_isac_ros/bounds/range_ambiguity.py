@@ -8,6 +8,7 @@ plans in little time.
 
 import numpy as np
 
+from rhs_isac_ros.bounds.unknown_phases import best_phases, phase_scales
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -69,7 +70,8 @@ def range_confusion_error_of(
     The error is that of the posterior mean, if the user is at a position or at one of those that
     can be confused with it: the lags are the minima of the mismatch along the line of sight. The
     differences of the signals are those that remain after a small displacement of the confused
-    position, to first order. Noise is drawn several times for each position.
+    position, to first order, and with the best values of phases that the scenario declares as
+    unknown. Noise is drawn several times for each position.
 
     Parameters
     ----------
@@ -97,10 +99,10 @@ def range_confusion_error_of(
         inside = ((confused >= low) & (confused <= high)).all(axis=1)
         if not inside.any():
             continue
-        difference = _differences(model, mean, confused[inside])
+        difference, penalties = _differences(model, mean, confused[inside])
         # The real and imaginary parts of the noise have variance 1/2 each.
         noise = rng.normal(scale=np.sqrt(0.5), size=(_DRAWS, difference.shape[1]))
-        exponents = 2 * noise @ difference.T - np.sum(difference**2, axis=1)
+        exponents = 2 * noise @ difference.T - np.sum(difference**2, axis=1) - penalties / 2
         # The true position has the exponent 0.
         largest = exponents.max(axis=1, initial=0.0)[:, None]
         weights = np.exp(exponents - largest)
@@ -110,16 +112,32 @@ def range_confusion_error_of(
 
 
 def _differences(
-        model: MeasurementModel, mean: np.ndarray, confused: np.ndarray) -> np.ndarray:
-    """Whitened differences from a mean that no small displacement explains, float64 [n, R]."""
+        model: MeasurementModel, mean: np.ndarray, confused: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened differences from a mean that nothing else explains.
+
+    Returns the differences, float64 [n, R], and the costs of the phases, float64 [n].
+    """
     means, jacobians = model.mean_and_jacobian(confused)
-    difference = _real(model.whiten(means - mean))
-    slopes = _real(model.whiten(jacobians))
-    by_position = np.einsum('nur,nr->nu', slopes, difference)
-    information = np.einsum('nur,nvr->nuv', slopes, slopes)
+    means, jacobians, target = model.whiten(means), model.whiten(jacobians), model.whiten(mean)
+    scales, penalties = phase_scales(model.scenario), np.zeros(len(confused))
+    slopes = jacobians
+    if scales.size:
+        products = 2 * np.sum(np.conj(means) * target, axis=2)
+        phases, penalties = best_phases(products, scales)
+        turns = np.exp(1j * phases)[..., None]
+        means, jacobians = turns * means, turns[:, None] * jacobians
+        # Displacements and phases compensate each other.
+        turned = 1j * means[:, None] * scales.T[None, :, :, None]
+        slopes = np.concatenate([jacobians, turned], axis=1)
+    difference, directions = _real(means - target), _real(slopes)
+    by_position = np.einsum('nur,nr->nu', directions, difference)
+    information = np.einsum('nur,nvr->nuv', directions, directions)
+    # The phases have a prior; the information of real parts is half the curvature.
+    information[:, 3:, 3:] += np.eye(scales.shape[1]) / 2
     displacement = np.linalg.solve(information, by_position[..., None])[..., 0]
-    remaining: np.ndarray = difference - np.einsum('nu,nur->nr', displacement, slopes)
-    return remaining
+    remaining: np.ndarray = difference - np.einsum('nu,nur->nr', displacement, directions)
+    return remaining, penalties
 
 
 def _lags(highest_hz: float, max_lag_m: float) -> np.ndarray:

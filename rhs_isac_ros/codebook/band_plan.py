@@ -2,27 +2,26 @@
 
 Frequencies move on a raster. Three stages of growing cost compare band plans: the range ambiguity
 function, in closed form, of all plans or along a coordinate search; short codebook optimisations
-of a few plans that differ; and a full optimisation for the best of these.
+of a few plans that differ; and full optimisations for the best of these. The expected squared
+error with a codebook compares the plans of the last two stages.
 """
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rhs_isac_ros.bounds import crlb_of
+from rhs_isac_ros.bounds import crlb_of, global_bound
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error, range_confusion_error_of
-from rhs_isac_ros.codebook.optimize import OptimizeResult, optimize
+from rhs_isac_ros.codebook.band_screening import first_fit, raster, screen
+from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.codebook.optimize import INTERRUPTED, OptimizeResult, optimize
 from rhs_isac_ros.codebook.start import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
+from rhs_isac_ros.model.nuisance import nuisance_parameters
 
 DEFAULT_RASTER_HZ = 10e6
-# Plans that are all compared; of more, a coordinate search compares some.
-MAX_EXHAUSTIVE = 20_000
-# Starts of the coordinate search.
-_STARTS = 8
 # Energies of a codebook relative to a random one, for each of which the screening proposes plans:
 # with more energy, wider plans are better. Energies from 8 proposed plans with more confusion of
 # directions, which the screening does not see.
@@ -30,6 +29,10 @@ _ENERGY_LEVELS = (2.0, 3.0, 4.0)
 # Plans with a codebook, and the positions and steps of their optimisations.
 _CANDIDATES = 6
 _SHORT_POSITIONS, _SHORT_STEPS = 64, 200
+# Candidates with a full optimisation.
+_FINALISTS = 3
+# Phases of the global bound after a short optimisation, and after a full one.
+_SHORT_PHASES, _PHASES = 1024, 4096
 # Positions at which energies and errors are averaged, and quantiles that represent the energies.
 _POSITIONS, _QUANTILES = 256, 16
 # Candidates differ from each other by this many steps of the raster in some frequency.
@@ -47,33 +50,35 @@ class Candidate:
     screening_m2
         Squared error by confusion of ranges, from the range ambiguity function.
     error_m2
-        Average bound plus squared error by confusion, with an optimised codebook; NaN before.
+        Expected squared error with an optimised codebook, see `expected_error`.
     """
 
     frequencies_hz: tuple[float, ...]
     screening_m2: float
-    error_m2: float = math.nan
+    error_m2: float
 
 
 @dataclasses.dataclass(frozen=True)
 class BandPlan:
     """Result of `optimize_band_plan`: the scenario with its bands, and its codebook.
 
-    `candidates` are the plans that `choose_bands` compared, the best one first.
+    `candidates` are the plans that `choose_bands` compared, the best one first, and `error_m2` is
+    the expected squared error.
     """
 
     scenario: Scenario
     result: OptimizeResult
     candidates: tuple[Candidate, ...]
+    error_m2: float
 
 
 def optimize_band_plan(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
         max_steps: int | None = None) -> BandPlan:
-    """Choose centre frequencies as `choose_bands` does, and optimise the codebook for them.
+    """Choose centre frequencies as `choose_bands` and `best_of` do, with codebooks for them.
 
-    `max_steps` limits the last optimisation, for which `optimize` describes the default.
+    `max_steps` limits the full optimisations, for which `optimize` describes the default.
 
     Raises
     ------
@@ -82,9 +87,45 @@ def optimize_band_plan(
     """
     candidates = choose_bands(
         scenario, spectrum_hz, n_bands, raster_hz=raster_hz, min_gap_hz=min_gap_hz, seed=seed)
-    best = with_bands(scenario, candidates[0].frequencies_hz)
-    result = optimize(best, objective='ambiguity', seed=seed, max_steps=max_steps)
-    return BandPlan(best, result, candidates)
+    return best_of(
+        scenario, candidates,
+        lambda plan: optimize(plan, objective='error', seed=seed, max_steps=max_steps), seed)
+
+
+def best_of(
+        scenario: Scenario, candidates: Sequence[Candidate],
+        search: Callable[[Scenario], OptimizeResult], seed: int = 0,
+        report: Callable[[Candidate], None] | None = None) -> BandPlan:
+    """Optimise codebooks for the first candidates, and return the plan with the lowest error.
+
+    Parameters
+    ----------
+    candidates
+        At least one candidate, the best one first.
+    search
+        Optimisation of a codebook. After one that is interrupted, the best plan so far is
+        returned.
+    report
+        Called with each plan and its error with the codebook.
+    """
+    best: BandPlan | None = None
+    for candidate in candidates[:_FINALISTS]:
+        plan = with_bands(scenario, candidate.frequencies_hz)
+        result = search(plan)
+        interrupted = result.reason == INTERRUPTED
+        if interrupted and best:
+            break
+        error = (math.nan if interrupted else
+                 expected_error(plan, result.codebook, seed, _PHASES))
+        if report:
+            report(dataclasses.replace(candidate, error_m2=error))
+        if best is None or error < best.error_m2:
+            best = BandPlan(plan, result, tuple(candidates), error)
+        if interrupted:
+            break
+    if best is None:
+        raise ValueError('candidates: none, expected at least one')
+    return best
 
 
 def choose_bands(
@@ -125,7 +166,7 @@ def choose_bands(
     gap_hz = (scenario.n_subbands * scenario.subband_width_hz if min_gap_hz is None
               else min_gap_hz)
     frequencies_hz = raster(spectrum_hz, raster_hz)
-    if _first_fit(frequencies_hz, n_bands, gap_hz) is None:
+    if first_fit(frequencies_hz, n_bands, gap_hz) is None:
         raise ValueError(
             f'bands: {n_bands} with gaps of {gap_hz:g} Hz, expected fewer on the '
             f'{len(frequencies_hz)} frequencies of the raster')
@@ -145,23 +186,6 @@ def with_bands(scenario: Scenario, frequencies_hz: Sequence[float]) -> Scenario:
     return dataclasses.replace(
         scenario, center_frequencies_hz=tuple(frequencies_hz),
         n_frames=scenario.n_bands * scenario.n_frames // len(frequencies_hz))
-
-
-def raster(spectrum_hz: Sequence[tuple[float, float]], raster_hz: float) -> np.ndarray:
-    """Return the possible centre frequencies, ascending, float64 [n] [Hz].
-
-    Raise ValueError if an interval or the raster is invalid.
-    """
-    if not 0 < raster_hz < math.inf:
-        raise ValueError(f'raster: {raster_hz:g} Hz, expected a positive number')
-    if not spectrum_hz:
-        raise ValueError('spectrum: no interval, expected at least one')
-    for low, high in spectrum_hz:
-        if not 0 < low <= high < math.inf:
-            raise ValueError(f'spectrum: {low:g}:{high:g}, expected LOW:HIGH with 0 < LOW <= HIGH')
-    return np.unique(np.concatenate([
-        low + raster_hz * np.arange(math.floor((high - low) / raster_hz * (1 + 1e-9)) + 1)
-        for low, high in spectrum_hz]))
 
 
 def _proposals(
@@ -191,58 +215,29 @@ def _proposals(
     return chosen
 
 
-def screen(
-        frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
-        errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator,
-        max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
-    """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
+def expected_error(
+        scenario: Scenario, codebook: Codebook, seed: int = 0, n_phases: int = 2048) -> float:
+    """Estimate the mean squared error with a codebook [m^2].
 
-    Up to `max_exhaustive` plans are all evaluated. Of more, the ends of a coordinate search from
-    several starts are returned: it moves one frequency at a time to its best place on the raster.
+    The estimate is the global bound, which is a few percent below the error. If the scenario
+    declares nuisance parameters, which that bound ignores, it is the average local bound with the
+    region as prior, plus the squared error by confusion of ranges.
     """
-    if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
-        return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)
-    plans = np.array(list(itertools.combinations(frequencies_hz, n_bands)))
-    plans = plans[_has_gap(plans, gap_hz)]
-    return plans, errors(plans)
-
-
-def _coordinate_search(
-        frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
-        errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the searches from several starts, which are random as far as the gap permits."""
-    drawn = np.sort([rng.choice(frequencies_hz, n_bands, replace=False)
-                     for _ in range(_STARTS)], axis=1)
-    first = _first_fit(frequencies_hz, n_bands, gap_hz)
-    starts = [*drawn[_has_gap(drawn, gap_hz)], *([] if first is None else [first])]
-    ends: dict[tuple[float, ...], float] = {}
-    for plan in starts:
-        value = np.inf
-        while True:
-            moves = np.repeat(plan[None], n_bands * len(frequencies_hz), axis=0)
-            moves.reshape(n_bands, -1, n_bands)[
-                np.arange(n_bands), :, np.arange(n_bands)] = frequencies_hz
-            moves = np.unique(np.sort(moves, axis=1), axis=0)
-            moves = moves[_has_gap(moves, gap_hz)]
-            values = errors(moves)
-            if not values.min() < value:
-                break
-            plan, value = moves[values.argmin()], values.min()
-        ends[tuple(plan)] = value
-    return np.array(list(ends)), np.array(list(ends.values()))
+    rng = streams.generator(seed, streams.PLANS, 1)
+    if not nuisance_parameters(scenario):
+        return global_bound(scenario, codebook, rng, n_phases).value
+    model = MeasurementModel(scenario, codebook)
+    positions = scenario.sample_positions(_POSITIONS, rng)
+    return (float(crlb_of(model, positions, region_prior=True).mean())
+            + range_confusion_error_of(model, positions, rng))
 
 
 def _short_error(scenario: Scenario, seed: int) -> float:
-    """Average bound plus squared error by confusion, with a codebook of a short search [m^2]."""
+    """Expected error with a codebook of a short search [m^2]."""
     codebook = optimize(
-        scenario, objective='ambiguity', seed=seed, n_positions=_SHORT_POSITIONS,
+        scenario, objective='error', seed=seed, n_positions=_SHORT_POSITIONS,
         max_steps=_SHORT_STEPS).codebook
-    model = MeasurementModel(scenario, codebook)
-    rng = streams.generator(seed, streams.PLANS, 1)
-    positions = scenario.sample_positions(_POSITIONS, rng)
-    return (float(crlb_of(model, positions).mean())
-            + range_confusion_error_of(model, positions, rng))
+    return expected_error(scenario, codebook, seed, _SHORT_PHASES)
 
 
 def _energies(scenario: Scenario) -> np.ndarray:
@@ -251,23 +246,8 @@ def _energies(scenario: Scenario) -> np.ndarray:
     model = MeasurementModel(scenario, random_codebook(scenario, rng))
     whitened = model.whiten(model.mean(scenario.sample_positions(_POSITIONS, rng)))
     energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
+    # A phase of each band that is unknown leaves less of the energy to compare phases with.
+    energies /= 1 + 2 * scenario.band_phase_std_rad**2 * energies / scenario.n_bands
     quantiles: np.ndarray = np.quantile(
         energies, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
     return quantiles
-
-
-def _has_gap(plans: np.ndarray, gap_hz: float) -> np.ndarray:
-    """Which ascending plans have a gap between all bands, up to rounding, bool [P]."""
-    enough: np.ndarray = np.all(np.diff(plans, axis=1) >= gap_hz * (1 - 1e-9), axis=1)
-    return enough
-
-
-def _first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.ndarray | None:
-    """Return the plan of the lowest frequencies that have the gap, or None."""
-    plan: list[float] = []
-    for frequency in frequencies_hz:
-        if not plan or frequency - plan[-1] >= gap_hz * (1 - 1e-9):
-            plan.append(float(frequency))
-        if len(plan) == n_bands:
-            return np.array(plan)
-    return None

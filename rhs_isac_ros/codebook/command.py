@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import yaml
@@ -15,9 +15,10 @@ from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook.band_plan import (
     DEFAULT_RASTER_HZ,
+    BandPlan,
     Candidate,
+    best_of,
     choose_bands,
-    with_bands,
 )
 from rhs_isac_ros.codebook.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.objective import OBJECTIVES
@@ -70,8 +71,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
     add('--objective', choices=sorted(OBJECTIVES),
         help='the average bound; the ambiguity between distant positions, which a local bound '
-             'ignores; or the bound with unknown phases of the bands and the region as prior. '
-             'crlb if omitted, or ambiguity with --spectrum')
+             'ignores; error, the same with weights close to the squared error; or the bound with '
+             'unknown phases of the bands and the region as prior. crlb if omitted, or error with '
+             '--spectrum')
     add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
         help='how the region of interest is sampled')
     add('--positions', type=integer(1, _MAX_POSITIONS), default=DEFAULT_POSITIONS,
@@ -144,9 +146,7 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     """
     output, partial = options.output, _partial(options.output)
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
-    if options.spectrum:
-        scenario = _choose_bands(options, scenario)
-    objective = options.objective or ('ambiguity' if options.spectrum else 'crlb')
+    objective = options.objective or ('error' if options.spectrum else 'crlb')
     calibration = None
     if options.calibration:
         calibration = Calibration.load(options.calibration)
@@ -155,13 +155,21 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
     for codebook in filter(None, (start, resumed)):
         check_start(codebook, scenario)
-    with _progress_bar(options) as show:
-        result = optimize(
-            scenario, method=options.method, objective=objective,
-            sampling=options.sampling, n_positions=options.positions, seed=options.seed,
-            start=start, resume=resumed, calibration=calibration, max_steps=options.steps,
-            max_evaluations=options.evaluations, progress=show,
-            keep=lambda result: _save_partial(result, partial))
+
+    def search(scenario: Scenario) -> OptimizeResult:
+        with _progress_bar(options) as show:
+            return optimize(
+                scenario, method=options.method, objective=objective,
+                sampling=options.sampling, n_positions=options.positions, seed=options.seed,
+                start=start, resume=resumed, calibration=calibration, max_steps=options.steps,
+                max_evaluations=options.evaluations, progress=show,
+                keep=lambda result: _save_partial(result, partial))
+
+    if options.spectrum:
+        plan = _choose_bands(options, scenario, search)
+        scenario, result = plan.scenario, plan.result
+    else:
+        result = search(scenario)
     held_out = scenario.sample_positions(
         HELD_OUT_POSITIONS, streams.generator(options.seed, streams.HELD_OUT))
     bounds = crlb_of(MeasurementModel(
@@ -177,24 +185,38 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
     return codebook, result.reason
 
 
-def _choose_bands(options: argparse.Namespace, scenario: Scenario) -> Scenario:
-    """Choose the bands, write the scenario with them, and return it."""
+def _choose_bands(
+        options: argparse.Namespace, scenario: Scenario,
+        search: Callable[[Scenario], OptimizeResult]) -> BandPlan:
+    """Choose the bands and the codebook, write the scenario with them, and return both."""
     def report(candidate: Candidate) -> None:
-        print(f'{_in_ghz(candidate)}: {candidate.error_m2:.4f} m^2 expected', file=sys.stderr)
+        if not options.quiet:
+            print(f'{_in_ghz(candidate.frequencies_hz)}: {candidate.error_m2:.4f} m^2 expected',
+                  file=sys.stderr)
 
-    best, *_ = choose_bands(
+    def write_and_search(scenario: Scenario) -> OptimizeResult:
+        # An unfinished codebook belongs to this plan.
+        _save_plan(options.plan, scenario)
+        return search(scenario)
+
+    candidates = choose_bands(
         scenario, options.spectrum, options.bands, raster_hz=options.raster,
-        min_gap_hz=options.min_gap, seed=options.seed, report=None if options.quiet else report)
-    scenario = with_bands(scenario, best.frequencies_hz)
+        min_gap_hz=options.min_gap, seed=options.seed, report=report)
+    best = best_of(scenario, candidates, write_and_search, options.seed, report)
+    _save_plan(options.plan, best.scenario)
+    print(f'{options.plan}: {_in_ghz(best.scenario.center_frequencies_hz)}, '
+          f'{best.scenario.n_frames} frames each')
+    return best
+
+
+def _save_plan(path: Path, scenario: Scenario) -> None:
     changes = yaml.safe_dump(scenario.changes(), sort_keys=False, default_flow_style=None)
-    write_whole(options.plan, f'# Chosen by python -m rhs_isac_ros.codebook --spectrum. Omitted '
-                              f'fields have the values of Table I.\n{changes}')
-    print(f'{options.plan}: {_in_ghz(best)}, {scenario.n_frames} frames each')
-    return scenario
+    write_whole(path, f'# Chosen by python -m rhs_isac_ros.codebook --spectrum. Omitted '
+                      f'fields have the values of Table I.\n{changes}')
 
 
-def _in_ghz(candidate: Candidate) -> str:
-    return ', '.join(f'{frequency / 1e9:g}' for frequency in candidate.frequencies_hz) + ' GHz'
+def _in_ghz(frequencies_hz: Sequence[float]) -> str:
+    return ', '.join(f'{frequency / 1e9:g}' for frequency in frequencies_hz) + ' GHz'
 
 
 def _partial(output: Path) -> Path:

@@ -7,8 +7,9 @@ import numpy as np
 
 from rhs_isac_ros.bounds import AverageCrlb, PairwiseErrorCost
 from rhs_isac_ros.bounds.average import Average
-from rhs_isac_ros.codebook.sampling import draw_confusable
+from rhs_isac_ros.codebook.sampling import WIDE, confusable_volumes, draw_confusable
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.los import checked_positions
 
 # Relative error of an objective's rows. The error of its value is then below 0.1 %, far less than
 # the sampling error, and the gradient is exact for that value.
@@ -16,6 +17,9 @@ ROW_TOLERANCE = 3e-5
 # Confusable positions for each sampled position: many, because a few close pairs dominate the
 # mean.
 _PAIRS_PER_POSITION = 128
+# Power of the volumes as weights of pairs. With 1, few pairs that are unlikely to be drawn would
+# have most of the weight.
+_VOLUME_POWER = 0.6
 
 
 def average_bound(
@@ -57,5 +61,26 @@ def ambiguity(
         scenario, first_positions, second_positions, tolerance=ROW_TOLERANCE)
 
 
+def error(scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
+    """Objective [m^2]: the cost of `ambiguity`, with weights close to those of the squared error.
+
+    Pairs extend farther across the line of sight, up to the far side lobes. Their weights grow
+    with the volume that each represents, see `confusable_volumes`: with the volumes themselves,
+    the cost would be proportional to the union bound on the mean squared error.
+
+    The positions are float64 [N_sam, 3] [m]; `rng` draws those that they may be confused with.
+    Raise ValueError if `positions` is empty or not a finite [N, 3] array.
+    """
+    first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
+    second_positions = draw_confusable(scenario, first_positions, rng, WIDE)
+    weights = confusable_volumes(
+        scenario, first_positions, second_positions, WIDE)**_VOLUME_POWER
+    if len(weights):
+        weights /= weights.mean()
+    return PairwiseErrorCost(
+        scenario, first_positions, second_positions, weights, ROW_TOLERANCE)
+
+
 OBJECTIVES: Mapping[str, Callable[[Scenario, np.ndarray, np.random.Generator], Average]] = {
-    'ambiguity': ambiguity, 'crlb': average_bound, 'nuisance': nuisance}
+    'ambiguity': ambiguity, 'crlb': average_bound, 'error': error,
+    'nuisance': nuisance}

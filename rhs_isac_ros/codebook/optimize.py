@@ -94,8 +94,9 @@ def optimize(
         One of `METHODS`.
     objective
         One of `OBJECTIVES`: ``crlb``, the average bound; ``ambiguity``, which penalises
-        confusion between distant positions, which a local bound ignores; or ``nuisance``, the
-        bound with unknown phases of the bands and the region as prior.
+        confusion between distant positions, which a local bound ignores; ``error``, the same with
+        weights close to those of the mean squared error; or ``nuisance``, the bound with unknown
+        phases of the bands and the region as prior.
     sampling
         One of `SAMPLINGS`: ``sobol``, or ``monte_carlo`` as in the paper.
     n_positions

@@ -9,8 +9,9 @@ from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
 # Grid points of the range lag per shortest carrier wavelength.
 _LAGS_PER_WAVELENGTH = 64
-# Range of the scale of transverse displacements, in widths of the narrowest beam.
-_TRANSVERSE_SCALES = 0.03, 0.3
+# Ranges of the scale of transverse displacements, in widths of the narrowest beam: up to the first
+# side lobes, and beyond.
+NEAR, WIDE = (0.03, 0.3), (0.03, 0.6)
 # Fraction of the pairs that differ in direction only.
 _ZERO_LAG_FRACTION = 0.3
 # Number of attempts to draw a position inside the region.
@@ -41,14 +42,16 @@ SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarra
 
 
 def draw_confusable(
-        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
+        scales: tuple[float, float] = NEAR) -> np.ndarray:
     """Draw for each position another one in the region of interest that has similar signals.
 
     Two positions are hard to distinguish if their ranges differ by about a whole number of
     wavelengths in every band, so range lags are drawn with a density proportional to
     exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For a fraction of the positions the lag is 0: these
     pairs differ in direction only. Across the line of sight, the displacement ranges from well
-    below the beam width up to the side lobes. Positions are float64 [N, 3] [m].
+    below the beam width up to the side lobes. Positions are float64 [N, 3] [m]; `scales` are the
+    limits of the scale of this displacement in widths of the narrowest beam, which is log-uniform.
     """
     low, high = scenario.roi_bounds_m
     lags, cumulative = _lag_distribution(scenario)
@@ -57,20 +60,48 @@ def draw_confusable(
     pending = np.arange(len(positions))
     for _ in range(_MAX_DRAWS):
         lag = np.interp(rng.uniform(size=len(pending)), cumulative, lags) * lagging[pending]
-        moved = _displaced(scenario, positions[pending], lag, rng)
+        moved = _displaced(scenario, positions[pending], lag, rng, scales)
         # Clipping covers regions so thin, compared with a beam, that no draw is inside.
         others[pending] = np.clip(moved, low, high)
         pending = pending[~((moved >= low) & (moved <= high)).all(axis=1)]
     return others
 
 
+def confusable_volumes(
+        scenario: Scenario, positions: np.ndarray, others: np.ndarray,
+        scales: tuple[float, float] = NEAR) -> np.ndarray:
+    """Compute the volumes that positions from `draw_confusable` represent, float64 [N].
+
+    They are the reciprocal densities of the draws, so that weighted sums over the draws are
+    integrals over the region. The unit is proportional to the volume that the posterior of the
+    true position occupies: with signals whose amplitude is inversely proportional to the range
+    r, it grows as r^5.
+    """
+    ranges, other_ranges = (
+        np.maximum(np.linalg.norm(points, axis=1), 1e-3) for points in (positions, others))
+    lags, density = _lag_density(scenario)
+    lag = np.abs(other_ranges - ranges)
+    # Lags of zero stand for those below the phase of a radian.
+    shortest = SPEED_OF_LIGHT_MPS / (2 * np.pi * max(scenario.center_frequencies_hz))
+    by_lag = np.where(lag < 1e-9, _ZERO_LAG_FRACTION / shortest,
+                      (1 - _ZERO_LAG_FRACTION) * np.interp(lag, lags, density))
+    cosine = np.sum(positions * others, axis=1) / (ranges * other_ranges)
+    # The squared displacement in beam widths; its density is an average of Gaussians.
+    square = np.maximum(1 / np.clip(cosine, 0.01, 1)**2 - 1, 1e-8) / _beam_width(scenario)**2
+    narrow, wide = (np.exp(-square / (2 * scale**2)) for scale in scales)
+    by_direction = (wide - narrow) / (2 * np.pi * square * np.log(scales[1] / scales[0]))
+    volumes: np.ndarray = other_ranges**2 / (
+        ranges**5 * np.maximum(by_lag * by_direction, np.finfo(float).tiny))
+    return volumes
+
+
 def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
-               rng: np.random.Generator) -> np.ndarray:
+               rng: np.random.Generator, scales: tuple[float, float]) -> np.ndarray:
     """Move positions by range lags of random sign and randomly across the line of sight."""
     n = len(positions)
     ranges = np.linalg.norm(positions, axis=1, keepdims=True)
     sight = positions / np.maximum(ranges, 1e-9)
-    least, most = np.log(_TRANSVERSE_SCALES)
+    least, most = np.log(scales)
     scale = np.exp(rng.uniform(least, most, size=(n, 1))) * _beam_width(scenario) * ranges
     transverse = rng.normal(size=(n, 3)) * scale
     transverse -= sight * np.sum(transverse * sight, axis=1, keepdims=True)
@@ -83,14 +114,21 @@ def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
 
 def _lag_distribution(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """Return lags up to the diagonal of the region [m] and their cumulative distribution."""
+    lags, density = _lag_density(scenario)
+    cumulative = np.cumsum(density)
+    return lags, (cumulative - cumulative[0]) / (cumulative[-1] - cumulative[0])
+
+
+def _lag_density(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Return lags up to the diagonal of the region [m] and their probability density [1/m]."""
     low, high = scenario.roi_bounds_m
     frequencies = np.array(scenario.center_frequencies_hz)[:, None]
     shortest = SPEED_OF_LIGHT_MPS / frequencies.max()
     longest = np.linalg.norm(high - low)
     lags = np.linspace(0, longest, 2 + int(longest / shortest * _LAGS_PER_WAVELENGTH))
     mismatch = np.sum(1 - np.cos(2 * np.pi * frequencies * lags / SPEED_OF_LIGHT_MPS), axis=0)
-    cumulative = np.cumsum(np.exp(-mismatch))
-    return lags, (cumulative - cumulative[0]) / (cumulative[-1] - cumulative[0])
+    density = np.exp(-mismatch)
+    return lags, density / (density.mean() * longest)
 
 
 def _beam_width(scenario: Scenario) -> float:

@@ -22,7 +22,7 @@ from scipy.stats import chi2
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.codebook.band_plan import raster, screen
+from rhs_isac_ros.codebook.band_screening import raster, screen
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int, seed

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error
-from rhs_isac_ros.codebook import band_plan
+from rhs_isac_ros.codebook import band_plan, optimize
 from rhs_isac_ros.codebook.band_plan import (
+    best_of,
     choose_bands,
+    expected_error,
     optimize_band_plan,
-    raster,
-    screen,
     with_bands,
 )
+from rhs_isac_ros.codebook.band_screening import raster, screen
 from rhs_isac_ros.model import Scenario
 
 SPECTRUM = [(2.5e9, 2.7e9)]
@@ -33,6 +34,8 @@ def short(monkeypatch):
     monkeypatch.setattr(band_plan, '_SHORT_POSITIONS', 4)
     monkeypatch.setattr(band_plan, '_SHORT_STEPS', 3)
     monkeypatch.setattr(band_plan, '_POSITIONS', 16)
+    monkeypatch.setattr(band_plan, '_SHORT_PHASES', 8)
+    monkeypatch.setattr(band_plan, '_PHASES', 8)
 
 
 def test_the_raster_begins_at_the_low_end_of_each_interval():
@@ -105,15 +108,53 @@ def test_a_raster_with_few_plans_has_few_candidates(small, short):
     assert only.frequencies_hz == (2.5e9, 3e9)
 
 
-def test_the_result_is_the_best_candidate_with_its_codebook(small, short, monkeypatch):
-    plan = optimize_band_plan(small, SPECTRUM, 2, raster_hz=50e6, seed=1, max_steps=2)
-    assert plan.scenario == with_bands(small, plan.candidates[0].frequencies_hz)
+def test_the_result_has_the_lowest_expected_error_of_the_first_candidates(small, short):
+    plan = optimize_band_plan(small, SPECTRUM, 2, raster_hz=25e6, seed=1, max_steps=2)
     plan.result.codebook.check(plan.scenario)
-    assert 'objective=ambiguity' in plan.result.codebook.provenance
+    assert 'objective=error' in plan.result.codebook.provenance
+    assert plan.error_m2 == expected_error(plan.scenario, plan.result.codebook, 1, 8)
+    tried = []
+    again = best_of(small, plan.candidates, lambda world: optimize(
+        world, objective='error', seed=1, max_steps=2), 1, tried.append)
+    assert [candidate.frequencies_hz for candidate in tried] == [
+        candidate.frequencies_hz for candidate in plan.candidates[:3]]
+    assert plan.error_m2 == min(candidate.error_m2 for candidate in tried)
     # Equal seeds give equal results.
-    other = optimize_band_plan(small, SPECTRUM, 2, raster_hz=50e6, seed=1, max_steps=2)
-    assert other.candidates == plan.candidates
-    assert other.result.codebook.id == plan.result.codebook.id
+    assert again.scenario == plan.scenario
+    assert again.result.codebook.id == plan.result.codebook.id
+
+
+def test_an_interrupted_search_ends_with_the_best_plan_so_far(small, short):
+    candidates = choose_bands(small, SPECTRUM, 2, raster_hz=25e6, n_candidates=2)
+    results = [optimize(with_bands(small, candidate.frequencies_hz), max_steps=1)
+               for candidate in candidates]
+    interrupted = [dataclasses.replace(result, reason='interrupted') for result in results]
+    first = best_of(small, candidates, lambda _: interrupted[0])
+    assert first.result is interrupted[0]
+    outcomes = iter([results[0], interrupted[1]])
+    assert best_of(small, candidates, lambda _: next(outcomes)).result is results[0]
+    with pytest.raises(ValueError, match='^candidates: none'):
+        best_of(small, [], lambda _: results[0])
+
+
+@pytest.fixture
+def long_region():
+    """Equally spaced bands repeat every 1.5 m."""
+    return Scenario(n_subbands=2, n_feeds=2, elements_per_side=4, max_power_w=1e-5, n_frames=2,
+                    center_frequencies_hz=(2.5e9, 2.7e9, 2.9e9, 3.1e9), roi_center_m=(6, 0, 0),
+                    roi_size_m=(6, 2, 1))
+
+
+@pytest.mark.parametrize(('phase_std_rad', 'least', 'most'), [(0.0, 1.5, 100), (6.3, 0.85, 1.15)])
+def test_unequal_spacing_pays_only_if_phases_are_known(
+        long_region, phase_std_rad, least, most):
+    errors = []
+    for bands in ((2.5e9, 2.7e9, 2.9e9, 3.1e9), (2.5e9, 2.56e9, 2.72e9, 3.1e9)):
+        plan = dataclasses.replace(
+            long_region, center_frequencies_hz=bands, band_phase_std_rad=phase_std_rad)
+        codebook = optimize(plan, objective='error', n_positions=16, max_steps=30).codebook
+        errors.append(expected_error(plan, codebook, n_phases=256))
+    assert least < errors[0] / errors[1] < most
 
 
 @pytest.mark.parametrize(('n_bands', 'options', 'message'), [

@@ -10,7 +10,7 @@ from rhs_isac_ros.bounds import PairwiseErrorCost, crlb
 from rhs_isac_ros.codebook import OBJECTIVES, objective, optimize, random_codebook
 from rhs_isac_ros.codebook.objective import ambiguity, average_bound
 from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.codebook.sampling import draw_confusable
+from rhs_isac_ros.codebook.sampling import WIDE, confusable_volumes, draw_confusable
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 
@@ -56,12 +56,16 @@ def test_ambiguity_is_the_pairwise_error_cost_of_the_plain_equations(
     assert value == pytest.approx(total / 20, rel=1e-3)
 
 
+PHASES = {'phase_std_rad': 0.4, 'band_phase_std_rad': 0.8}
+
+
 @pytest.mark.parametrize('seed', range(3))
-@pytest.mark.parametrize('name', OBJECTIVES)
-def test_gradients_agree_with_finite_differences(name, random_beams, seed):
+@pytest.mark.parametrize(('name', 'phases'), [
+    *((name, {}) for name in OBJECTIVES), ('ambiguity', PHASES), ('error', PHASES)])
+def test_gradients_agree_with_finite_differences(name, phases, random_beams, seed):
     rng = np.random.default_rng(seed)
     scenario = Scenario(
-        center_frequencies_hz=(1.8e9, 2.9e9), n_subbands=2, n_frames=2, n_feeds=2,
+        **phases, center_frequencies_hz=(1.8e9, 2.9e9), n_subbands=2, n_frames=2, n_feeds=2,
         elements_per_side=3, max_power_w=0.02, roi_center_m=(3, 0, 0), roi_size_m=(2, 2, 2))
     problem = Problem(scenario, OBJECTIVES[name](
         scenario, scenario.sample_positions(12, rng), rng))
@@ -71,12 +75,40 @@ def test_gradients_agree_with_finite_differences(name, random_beams, seed):
     variables[problem.n_analog:] *= 1.9
     value, gradient = problem.value_and_gradient(variables)
     assert value == pytest.approx(problem.value(variables), rel=1e-12)
+    # The phases are found by iteration.
+    tolerance = 3e-5 if phases else 1e-5
     for _ in range(4):
         direction = rng.normal(size=variables.shape)
         difference = (problem.value(variables + 1e-5 * direction)
                       - problem.value(variables - 1e-5 * direction)) / 2e-5
         assert gradient @ direction == pytest.approx(
-            difference, abs=1e-5 * np.linalg.norm(gradient) * np.linalg.norm(direction))
+            difference, abs=tolerance * np.linalg.norm(gradient) * np.linalg.norm(direction))
+
+
+def test_error_weights_pairs_by_a_power_of_their_volumes(scenario, random_beams, monkeypatch):
+    monkeypatch.setattr(objective, '_PAIRS_PER_POSITION', 5)
+    rng = np.random.default_rng(0)
+    codebook, positions = random_beams(scenario, rng), scenario.sample_positions(4, rng)
+    value = OBJECTIVES['error'](scenario, positions, np.random.default_rng(1)).value(codebook)
+    firsts = np.repeat(positions, 5, axis=0)
+    seconds = draw_confusable(scenario, firsts, np.random.default_rng(1), WIDE)
+    volumes = confusable_volumes(scenario, firsts, seconds, WIDE)
+    costs = np.array([PairwiseErrorCost(scenario, a[None], b[None]).value(codebook)
+                      for a, b in zip(firsts, seconds, strict=True)])
+    expected = np.sum(volumes**0.6 * costs) / np.sum(volumes**0.6)
+    assert value == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize('name', ['ambiguity', 'error'])
+@pytest.mark.parametrize(('change', 'greater'), [
+    ({'band_phase_std_rad': 2 * np.pi}, 1.05), ({'phase_std_rad': 2 * np.pi}, 1.0)])
+def test_unknown_phases_raise_the_cost_of_confusions(
+        scenario, random_beams, name, change, greater):
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    positions = scenario.sample_positions(20, np.random.default_rng(1))
+    known, unknown = (OBJECTIVES[name](world, positions, np.random.default_rng(2)).value(codebook)
+                      for world in (scenario, dataclasses.replace(scenario, **change)))
+    assert unknown > greater * known
 
 
 def test_optimising_the_ambiguity_lowers_it_on_held_out_pairs(scenario):
@@ -101,7 +133,7 @@ def test_the_generator_determines_the_random_pairs(scenario, small, name):
         OBJECTIVES[name](scenario, positions, np.random.default_rng(seed)).value(small.codebook)
         for seed in (1, 1, 2))
     assert one == same
-    assert (one == other) == (name != 'ambiguity')
+    assert (one == other) == (name not in ('ambiguity', 'error'))
 
 
 @pytest.mark.parametrize('name', OBJECTIVES)

@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import SAMPLINGS
-from rhs_isac_ros.codebook.sampling import draw_confusable, monte_carlo, sobol
+from rhs_isac_ros.codebook.sampling import (
+    WIDE,
+    confusable_volumes,
+    draw_confusable,
+    monte_carlo,
+    sobol,
+)
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 
 LOPSIDED = Scenario(roi_center_m=(4, 1, -2), roi_size_m=(2, 6, 1))
 # Large enough that the lags of a position at its centre are not truncated.
-WIDE = Scenario(roi_center_m=(50, 0, 0), roi_size_m=(90, 90, 90))
+WIDE_REGION = Scenario(roi_center_m=(50, 0, 0), roi_size_m=(90, 90, 90))
 BANDS = {'two': (2.5e9, 3.0e9), 'one': (2.5e9,), 'three': (2.0e9, 2.3e9, 3.1e9)}
 
 
@@ -88,7 +94,7 @@ def test_confusable_positions_differ_and_are_in_the_region(region, bands):
 
 def lags_of(bands, n=20_000):
     """Return the range lags below 20 m of positions at the centre of a wide region."""
-    scenario = dataclasses.replace(WIDE, center_frequencies_hz=BANDS[bands])
+    scenario = dataclasses.replace(WIDE_REGION, center_frequencies_hz=BANDS[bands])
     positions = np.tile([50.0, 0, 0], (n, 1))
     others = draw_confusable(scenario, positions, np.random.default_rng(3))
     lags = np.linalg.norm(others, axis=1) - 50
@@ -138,7 +144,7 @@ def test_lags_have_the_documented_density(bands):
 @pytest.mark.parametrize('side', [5, 20])
 def test_confusable_positions_lie_within_a_beam(side):
     """Smaller surfaces have wider beams; the elements are 0.3 wavelengths apart."""
-    scenario = dataclasses.replace(WIDE, elements_per_side=side)
+    scenario = dataclasses.replace(WIDE_REGION, elements_per_side=side)
     positions = np.tile([50.0, 0, 0], (5000, 1))
     others = draw_confusable(scenario, positions, np.random.default_rng(3))
     angles = np.arctan2(np.linalg.norm(others[:, 1:], axis=1), others[:, 0])
@@ -159,3 +165,32 @@ def test_thin_regions_have_confusable_pairs(size):
     low, high = scenario.roi_bounds_m
     assert ((others >= low) & (others <= high)).all()
     assert np.mean((others != positions).any(axis=1)) > 0.9
+
+
+def test_sums_weighted_with_volumes_are_integrals():
+    """Of a smooth function about one position, in three dimensions."""
+    scenario = dataclasses.replace(WIDE_REGION, center_frequencies_hz=(2.5e9,))
+    centre = np.array([50.0, 0, 0])
+    positions = np.tile(centre, (60_000, 1))
+    others = draw_confusable(scenario, positions, np.random.default_rng(3), WIDE)
+    volumes = confusable_volumes(scenario, positions, others, WIDE)
+    scale = np.array([12.0, 8.0, 8.0])
+
+    def average(shift):
+        """Gaussians whose integrals are equal."""
+        return np.mean(volumes * np.exp(-np.sum(((others - centre - shift) / scale)**2, axis=1)))
+
+    inner = average(np.zeros(3))
+    for shift in ([6.0, 0, 0], [0, 4.0, 0], [0, 0, -4.0], [-6.0, 3.0, 0]):
+        assert average(np.array(shift)) == pytest.approx(inner, rel=0.2)
+
+
+def test_volumes_are_relative_to_the_fifth_power_of_the_range():
+    scenario = Scenario()
+    near, far = np.array([[6.0, 0, 0]]), np.array([[12.0, 0, 0]])
+    turn = np.array([[np.cos(0.1), np.sin(0.1), 0]])
+    first, second = (
+        float(confusable_volumes(scenario, position, np.linalg.norm(position) * turn)[0])
+        for position in (near, far))
+    # The displaced volume itself grows with the square of the range.
+    assert second / first == pytest.approx(2.0**(2 - 5))
