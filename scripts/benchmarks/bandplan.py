@@ -4,6 +4,9 @@ Problem: two bands 0.5 GHz apart repeat every 0.6 m of range. What do four bands
 chosen for the region, each with half as many frames? All plans are evaluated with the posterior
 mean. The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a
 Gaussian. How close does the coordinate search come to the best of all plans of a small raster?
+
+--plan adds a plan, for example one with two bands that python -m rhs_isac_ros.codebook --spectrum
+2.5e9:3.0e9 --bands 2 --plan two.yaml --output codebook_two.yaml has chosen.
 """
 
 import os
@@ -25,7 +28,13 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.band_screening import raster, screen
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError, simulate_received
-from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int, seed
+from rhs_isac_ros.model.arguments import (
+    ArgumentParser,
+    input_file,
+    output_file,
+    positive_int,
+    seed,
+)
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import make_estimator
 
@@ -43,22 +52,32 @@ def main() -> None:
     """Run the benchmark."""
     parser = ArgumentParser(
         prog='scripts/benchmark bandplan', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--positions', type=positive_int, default=10_000,
-                        help='number of positions')
-    parser.add_argument('--seed', type=seed, default=1, help='seed of all random numbers')
+                        help='number of positions (default: %(default)s)')
+    parser.add_argument('--seed', type=seed, default=1,
+                        help='seed of all random numbers (default: %(default)s)')
+    parser.add_argument('--plan', type=input_file, nargs=2, action='append', default=[],
+                        metavar=('SCENARIO', 'CODEBOOK'), help='another plan and its codebook')
+    parser.add_argument('--only-plans', action='store_true',
+                        help='leave out the built-in plans and the comparison of searches')
     parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
     print('| plan | mean squared error [m^2], 95 % interval | median error [m] | '
           'average CRLB [m^2] | coverage of the 95 % region |\n|---|---|---|---|---|')
+    plans = {} if options.only_plans else {
+        name: (CONFIG / scenario, CONFIG / codebook)
+        for name, (scenario, codebook) in PLANS.items()}
+    plans |= {scenario.stem: (scenario, codebook) for scenario, codebook in options.plan}
     figures = {}
-    for name, (scenario, codebook) in PLANS.items():
+    for name, (scenario, codebook) in plans.items():
         figures[name] = row = evaluate(
-            Scenario.from_yaml(CONFIG / scenario), Codebook.load(CONFIG / codebook), options)
+            Scenario.from_yaml(scenario), Codebook.load(codebook), options)
         print('| {} | {mse_m2:.4f} [{low_m2:.4f}, {high_m2:.4f}] | {median_m:.3f} | '
               '{average_crlb_m2:.4f} | {coverage:.3f} |'.format(name, **row), flush=True)
-    figures['search'] = compare_searches()
+    if not options.only_plans:
+        figures['search'] = compare_searches()
     if options.json:
         write_whole(options.json, json.dumps(figures, indent=2) + '\n')
 

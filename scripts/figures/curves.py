@@ -1,7 +1,7 @@
 """Positioning error beside the local and the global bound, over one parameter at a time.
 
 Problem: how do the error of `bayes` and the bounds depend on the number of bands at equal pilots
-(`bands`: equal and unequal distances between the carriers), on the number of pilots (`pilots`), on
+(`bands`: equally spaced, and chosen for the region), on the number of pilots (`pilots`), on
 the transmit power (`power`), on the Rice factor (`rice`: power of the direct path relative to the
 multipath) and on the number of elements (`elements`)? NAME restricts the run to some of them. Each
 curve compares the plans of Table I, of four equally spaced and of four unequally spaced bands,
@@ -27,6 +27,7 @@ from rhs_isac_ros.model import Scenario
 TRIALS, QUICK_TRIALS = 20, 1
 PHASES, QUICK_PHASES = 4096, 1024
 STEPS, QUICK_STEPS = 600, 100
+CANDIDATES, QUICK_CANDIDATES = 6, 2
 
 
 def more_frames(factor: float, plan: Changes) -> Changes:
@@ -60,7 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise SystemExit(f'scripts/reproduce curves: error: NAME: {", ".join(sorted(unknown))}, '
                          f'expected some of {", ".join(CURVES)}')
     sizes = Sizes(options.trials, QUICK_PHASES if options.quick else PHASES,
-                  options.steps or (QUICK_STEPS if options.quick else STEPS))
+                  options.steps or (QUICK_STEPS if options.quick else STEPS),
+                  QUICK_CANDIDATES if options.quick else CANDIDATES)
 
     def reproduce() -> None:
         for name in options.names or CURVES:

@@ -36,6 +36,8 @@ def parts(curves, monkeypatch):
         return {'squared_errors_m2': [0.1 + phase, 0.1 + phase]}
 
     made = []
+    monkeypatch.setattr(plan_curves, 'choose', lambda n_bands, candidates: plan_curves.spaced(
+        'unequal', n_bands))
     monkeypatch.setattr(plan_curves, 'optimise', optimise)
     monkeypatch.setattr(plan_curves, 'locate', locate)
     monkeypatch.setattr(plan_curves, 'bounds', lambda scenario, codebook, phases: {
@@ -94,6 +96,16 @@ def test_codebooks_get_the_power_of_the_scenario(curves, parts, tmp_path):
 def test_an_unknown_curve_is_an_error(curves):
     with pytest.raises(SystemExit, match='NAME: fame, expected some of bands, pilots'):
         curves.main(['fame'])
+
+
+def test_the_optimiser_of_plans_chooses_bands(parts, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setattr('rhs_isac_ros.codebook.band_plan._short_error', lambda scenario, seed: max(
+        scenario.center_frequencies_hz))
+    chosen = parts.choose(2, 2)
+    assert chosen['n_frames'] == 4
+    low, high = chosen['center_frequencies_hz']
+    assert 2.5e9 <= low < high <= 3.0e9
 
 
 def test_jobs_locate_and_bound(parts, monkeypatch):

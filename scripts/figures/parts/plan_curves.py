@@ -12,6 +12,7 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import Codebook, optimize
+from rhs_isac_ros.codebook.band_plan import choose_bands
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.experiments import Job, markdown_table, run_jobs
 from rhs_isac_ros.model import Scenario, streams
@@ -55,7 +56,7 @@ class Curve(NamedTuple):
         Values on the axis.
     change
         Function from a value and a plan's changes to the further changes; None varies the number
-        of bands of the spacings.
+        of bands, equally spaced and chosen for the region.
     reoptimise
         Whether each value has a codebook of its own.
     bounds
@@ -120,11 +121,14 @@ def with_power(codebook: Changes, scenario: Changes) -> Changes:
         book.analog, book.digital * np.sqrt(scenario['max_power_w'] / power)))
 
 
-def points_of(name: str, curve: Curve, plans: Mapping[str, Plan]) -> list[Point]:
-    """List the points of a curve, line by line."""
+def points_of(name: str, curve: Curve, plans: Mapping[str, Plan],
+              chosen: Mapping[float, Changes]) -> list[Point]:
+    """List the points of a curve, line by line; the chosen plans are those of `choose`."""
     if curve.change is None:
-        return [Point(name, spacing, n, changes, Plan(changes)) for spacing in SPACINGS
-                for n in curve.values for changes in [spaced(spacing, int(n))]]
+        lines = {'equally spaced': {n: spaced('equal', int(n)) for n in curve.values},
+                 'chosen for the region': chosen}
+        return [Point(name, line, n, of_line[n], Plan(of_line[n]))
+                for line, of_line in lines.items() for n in curve.values]
     points = []
     for line, plan in plans.items():
         for value in curve.values:
@@ -132,6 +136,13 @@ def points_of(name: str, curve: Curve, plans: Mapping[str, Plan]) -> list[Point]
             own = Plan(changes) if curve.reoptimise else plan
             points.append(Point(name, line, value, changes, own))
     return points
+
+
+def choose(n_bands: int, candidates: int) -> Changes:
+    """Return the changes of the plan that the optimiser of plans chooses."""
+    best, *_ = choose_bands(
+        Scenario(), [(LOW_HZ, HIGH_HZ)], n_bands, seed=SEED, n_candidates=candidates)
+    return {'center_frequencies_hz': list(best.frequencies_hz), 'n_frames': N_PILOTS // n_bands}
 
 
 def optimise(scenario: Changes, steps: int) -> Changes:
@@ -162,21 +173,26 @@ def bounds(scenario: Changes, codebook: Changes, phases: int) -> dict[str, Any]:
 
 
 class Sizes(NamedTuple):
-    """Trials of each point, phases of a bound, and steps of an optimisation."""
+    """Trials of each point, phases of a bound, steps of an optimisation, and plans compared."""
 
     trials: int
     phases: int
     steps: int
+    candidates: int = 6
 
 
 def evaluate(curves: Mapping[str, Curve], plans: Mapping[str, Plan], sizes: Sizes, folder: Path,
              n_jobs: int, dask: str | None) -> list[dict[str, Any]]:
     """Run the jobs that have no results, and return an entry for each point."""
-    points = [point for name, curve in curves.items() for point in points_of(name, curve, plans)]
-
     def run(function: Callable[..., dict[str, Any]], jobs: Mapping[Any, Job]) -> dict[Any, Any]:
         return dict(zip(jobs, run_jobs(function, list(jobs.values()), folder, n_jobs, dask),
                         strict=True))
+
+    chosen = run(choose, {n: Job(f'plan-{n}', {
+        'n_bands': int(n), 'candidates': sizes.candidates})
+        for curve in curves.values() if curve.change is None for n in curve.values})
+    points = [point for name, curve in curves.items()
+              for point in points_of(name, curve, plans, chosen)]
 
     wanted = {Scenario(**point.plan.changes).id: point.plan.changes for point in points
               if point.plan.codebook is None}
