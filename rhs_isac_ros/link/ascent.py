@@ -1,19 +1,20 @@
-"""Ascent of the capacity from a configuration to a maximum nearby."""
+"""Ascent of the capacity from configurations to maxima nearby."""
 
 import dataclasses
 
 import numpy as np
 
 from rhs_isac_ros.link.band_link import BandLink
+from rhs_isac_ros.link.water_filling import water_filling
 
-# Maximum number of rounds; one or two are usual.
-_MAX_ROUNDS = 50
+# Maximum number of rounds; two or three are usual.
+_MAX_ROUNDS = 100
 # Smallest relative gain of the capacity that justifies another round.
 _MIN_GAIN = 1e-9
 
 
-def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Increase the capacity of a configuration, float64 [N_E], until no step increases it.
+def ascend(link: BandLink, analog: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray]:
+    """Increase the capacity of the best of some configurations until no step increases it.
 
     Each round finds the best digital part and then, with that part fixed, a better configuration.
     The received power is convex in the configuration, so that it lies above its linear model at
@@ -23,88 +24,114 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     one element to an end of its range: the one that increases it most. The capacity never falls
     below that of the start.
 
-    Returns a configuration, float64 [N_E], each entry in [0, 1], and the best digital part for
-    it, complex128 [N_SB, K] [sqrt(W)].
+    Parameters
+    ----------
+    link
+        The links of several bands.
+    analog
+        Starts, float64 [N_B, n, N_E], each entry in [0, 1].
+    n_kept
+        Number of starts of each band that are improved: those of the highest capacity.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Configurations, float64 [N_B, n_kept, N_E], each entry in [0, 1], and their capacities
+        [nat/symbol] summed over the sub-bands, float64 [N_B, n_kept].
     """
     point = _Point.at(link, analog)
+    if n_kept < analog.shape[1]:
+        best = np.argsort(-point.rate, axis=1, kind='stable')[:, :n_kept]
+        point = point[np.arange(len(best))[:, None], best]
+    # Whether the corner remains to be tried.
+    is_new = np.ones(point.rate.shape, bool)
     for _ in range(_MAX_ROUNDS):
-        better = point.corner_step()
-        if better is None:
-            better = point.element_step()
-        if better is None:
+        to_corner = is_new & (point.corner != point.analog).any(axis=-1)
+        by_element, gain = point.element_step(link)
+        done = ~to_corner & (gain <= _MIN_GAIN * point.rate)
+        if done.all():
             break
-        point = _Point.at(link, better)
-    return point.analog, point.digital
+        other = _Point.at(link, np.where(
+            done[..., None], point.analog,
+            np.where(to_corner[..., None], point.corner, by_element)))
+        is_new = other.rate - point.rate > _MIN_GAIN * point.rate
+        # An element that does not increase the capacity after all ends the ascent.
+        if not (is_new | to_corner).any():
+            break
+        point = other if is_new.all() else other.where(is_new, point)
+    return point.analog, point.rate
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Point:
-    """A configuration, the best digital part for it, and the local behaviour of the capacity.
+    """Configurations, and the local behaviour of the capacity with their best digital parts.
 
     Attributes
     ----------
-    weights
-        Digital part times on-board propagation, over the noise amplitude, complex128
-        [N_SB, N_E].
-    los_weights
-        `weights` times the line-of-sight gains, complex128 [N_SB, N_E].
+    analog
+        Float64 [N_B, n, N_E].
+    rate
+        Capacities [nat/symbol], float64 [N_B, n].
+    corner
+        The corner that the gradient points to, float64 [N_B, n, N_E].
     snr
-        Signal-to-noise ratios, float64 [N_SB].
-    snr_gradient
-        Derivative of the ratios with respect to the configuration, float64 [N_SB, N_E].
+        Signal-to-noise ratios, float64 [N_B, n, N_SB].
+    slope, curvature
+        Derivative of the ratios with respect to each element, and the coefficient of the square
+        of a change, float64 [N_B, n, N_SB, N_E].
     """
 
-    link: BandLink
     analog: np.ndarray
-    digital: np.ndarray
-    weights: np.ndarray
-    los_weights: np.ndarray
+    rate: np.ndarray
+    corner: np.ndarray
     snr: np.ndarray
-    snr_gradient: np.ndarray
+    slope: np.ndarray
+    curvature: np.ndarray
 
     @classmethod
     def at(cls, link: BandLink, analog: np.ndarray) -> '_Point':
-        digital = link.best_digital(analog)
-        weights = np.einsum('jk,jkm->jm', digital, link.onboard) / np.sqrt(link.noise_power_w)
-        los_weights = weights * link.los
-        direct, radiation = los_weights @ analog, weights * analog
-        diffuse = np.conj(link.scatter(radiation))
-        snr = np.abs(direct)**2 + np.sum(radiation * diffuse, axis=1).real
-        gradient = 2 * (np.conj(direct)[:, None] * los_weights + weights * diffuse).real
-        return cls(link, analog, digital, weights, los_weights, snr, gradient)
+        configured, scattered, direct = link.feeds(analog)
+        gains, directions = np.linalg.eigh(link.correlations(configured, scattered, direct))
+        # The configuration may pass no signal; only rounding makes the gain negative.
+        gain = np.maximum(gains[..., -1], 0) / link.noise_power_w
+        power = water_filling(gain, link.power_w)
+        snr = gain * power
+        amplitude = np.sqrt(power / link.noise_power_w)
+        digital = (np.conj(directions[..., -1]) * amplitude[..., None])[..., None, :]
+        weights = np.matmul(digital, link.onboard[:, None])[..., 0, :]
+        received = np.conj(np.matmul(digital, direct)[..., 0])
+        towards = received * link.los[:, None]
+        towards += np.conj(np.matmul(digital, scattered)[..., 0, :])
+        slope = 2 * (weights * towards).real
+        spread = np.abs(link.los)**2 + np.diagonal(link.spatial, axis1=-2, axis2=-1)[:, None]
+        curvature = (weights.real**2 + weights.imag**2) * spread[:, None]
+        ascending = np.sum(slope / (1 + snr)[..., None], axis=-2) > 0
+        corner = np.where(link.fixed, 1.0, ascending)
+        return cls(analog, np.log1p(snr).sum(axis=-1), corner, snr, slope, curvature)
 
-    def corner_step(self) -> np.ndarray | None:
-        """Return the corner that the gradient points to.
-
-        Return None if it does not increase the capacity.
-        """
-        corner: np.ndarray = (1 / (1 + self.snr) @ self.snr_gradient > 0).astype(float)
-        corner[self.link.fixed] = 1.0
-        direct, radiation = self.los_weights @ corner, self.weights * corner
-        scattered = np.sum(self.link.scatter(radiation) * np.conj(radiation), axis=1).real
-        return corner if self._gains(np.abs(direct)**2 + scattered) else None
-
-    def element_step(self) -> np.ndarray | None:
-        """Return the best change of one element to an end of its range.
-
-        Return None if no change increases the capacity.
-        """
-        curvatures = np.abs(self.los_weights)**2
-        curvatures += np.abs(self.weights)**2 * np.diag(self.link.spatial)
-        steps = np.stack([-self.analog, 1 - self.analog])[:, None] * ~self.link.fixed
+    def element_step(self, link: BandLink) -> tuple[np.ndarray, np.ndarray]:
+        """Return the best change of one element to an end of its range, and its gain [nat]."""
+        # Axes: end, band, start, sub-band, element.
+        steps = np.stack([-self.analog, 1 - self.analog])[:, :, :, None] * ~link.fixed
         # The power is quadratic in each element, so that this is exact; only rounding can make
         # it negative.
-        snr = self.snr[:, None] + steps * self.snr_gradient + steps**2 * curvatures
-        snr = np.maximum(snr, 0)
-        end, element = np.unravel_index(
-            np.log1p(snr).sum(axis=1).argmax(), (2, len(self.analog)))
-        if not self._gains(snr[end, :, element]):
-            return None
-        better: np.ndarray = self.analog.copy()
-        better[element] = end
-        return better
+        snr = self.snr[..., None] + steps * (self.slope + steps * self.curvature)
+        low, high = np.log1p(np.maximum(snr, 0)).sum(axis=-2)
+        rates = np.maximum(low, high)
+        place = (*np.ogrid[:len(rates), :rates.shape[1]], rates.argmax(axis=-1))
+        better = self.analog.copy()
+        better[place] = high[place] > low[place]
+        gain: np.ndarray = rates[place] - self.rate
+        return better, gain
 
-    def _gains(self, snr: np.ndarray) -> bool:
-        """Return whether the given signal-to-noise ratios yield a higher capacity."""
-        rate = np.log1p(self.snr).sum()
-        return bool(np.log1p(snr).sum() - rate > _MIN_GAIN * rate)
+    def where(self, condition: np.ndarray, other: '_Point') -> '_Point':
+        """Return these points where a condition, bool [N_B, n], holds, and others elsewhere."""
+        pairs = zip(self._fields(), other._fields(), strict=True)
+        return _Point(*(np.where(condition.reshape(*condition.shape, *[1] * (new.ndim - 2)),
+                                 new, old) for new, old in pairs))
+
+    def __getitem__(self, index: tuple[np.ndarray, ...]) -> '_Point':
+        return _Point(*(field[index] for field in self._fields()))
+
+    def _fields(self) -> list[np.ndarray]:
+        return [self.analog, self.rate, self.corner, self.snr, self.slope, self.curvature]

@@ -1,24 +1,28 @@
-"""The link between the surface and one position in one band, as arrays for steering."""
+"""The links between the surface and one position, as arrays for steering."""
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
 from rhs_isac_ros.link.water_filling import water_filling
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-
-# Largest share of the multipath power that the modes may omit.
-_MAX_OMITTED = 0.02
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BandLink:
-    """The link between the surface and a user in one band.
+    """The link between the surface and a user in one band, or the links in some bands.
+
+    With several bands, all arrays but `fixed` have a leading axis for the band. Configurations
+    then have leading axes for the band and for alternatives, float64 [N_B, n, N_E]; in one band,
+    they have any number of leading axes.
 
     Attributes
     ----------
@@ -28,8 +32,6 @@ class BandLink:
         Line-of-sight gains, complex128 [N_SB, N_E].
     spatial
         V_i, which is real, float64 [N_E, N_E].
-    modes
-        The strongest modes of V_i, float64 [N_E, r]: G with G G^T close to V_i.
     noise_power_w, power_w
         Noise power of a sub-band, and power of the digital part over all sub-bands [W].
     fixed
@@ -39,15 +41,14 @@ class BandLink:
     onboard: np.ndarray
     los: np.ndarray
     spatial: np.ndarray
-    modes: np.ndarray
     noise_power_w: float
     power_w: float
     fixed: np.ndarray
 
     @classmethod
-    def to(cls, scenario: Scenario, position: np.ndarray, band: int,
+    def to(cls, scenario: Scenario, position: np.ndarray, bands: int | Sequence[int],
            surface: SurfaceEstimate | None = None) -> 'BandLink':
-        """Return the link to a position, float64 [3] [m], in a band, counted from 0.
+        """Return the links to a position, float64 [3] [m], in bands, counted from 0.
 
         The coefficients of an estimated surface become part of the propagation on the board.
 
@@ -56,60 +57,115 @@ class BandLink:
         ValueError
             If the position is not a finite [3] array.
         """
-        los = los_gain(scenario, np.asarray(position, dtype=float)[None], band)[0]
-        spatial, modes = _multipath(scenario)[band]
-        onboard, fixed = onboard_matrix(scenario)[band], np.zeros(scenario.n_elements, bool)
-        if surface:
-            fixed = surface.failed
-            coefficients = np.where(fixed, surface.offsets, surface.gains)
-            onboard = surface.band_gains[band] * coefficients * onboard
-        return cls(onboard, los, spatial, modes, scenario.noise_power_w, scenario.max_power_w,
-                   fixed)
+        place = np.asarray(position, dtype=float)[None]
+        onboard, spatial, fixed = arrays(scenario, surface)
+        if isinstance(bands, int):
+            los = los_gain(scenario, place, bands)[0]
+        else:
+            los = np.concatenate([los_gain(scenario, place, band) for band in bands])
+        index = band_index(bands)
+        return cls(onboard[index], los, spatial[index], scenario.noise_power_w,
+                   scenario.max_power_w, fixed)
+
+    def at_subbands(self, subbands: np.ndarray) -> 'BandLink':
+        """Return the links in some sub-bands, with the share of the power that is theirs."""
+        share = len(subbands) / self.los.shape[-2]
+        return dataclasses.replace(
+            self, onboard=self.onboard[..., subbands, :, :], los=self.los[..., subbands, :],
+            power_w=self.power_w * share)
 
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
-        """Return the best digital part for a configuration, complex128 [N_SB, K] [sqrt(W)].
+        """Return the best digital part for configurations, complex128 [..., N_SB, K] [sqrt(W)].
 
         It follows the principal eigenvectors of the correlation matrices of the channels at the
-        feeds, with the power divided by water-filling. The configuration is float64 [N_E].
+        feeds, with the power divided by water-filling.
         """
-        gains, directions = np.linalg.eigh(self._correlations(analog))
-        power = water_filling(gains[:, -1] / self.noise_power_w, self.power_w)
+        gains, directions = np.linalg.eigh(self.correlations(*self.feeds(analog)))
+        power = water_filling(gains[..., -1] / self.noise_power_w, self.power_w)
         # s is a row: s M s^H is largest along the conjugate of the eigenvector.
-        digital: np.ndarray = np.conj(directions[:, :, -1]) * np.sqrt(power)[:, None]
+        digital: np.ndarray = np.conj(directions[..., -1]) * np.sqrt(power)[..., None]
         return digital
 
-    def best_rate(self, analog: np.ndarray) -> float:
-        """Return the capacity with the best digital part [nat/symbol], summed over sub-bands."""
-        gains = np.linalg.eigvalsh(self._correlations(analog))[:, -1] / self.noise_power_w
-        return float(np.log1p(gains * water_filling(gains, self.power_w)).sum())
+    def best_rate(self, analog: np.ndarray) -> np.ndarray:
+        """Return the capacity with the best digital part [nat/symbol], float64 [...].
+
+        It is the sum over the sub-bands.
+        """
+        correlations = self.correlations(*self.feeds(analog))
+        gains = np.linalg.eigvalsh(correlations)[..., -1] / self.noise_power_w
+        rate: np.ndarray = np.log1p(gains * water_filling(gains, self.power_w)).sum(axis=-1)
+        return rate
+
+    def feeds(self, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the channels between the feeds and the air for configurations [..., N_E].
+
+        Returns B_j diag(c), complex128 [..., N_SB, K, N_E], its product with V_i, and its product
+        with the line-of-sight gains, complex128 [..., N_SB, K, 1].
+        """
+        several = self.spatial.ndim == 3
+        onboard, los = self.onboard, self.los[..., None]
+        if several:
+            onboard, los = onboard[:, None], los[:, None]
+        configured = onboard * analog[..., None, None, :]
+        return configured, self.scatter(configured), np.matmul(configured, los)
 
     def scatter(self, weights: np.ndarray) -> np.ndarray:
         """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
+        n = weights.shape[-1]
+        rows = weights.reshape(*self.spatial.shape[:-2], -1, n)
         # Two real products take half the time of one complex product.
-        result = np.empty(weights.shape, complex)
-        result.real, result.imag = weights.real @ self.spatial, weights.imag @ self.spatial
-        return result
+        result = np.empty(rows.shape, complex)
+        result.real, result.imag = rows.real @ self.spatial, rows.imag @ self.spatial
+        return result.reshape(weights.shape)
 
-    def _correlations(self, analog: np.ndarray) -> np.ndarray:
-        """Correlation matrices of the channels at the feeds, complex128 [N_SB, K, K]."""
-        configured = self.onboard * analog
-        direct = np.matmul(configured, self.los[:, :, None])
-        correlations: np.ndarray = direct * np.conj(np.swapaxes(direct, 1, 2))
-        correlations += np.matmul(self.scatter(configured), np.conj(np.swapaxes(configured, 1, 2)))
+    @staticmethod
+    def correlations(
+            configured: np.ndarray, scattered: np.ndarray, direct: np.ndarray) -> np.ndarray:
+        """Correlation matrices of the channels of `feeds`, complex128 [..., N_SB, K, K]."""
+        correlations: np.ndarray = direct * np.conj(np.swapaxes(direct, -1, -2))
+        correlations += np.matmul(scattered, np.conj(np.swapaxes(configured, -1, -2)))
         return correlations
 
 
+def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
+    """Return the index of bands in an array, a slice if possible, which needs no copy."""
+    if isinstance(bands, int):
+        return bands
+    first, n = bands[0], len(bands)
+    return slice(first, first + n) if list(bands) == list(range(first, first + n)) else list(bands)
+
+
 @functools.lru_cache(maxsize=16)
-def _multipath(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Covariance of each band, float64 [N_E, N_E], and its strongest modes, float64 [N_E, r]."""
-    result = []
-    for covariance in multipath_covariance(scenario):
-        spatial = np.ascontiguousarray(covariance.real)
-        powers, directions = np.linalg.eigh(spatial)
-        powers, directions = np.maximum(powers[::-1], 0), directions[:, ::-1]
-        rank = 1 + int(np.searchsorted(np.cumsum(powers), (1 - _MAX_OMITTED) * powers.sum()))
-        modes = directions[:, :rank] * np.sqrt(powers[:rank])
-        for array in (spatial, modes):
-            array.flags.writeable = False
-        result.append((spatial, modes))
-    return tuple(result)
+def arrays(scenario: Scenario, surface: SurfaceEstimate | None
+           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute what does not depend on the position: `onboard`, `spatial` of all bands, `fixed`.
+
+    The arrays are read-only.
+    """
+    onboard, fixed = onboard_matrix(scenario), np.zeros(scenario.n_elements, bool)
+    if surface:
+        fixed = surface.failed
+        coefficients = np.where(fixed, surface.offsets, surface.gains)
+        onboard = surface.band_gains[:, None, None, None] * coefficients * onboard
+    spatial = np.ascontiguousarray(multipath_covariance(scenario).real)
+    for array in (onboard, spatial, fixed):
+        array.flags.writeable = False
+    return onboard, spatial, fixed
+
+
+@functools.lru_cache(maxsize=16)
+def representative_subbands(
+        scenario: Scenario, max_drift_rad: float, max_count: int) -> np.ndarray:
+    """Return indices of evenly spread sub-bands, at most `max_count`.
+
+    Between neighbours, the phases of the elements drift apart by at most `max_drift_rad`, unless
+    that takes more sub-bands.
+    """
+    elements, feeds = element_positions(scenario), feed_positions(scenario)
+    on_board = np.linalg.norm(elements - feeds[:, None], axis=-1)
+    across = np.linalg.norm(np.ptp(elements, axis=0))
+    span_m = scenario.refractive_index * np.ptp(on_board) + across
+    span_hz = (scenario.n_subbands - 1) * scenario.subband_width_hz
+    drift = 2 * np.pi * span_hz / SPEED_OF_LIGHT_MPS * span_m
+    n = int(min(scenario.n_subbands, 1 + drift // max_drift_rad, max_count))
+    return ((np.arange(n) + 0.5) * scenario.n_subbands / n).astype(int)

@@ -3,12 +3,13 @@
 import dataclasses
 import functools
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
+from rhs_isac_ros.link.band_link import arrays, band_index
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.model.los import los_sums
 from rhs_isac_ros.model.shapes import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.model.threads import one_blas_thread
@@ -49,12 +50,20 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
     ValueError
         If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
     """
-    radiation = _radiation(scenario, beam)
-    direct = _direct_power_w(scenario, beam.band, radiation, positions)
-    spatial = multipath_covariance(scenario)[beam.band]
-    scattered = np.sum((radiation @ spatial) * np.conj(radiation), axis=1).real
-    snr = (direct + scattered) / scenario.noise_power_w
-    rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=1)
+    return capacities(scenario, [beam], positions)[0]
+
+
+def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray) -> np.ndarray:
+    """Compute `capacity` for several beams, float64 [n, N] [bit/s]; errors are the same."""
+    bands = [beam.band for beam in beams]
+    radiation = np.stack([_radiation(scenario, beam) for beam in beams])
+    direct = np.abs(los_sums(scenario, positions, bands, radiation))**2
+    # V is real: the real and imaginary parts of the radiation contribute separately.
+    spatial = arrays(scenario, None)[1][band_index(bands)]
+    parts = np.concatenate([radiation.real, radiation.imag], axis=1)
+    scattered = np.sum((parts @ spatial) * parts, axis=-1).reshape(len(beams), 2, 1, -1)
+    snr = (direct + scattered.sum(axis=1)) / scenario.noise_power_w
+    rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
     return rates
 
 
@@ -71,8 +80,16 @@ def expected_capacity(
         If `mean` or `covariance` has a wrong shape or is not finite, or the beam does not fit the
         scenario.
     """
+    return float(expected_capacities(scenario, [beam], mean, covariance)[0])
+
+
+def expected_capacities(
+        scenario: Scenario, beams: Sequence[Beam], mean: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Compute `expected_capacity` for several beams, float64 [n] [bit/s]; errors are the same."""
     points, weights = posterior_points(scenario, mean, covariance)
-    return float(weights @ capacity(scenario, beam, points))
+    # One product for each beam, so that the others do not affect its rounding.
+    return np.array([weights @ rates for rates in capacities(scenario, beams, points)])
 
 
 def direct_power_w(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
@@ -80,8 +97,8 @@ def direct_power_w(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.
 
     The result is the sum over the sub-bands, float64 [N] [W]. Errors are those of `capacity`.
     """
-    power: np.ndarray = _direct_power_w(
-        scenario, beam.band, _radiation(scenario, beam), positions).sum(axis=1)
+    (sums,) = los_sums(scenario, positions, [beam.band], _radiation(scenario, beam)[None])
+    power: np.ndarray = np.sum(np.abs(sums)**2, axis=1)
     return power
 
 
@@ -147,12 +164,3 @@ def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
     radiation: np.ndarray = feeds * beam.analog
     return radiation
 
-
-def _direct_power_w(
-        scenario: Scenario, band: int, radiation: np.ndarray, positions: np.ndarray
-) -> np.ndarray:
-    """Power over the line of sight, float64 [N, N_SB] [W]."""
-    amplitudes: np.ndarray = np.einsum(
-        'jm,njm->nj', radiation, los_gain(scenario, positions, band))
-    power: np.ndarray = np.abs(amplitudes)**2
-    return power

@@ -1,107 +1,265 @@
-"""Search for configurations from which to start an ascent, many starts at a time."""
+"""Search for configurations from which to start an ascent, for all bands at a time."""
 
+import dataclasses
 import functools
 
 import numpy as np
 
+from rhs_isac_ros.link import band_link
 from rhs_isac_ros.link.band_link import BandLink
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
-_N_STARTS = 320
-# Number of starts that remain after each round.
-_N_KEPT = (320, 320, 160, 80, 80, 80, 80, 80, 80)
-# Lower limit of a norm, which avoids a division by zero.
-_MIN_NORM = 1e-300
+# Largest share of the multipath power that the modes may omit.
+_MAX_OMITTED = 0.02
 # Sub-bands whose phases drift apart by more than this over the surface are searched separately,
 # up to a limited number.
 _MAX_DRIFT_RAD = 1.0
 _MAX_SUBBANDS = 16
+# Number of random starts, and of those that remain after the first step.
+_N_STARTS = 256
+_N_DIRECT = 96
+# Number of configurations that are improved with the multipath, and that remain after each step.
+_N_KEPT = (24, 12, 6)
+# Number of configurations for the multipath alone, of their random starts and of steps.
+_N_SCATTERED = 8
+_N_SCATTERED_STARTS = 256
+_N_SCATTERED_STEPS = 8
+# Configurations of nearly equal capacity count as one.
+_MIN_DIFFERENCE = 1e-6
+# Limits of the amplitudes relative to the noise.
+_AMPLITUDES = (1e-3, 1e4)
+# Lower limit of a norm, which avoids a division by zero.
+_MIN_NORM = 1e-30
 
 
-def candidate_configurations(link: BandLink, max_count: int) -> np.ndarray:
-    """Find configurations of high capacity.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tables:
+    """What the search needs and what does not depend on the position, for all bands.
+
+    Attributes
+    ----------
+    subbands
+        Indices of the sub-bands that represent all, int [J].
+    onboard
+        Gains on the board, complex64 [N_B, N_E, J, K].
+    paths
+        Gains from each feed via each element to each wave in the air, complex64
+        [N_B, N_E, J, K, L]. The last waves are the strongest modes of the multipath, the columns
+        of G with G G^T close to V_i; the first one, the line of sight, is left zero.
+    starts
+        Fixed waves on the board, with which the search starts, float32 [S, 2 J K].
+    peaks
+        Upper limits of the amplitude of a mode at a feed, float64 [N_B].
+    scattered
+        Configurations with a high capacity over the multipath alone, float32 [N_B, n, N_E].
+    fixed
+        Elements that do not follow the configuration, bool [N_E]; None if all do.
+    """
+
+    subbands: np.ndarray
+    onboard: np.ndarray
+    paths: np.ndarray
+    starts: np.ndarray
+    peaks: np.ndarray
+    scattered: np.ndarray
+    fixed: np.ndarray | None
+
+
+def candidate_configurations(
+        tables: Tables, link: BandLink, index: slice | list[int], n: int) -> np.ndarray:
+    """Find configurations of high capacity, float64 [N_B, n, N_E], each entry 0 or 1.
 
     By the holographic principle, a configuration enables those elements at which a wave on the
     board, s B, and a wave in the air, G w, are in phase. The waves in the air are the line of
-    sight and the modes of the multipath, the columns of G. Starting from fixed pairs of waves,
-    spread over all directions, the search improves waves and configuration in turn: the best pair
-    for a configuration belongs to the largest singular value of B diag(c) G.
+    sight and the modes of the multipath, the columns of G. Starting from fixed waves on the
+    board, spread over all directions, the search improves waves and configuration in turn: the
+    best pair of waves for a configuration belongs to the largest singular value of B diag(c) G.
+    It begins with the line of sight alone, for which the best wave on the board is known, and
+    continues with the best of the configurations found, with those that are best for the
+    multipath alone, and with the matched filter.
 
-    Returns up to `max_count` different configurations, float64 [n, N_E], each entry 0 or 1, in
-    descending order of the capacity over the sub-bands and modes that are searched.
+    The configurations of a band are in no particular order, and some may be equal.
+
+    Parameters
+    ----------
+    link
+        The links of the bands.
+    index
+        The bands among those of the tables.
     """
-    paths = _paths(link)
-    n_subbands, n_feeds, n_waves, n_elements = paths.shape
-    # Real arithmetic suffices: configurations are real, and only the real part of the product of
-    # the waves matters.
-    path_matrix = paths.reshape(-1, n_elements).T.copy().view(float)
-    on_board, in_air = _starts(n_feeds, n_waves)
-    pairs = np.zeros((_N_STARTS, n_subbands, n_feeds, n_waves), complex)
-    # Each start begins with a single sub-band.
-    first_pair = np.arange(_N_STARTS), np.arange(_N_STARTS) % n_subbands
-    pairs[first_pair] = on_board[:, :, None] * in_air[:, None, :]
-    on_board = np.repeat(on_board[:, None], n_subbands, axis=1)
-    for n_left in _N_KEPT:
-        product = np.conj(pairs).reshape(len(pairs), -1).view(float)
-        analog = (product @ path_matrix.T > 0).astype(float)
-        analog[:, link.fixed] = 1.0
-        configured = (analog @ path_matrix).view(complex).reshape(pairs.shape)
-        snr, on_board, pairs = _improve_pairs(configured, on_board)
-        pairs /= (1 + snr)[..., None, None]
-        rate = np.log1p(snr).sum(axis=1)
-        if n_left < len(pairs):
-            best = np.argpartition(-rate, n_left)[:n_left]
-            analog, on_board, pairs, rate = analog[best], on_board[best], pairs[best], rate[best]
-    # Several starts may end in the same configuration.
-    distinct = {row.tobytes(): row for row in analog[np.argsort(-rate, kind='stable')]}
-    return np.array(list(distinct.values())[:max_count])
-
-
-def _improve_pairs(
-        configured: np.ndarray, on_board: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Improve pairs of waves for given configurations by a step of power iteration.
-
-    Takes B diag(c) G [S, J, K, L] and waves on the board [S, J, K]; returns the signal-to-noise
-    ratios [S, J], the new waves on the board, and the products of the new pairs [S, J, K, L].
-    """
-    in_air = np.conj(np.matmul(on_board[..., None, :], configured))
-    on_board = np.conj(np.matmul(configured, np.swapaxes(in_air, -1, -2))[..., 0])
-    on_board /= np.maximum(np.linalg.norm(on_board, axis=-1, keepdims=True), _MIN_NORM)
-    in_air = np.conj(np.matmul(on_board[..., None, :], configured))
-    snr = np.sum(np.abs(in_air)**2, axis=(-1, -2))
-    return snr, on_board, on_board[..., None] * in_air
-
-
-def _paths(link: BandLink) -> np.ndarray:
-    """Gain over noise from each feed via each element to each wave, complex128 [J, K, L, N_E].
-
-    The power is divided evenly among the sub-bands. One sub-band represents all that hardly
-    differ.
-    """
-    n_subbands = len(link.los)
-    subbands = _representative_subbands(link)
-    in_air = np.concatenate([
-        link.los[subbands][:, None], np.broadcast_to(
-            link.modes.T, (len(subbands), *link.modes.T.shape))], axis=1)
-    scale = np.sqrt(link.power_w / n_subbands / link.noise_power_w)
-    paths: np.ndarray = scale * link.onboard[subbands][:, :, None] * in_air[:, None]
-    return paths
-
-
-def _representative_subbands(link: BandLink) -> np.ndarray:
-    """Indices of evenly spread sub-bands, so close that the phases drift little between them."""
-    n_subbands = len(link.los)
-    # Rotation of the last sub-band against the first, without the rotation common to all elements.
-    rotation = link.onboard[-1] * link.los[-1] * np.conj(link.onboard[0] * link.los[0])
-    drift = np.angle(rotation * np.conj(rotation.sum()))
-    n = int(min(n_subbands, 1 + np.ptp(drift) // _MAX_DRIFT_RAD, _MAX_SUBBANDS))
-    return ((np.arange(n) + 0.5) * n_subbands / n).astype(int)
+    los = np.swapaxes(link.los[:, tables.subbands], 1, 2)[..., None]
+    direct = tables.onboard[index] * los
+    # The power is divided evenly among the sub-bands. Limits of the amplitudes keep the search
+    # within the range of single precision and hardly change its result.
+    peak = np.maximum(np.abs(direct).sum(axis=1).max(axis=(1, 2)), tables.peaks[index])
+    over_noise = np.sqrt(link.power_w / link.los.shape[1] / link.noise_power_w)
+    scale = (np.clip(over_noise * peak, *_AMPLITUDES) / peak)[:, None, None, None]
+    direct = (scale * direct).astype(np.complex64, order='C')
+    paths = tables.paths[index] * scale[..., None].astype(np.float32)
+    paths[..., 0] = direct
+    analog = np.concatenate([
+        _direct_configurations(tables, direct), tables.scattered[index],
+        _matched(tables, direct)], axis=1)
+    waves = _Waves.at(paths, analog).best(_N_KEPT[0])
+    for n_kept in _N_KEPT:
+        waves = _Waves.at(paths, waves.corner(paths, tables.fixed), waves.on_board)
+        if n_kept < waves.rate.shape[1]:
+            waves = waves[_best(waves.rate, n_kept)]
+    return waves.best(n).analog.astype(float)
 
 
 @functools.lru_cache(maxsize=16)
-def _starts(n_feeds: int, n_waves: int) -> tuple[np.ndarray, np.ndarray]:
-    """Fixed waves on the board and in the air, complex128 [S, K] and [S, L]."""
+def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
+    """Compute the tables for a scenario and a calibrated surface."""
+    onboard, spatial, fixed = band_link.arrays(scenario, surface)
+    subbands = band_link.representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
+    on_board = np.moveaxis(onboard[:, subbands], -1, 1)
+    modes = _modes(spatial)
+    paths = np.zeros((*on_board.shape, 1 + modes.shape[2]), np.complex64)
+    paths[..., 1:] = on_board[..., None] * modes[:, :, None, None]
     rng = np.random.default_rng(0)
-    on_board: np.ndarray = rng.normal(size=(_N_STARTS, n_feeds, 2)) @ [1, 1j]
-    in_air: np.ndarray = rng.normal(size=(_N_STARTS, n_waves, 2)) @ [1, 1j]
-    return on_board, in_air
+    n_subbands, n_feeds = len(subbands), scenario.n_feeds
+    starts = np.zeros((_N_STARTS, n_subbands, 2 * n_feeds), np.float32)
+    # Each start begins with a single sub-band.
+    starts[np.arange(_N_STARTS), np.arange(_N_STARTS) % n_subbands] = rng.normal(
+        size=(_N_STARTS, 2 * n_feeds))
+    fixed = fixed if fixed.any() else None
+    peaks = np.abs(paths).sum(axis=1).max(axis=(1, 2, 3)).astype(float) + _MIN_NORM
+    scaled = paths * (_AMPLITUDES[1] / peaks)[:, None, None, None, None].astype(np.float32)
+    return Tables(
+        subbands, on_board.astype(np.complex64, order='C'), paths, starts.reshape(_N_STARTS, -1),
+        peaks, _scattered_configurations(scaled, fixed, rng), fixed)
+
+
+def _modes(spatial: np.ndarray) -> np.ndarray:
+    """Return the strongest modes of the multipath in each band, float64 [N_B, N_E, L].
+
+    Bands with fewer modes than others have columns of zeros.
+    """
+    powers, directions = np.linalg.eigh(spatial)
+    powers, directions = np.maximum(powers[:, ::-1], 0), directions[:, :, ::-1]
+    omitted = 1 - np.cumsum(powers, axis=1) / powers.sum(axis=1, keepdims=True)
+    n_modes = 1 + np.sum(omitted > _MAX_OMITTED, axis=1)
+    powers[np.arange(powers.shape[1]) >= n_modes[:, None]] = 0
+    modes: np.ndarray = directions * np.sqrt(powers)[:, None]
+    return modes[:, :, :n_modes.max()]
+
+
+def _scattered_configurations(
+        paths: np.ndarray, fixed: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
+    """Search for configurations without a line of sight, from random waves in the air."""
+    shape = (len(paths), _N_SCATTERED_STARTS, *paths.shape[2:])
+    on_board = rng.normal(size=(*shape[:-1], 1, 2)) @ [1, 1j]
+    in_air = rng.normal(size=(*shape[:-2], 1, shape[-1], 2)) @ [1, 1j]
+    analog = _corner((on_board * in_air).astype(np.complex64), paths, fixed)
+    waves = _Waves.at(paths, analog)
+    for _ in range(_N_SCATTERED_STEPS):
+        waves = _Waves.at(paths, waves.corner(paths, fixed), waves.on_board)
+    return waves.best(_N_SCATTERED).analog
+
+
+def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
+    """Search over the line of sight, whose gains are complex64 [N_B, N_E, J, K].
+
+    Returns configurations, float32 [N_B, n, N_E].
+    """
+    n_bands, n_elements, n_subbands, n_feeds = direct.shape
+    # Real arithmetic suffices: configurations are real, and only the real part of the product of
+    # the waves matters.
+    gains = direct.reshape(n_bands, n_elements, -1).view(np.float32)
+    analog = _threshold(tables.starts @ np.swapaxes(gains, 1, 2), tables.fixed)
+    # The best wave on the board is the conjugate of the channels at the feeds.
+    received = (analog @ gains).reshape(n_bands, -1, n_subbands, 2 * n_feeds)
+    snr = np.einsum('bsjk,bsjk->bsj', received, received)
+    best = _best(np.log1p(snr).sum(axis=-1), _N_DIRECT)
+    received /= (1 + snr)[..., None]
+    waves = received[best].reshape(n_bands, -1, 2 * n_subbands * n_feeds)
+    return _threshold(waves @ np.swapaxes(gains, 1, 2), tables.fixed)
+
+
+def _matched(tables: Tables, direct: np.ndarray) -> np.ndarray:
+    """Return the matched filter for line-of-sight gains, float32 [N_B, 1, N_E]."""
+    interference = direct.real.sum(axis=(2, 3))[:, None]
+    peak = np.abs(interference).max(axis=-1, keepdims=True) + np.float32(_MIN_NORM)
+    matched: np.ndarray = (interference / peak + 1) / 2
+    if tables.fixed is not None:
+        matched[..., tables.fixed] = 1.0
+    return matched
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Waves:
+    """Configurations with a pair of waves for each.
+
+    Attributes
+    ----------
+    analog
+        Float32 [N_B, n, N_E].
+    rate
+        Capacities [nat/symbol], float32 [N_B, n].
+    on_board
+        Conjugates of unit waves on the board, complex64 [N_B, n, J, K, 1].
+    in_air
+        The best waves in the air for them, over 1 plus the signal-to-noise ratio, complex64
+        [N_B, n, J, 1, L].
+    """
+
+    analog: np.ndarray
+    rate: np.ndarray
+    on_board: np.ndarray
+    in_air: np.ndarray
+
+    @classmethod
+    def at(cls, paths: np.ndarray, analog: np.ndarray,
+           on_board: np.ndarray | None = None) -> '_Waves':
+        """Improve waves on the board, by default those for the line of sight, by a power step."""
+        n_bands, n_elements, *shape = paths.shape
+        channels = (analog @ paths.reshape(n_bands, n_elements, -1).view(np.float32)).view(
+            np.complex64).reshape(n_bands, -1, *shape)
+        conjugate = np.conj(np.swapaxes(channels, -1, -2))
+        on_board = channels @ (conjugate @ (channels[..., :1] if on_board is None else on_board))
+        on_board /= np.linalg.norm(on_board, axis=-2, keepdims=True) + np.float32(_MIN_NORM)
+        in_air = np.conj(np.swapaxes(on_board, -1, -2)) @ channels
+        parts = in_air.view(np.float32)
+        snr = np.einsum('bsjkl,bsjkl->bsj', parts, parts)
+        in_air /= (1 + snr)[..., None, None]
+        return cls(analog, np.log1p(snr).sum(axis=-1), on_board, in_air)
+
+    def corner(self, paths: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
+        """Return the configurations that suit the waves, float32 [N_B, n, N_E]."""
+        return _corner(self.on_board * self.in_air, paths, fixed)
+
+    def best(self, n: int) -> '_Waves':
+        """Return the `n` best of each band; of those with the same capacity, one goes first."""
+        order = np.argsort(-self.rate, axis=1)
+        ranked = self.rate[np.arange(len(order))[:, None], order]
+        repeated = ranked[:, :-1] - ranked[:, 1:] <= _MIN_DIFFERENCE * ranked[:, :-1]
+        ranked[:, 1:][repeated] = -1
+        distinct = np.argsort(-ranked, axis=1, kind='stable')[:, :n]
+        bands = np.arange(len(order))[:, None]
+        return self[bands, order[bands, distinct]]
+
+    def __getitem__(self, index: tuple[np.ndarray, ...]) -> '_Waves':
+        return _Waves(self.analog[index], self.rate[index], self.on_board[index],
+                      self.in_air[index])
+
+
+def _corner(pairs: np.ndarray, paths: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
+    """Enable the elements where pairs of waves, complex64 [N_B, n, J, K, L], are in phase."""
+    n_bands, n_elements = paths.shape[:2]
+    weights = pairs.reshape(n_bands, -1, paths[0, 0].size).view(np.float32)
+    gains = paths.reshape(n_bands, n_elements, -1).view(np.float32)
+    return _threshold(weights @ np.swapaxes(gains, 1, 2), fixed)
+
+
+def _threshold(phases: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
+    analog = (phases > 0).astype(np.float32)
+    if fixed is not None:
+        analog[..., fixed] = 1.0
+    return analog
+
+
+def _best(rate: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index of the `n` highest rates of each band, in no order."""
+    return np.arange(len(rate))[:, None], np.argpartition(-rate, n - 1, axis=1)[:, :n]

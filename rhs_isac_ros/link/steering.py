@@ -7,17 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from rhs_isac_ros.link.ascent import ascend
-from rhs_isac_ros.link.band_link import BandLink
-from rhs_isac_ros.link.capacity import Beam, capacity, expected_capacity
-from rhs_isac_ros.link.search import candidate_configurations
+from rhs_isac_ros.link.band_link import BandLink, band_index, representative_subbands
+from rhs_isac_ros.link.capacity import Beam, capacity, expected_capacities
+from rhs_isac_ros.link.search import candidate_configurations, tables
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface import matched_configuration
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import one_blas_thread
 
-# Number of candidates to compare over all sub-bands and modes, and of ascents.
-_N_CANDIDATES = 8
-_N_ASCENTS = 4
+# Number of candidates to compare over all modes, and of ascents.
+_N_CANDIDATES = 4
+_N_ASCENTS = 2
+# An ascent ignores drifts of the phases between sub-bands below this, unless that takes more
+# sub-bands than the limit.
+_MAX_DRIFT_RAD = 0.05
+_MAX_SUBBANDS = 64
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,15 +65,23 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
     ValueError
         If the position is not a finite [3] array, or the band is out of range.
     """
-    if not 0 <= band < scenario.n_bands:
-        raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
-    link = BandLink.to(scenario, position, band, surface)
-    matched = matched_configuration(link.los, link.onboard)
-    matched[link.fixed] = 1.0
-    starts = [matched, *candidate_configurations(link, _N_CANDIDATES)]
-    starts.sort(key=link.best_rate, reverse=True)
-    ends = [ascend(link, start) for start in starts[:_N_ASCENTS]]
-    return Beam(*max(ends, key=lambda end: link.best_rate(end[0])), band)
+    return _steer(scenario, position, [band], surface)[0]
+
+
+def _steer(scenario: Scenario, position: np.ndarray, bands: Sequence[int],
+           surface: SurfaceEstimate | None) -> list[Beam]:
+    """Steer a beam of each of some bands, as `steer` does, all of them together."""
+    for band in bands:
+        if not 0 <= band < scenario.n_bands:
+            raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
+    link = BandLink.to(scenario, position, bands, surface)
+    starts = candidate_configurations(
+        tables(scenario, surface), link, band_index(bands), _N_CANDIDATES)
+    subbands = representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
+    ends, rates = ascend(link.at_subbands(subbands), starts, _N_ASCENTS)
+    best = ends[np.arange(len(ends)), rates.argmax(axis=1)]
+    digital = link.best_digital(best[:, None])[:, 0]
+    return [Beam(*parts) for parts in zip(best, digital, bands, strict=True)]
 
 
 def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
@@ -108,12 +119,12 @@ def choose_beam(
         If `mean` or `covariance` has a wrong shape or is not finite, or a band is out of range.
     """
     covariance = np.zeros((3, 3)) if covariance is None else covariance
-    choices = []
-    for band in range(scenario.n_bands) if bands is None else bands:
-        beam = steer(scenario, mean, band, surface)
-        choices.append(Choice(beam, expected_capacity(
-            scenario, applied_beam(beam, surface), mean, covariance)))
-    return max(choices, key=lambda choice: choice.expected_bps)
+    bands = range(scenario.n_bands) if bands is None else bands
+    beams = _steer(scenario, mean, bands, surface)
+    expected = expected_capacities(
+        scenario, [applied_beam(beam, surface) for beam in beams], mean, covariance)
+    best = int(expected.argmax())
+    return Choice(beams[best], float(expected[best]))
 
 
 @one_blas_thread

@@ -4,6 +4,8 @@ Positions are those of the user, float64 [N, 3] [m]; `band` is an index from 0. 
 positions raise ValueError if the shape is wrong or a value is not finite.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -20,6 +22,35 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
     """Compute the line-of-sight gains h^LoS, complex128 [N, N_SB, N_E], defined below Eq. (1)."""
     offsets, distances = _separation(scenario, positions)
     return _gain(scenario, distances, band, _amplitude(scenario, offsets))
+
+
+def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
+             weights: np.ndarray) -> np.ndarray:
+    """Sum the gains of `los_gain` over the elements in some bands, complex128 [n, N, N_SB].
+
+    The gains of all elements and sub-bands are not stored, and the bands share their
+    exponentials. The weights are complex128 [n, N_SB, N_E], the positions float64 [N, 3] [m].
+
+    Raises
+    ------
+    ValueError
+        If `positions` is not a finite [N, 3] array.
+    """
+    offsets, distances = _separation(scenario, positions)
+    amplitudes = _amplitude(scenario, offsets) / distances
+    phase_rate = -2j * np.pi / SPEED_OF_LIGHT_MPS * distances
+    step = np.exp(phase_rate * scenario.subband_width_hz)
+    sums = np.empty((len(bands), len(distances), scenario.n_subbands), complex)
+    for index, band in enumerate(bands):
+        frequencies = subband_frequencies_hz(scenario)[band]
+        gain = np.exp(phase_rate * frequencies[0])
+        gain *= amplitudes
+        for subband, row in enumerate(weights[index]):
+            if subband:
+                gain *= step
+            np.matmul(gain, row, out=sums[index, :, subband])
+        sums[index] /= frequencies
+    return sums
 
 
 def los_derivative(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
