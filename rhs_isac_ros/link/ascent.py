@@ -13,8 +13,8 @@ _MAX_ROUNDS = 100
 _MIN_GAIN = 1e-9
 
 
-def ascend(link: BandLink, analog: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray]:
-    """Increase the capacity of the best of some configurations until no step increases it.
+def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Increase the capacity of configurations until no step increases it.
 
     Each round finds the best digital part and then, with that part fixed, a better configuration.
     The received power is convex in the configuration, so that it lies above its linear model at
@@ -30,19 +30,14 @@ def ascend(link: BandLink, analog: np.ndarray, n_kept: int) -> tuple[np.ndarray,
         The links of several bands.
     analog
         Starts, float64 [N_B, n, N_E], each entry in [0, 1].
-    n_kept
-        Number of starts of each band that are improved: those of the highest capacity.
 
     Returns
     -------
     tuple of numpy.ndarray
-        Configurations, float64 [N_B, n_kept, N_E], each entry in [0, 1], and their capacities
-        [nat/symbol] summed over the sub-bands, float64 [N_B, n_kept].
+        Configurations, float64 [N_B, n, N_E], each entry in [0, 1], and their capacities
+        [nat/symbol] summed over the sub-bands, float64 [N_B, n].
     """
     point = _Point.at(link, analog)
-    if n_kept < analog.shape[1]:
-        best = np.argsort(-point.rate, axis=1, kind='stable')[:, :n_kept]
-        point = point[np.arange(len(best))[:, None], best]
     # Whether the corner remains to be tried.
     is_new = np.ones(point.rate.shape, bool)
     for _ in range(_MAX_ROUNDS):
@@ -129,9 +124,6 @@ class _Point:
         pairs = zip(self._fields(), other._fields(), strict=True)
         return _Point(*(np.where(condition.reshape(*condition.shape, *[1] * (new.ndim - 2)),
                                  new, old) for new, old in pairs))
-
-    def __getitem__(self, index: tuple[np.ndarray, ...]) -> '_Point':
-        return _Point(*(field[index] for field in self._fields()))
 
     def _fields(self) -> list[np.ndarray]:
         return [self.analog, self.rate, self.corner, self.snr, self.slope, self.curvature]

@@ -113,9 +113,10 @@ class BandLink:
         """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
         n = weights.shape[-1]
         rows = weights.reshape(*self.spatial.shape[:-2], -1, n)
-        # Two real products take half the time of one complex product.
+        # A real product takes half the time of a complex one.
+        parts = np.concatenate([rows.real, rows.imag], axis=-2) @ self.spatial
         result = np.empty(rows.shape, complex)
-        result.real, result.imag = rows.real @ self.spatial, rows.imag @ self.spatial
+        result.real, result.imag = np.split(parts, 2, axis=-2)
         return result.reshape(weights.shape)
 
     @staticmethod

@@ -20,7 +20,9 @@ _MAX_SUBBANDS = 16
 _N_STARTS = 256
 _N_DIRECT = 96
 # Number of configurations that are improved with the multipath, and that remain after each step.
-_N_KEPT = (24, 12, 6)
+_N_KEPT = (24, 12, 4)
+# Number of modes that decide which configurations are improved.
+_N_STRONGEST = 5
 # Number of configurations for the multipath alone, of their random starts and of steps.
 _N_SCATTERED = 8
 _N_SCATTERED_STARTS = 256
@@ -101,11 +103,13 @@ def candidate_configurations(
     analog = np.concatenate([
         _direct_configurations(tables, direct), tables.scattered[index],
         _matched(tables, direct)], axis=1)
-    waves = _Waves.at(paths, analog).best(_N_KEPT[0])
-    for n_kept in _N_KEPT:
+    # A first selection needs the strongest modes only.
+    strongest = np.ascontiguousarray(paths[..., :1 + _N_STRONGEST])
+    analog = _Waves.at(strongest, analog).best(_N_KEPT[0]).analog
+    waves = _Waves.at(paths, analog)
+    for n_kept in _N_KEPT[1:]:
         waves = _Waves.at(paths, waves.corner(paths, tables.fixed), waves.on_board)
-        if n_kept < waves.rate.shape[1]:
-            waves = waves[_best(waves.rate, n_kept)]
+        waves = waves[_best(waves.rate, n_kept)]
     return waves.best(n).analog.astype(float)
 
 
@@ -150,13 +154,16 @@ def _scattered_configurations(
         paths: np.ndarray, fixed: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
     """Search for configurations without a line of sight, from random waves in the air."""
     shape = (len(paths), _N_SCATTERED_STARTS, *paths.shape[2:])
-    on_board = rng.normal(size=(*shape[:-1], 1, 2)) @ [1, 1j]
-    in_air = rng.normal(size=(*shape[:-2], 1, shape[-1], 2)) @ [1, 1j]
-    analog = _corner((on_board * in_air).astype(np.complex64), paths, fixed)
-    waves = _Waves.at(paths, analog)
+    on_board = _complex_normal((*shape[:-1], 1), rng)
+    in_air = _complex_normal((*shape[:-2], 1, shape[-1]), rng)
+    waves = _Waves.at(paths, _corner(on_board * in_air, paths, fixed), on_board)
     for _ in range(_N_SCATTERED_STEPS):
         waves = _Waves.at(paths, waves.corner(paths, fixed), waves.on_board)
     return waves.best(_N_SCATTERED).analog
+
+
+def _complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    return rng.standard_normal((*shape, 2), np.float32).view(np.complex64)[..., 0]
 
 
 def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
@@ -213,14 +220,18 @@ class _Waves:
     @classmethod
     def at(cls, paths: np.ndarray, analog: np.ndarray,
            on_board: np.ndarray | None = None) -> '_Waves':
-        """Improve waves on the board, by default those for the line of sight, by a power step."""
+        """Improve waves on the board by a power step, or take those for the line of sight."""
         n_bands, n_elements, *shape = paths.shape
         channels = (analog @ paths.reshape(n_bands, n_elements, -1).view(np.float32)).view(
             np.complex64).reshape(n_bands, -1, *shape)
-        conjugate = np.conj(np.swapaxes(channels, -1, -2))
-        on_board = channels @ (conjugate @ (channels[..., :1] if on_board is None else on_board))
-        on_board /= np.linalg.norm(on_board, axis=-2, keepdims=True) + np.float32(_MIN_NORM)
-        in_air = np.conj(np.swapaxes(on_board, -1, -2)) @ channels
+        if on_board is None:
+            on_board = channels[..., :1]
+        else:
+            on_board = channels @ (np.conj(np.swapaxes(channels, -1, -2)) @ on_board)
+        on_board = on_board / (np.linalg.norm(on_board, axis=-2, keepdims=True)
+                               + np.float32(_MIN_NORM))
+        # Faster than a product of many small matrices.
+        in_air = np.sum(np.conj(on_board) * channels, axis=-2, keepdims=True)
         parts = in_air.view(np.float32)
         snr = np.einsum('bsjkl,bsjkl->bsj', parts, parts)
         in_air /= (1 + snr)[..., None, None]

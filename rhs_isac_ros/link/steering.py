@@ -14,8 +14,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import one_blas_thread
 
-# Number of candidates to compare over all modes, and of ascents.
-_N_CANDIDATES = 4
+# Number of ascents in each band.
 _N_ASCENTS = 2
 # An ascent ignores drifts of the phases between sub-bands below this, unless that takes more
 # sub-bands than the limit.
@@ -76,9 +75,9 @@ def _steer(scenario: Scenario, position: np.ndarray, bands: Sequence[int],
             raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
     link = BandLink.to(scenario, position, bands, surface)
     starts = candidate_configurations(
-        tables(scenario, surface), link, band_index(bands), _N_CANDIDATES)
+        tables(scenario, surface), link, band_index(bands), _N_ASCENTS)
     subbands = representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
-    ends, rates = ascend(link.at_subbands(subbands), starts, _N_ASCENTS)
+    ends, rates = ascend(link.at_subbands(subbands), starts)
     best = ends[np.arange(len(ends)), rates.argmax(axis=1)]
     digital = link.best_digital(best[:, None])[:, 0]
     return [Beam(*parts) for parts in zip(best, digital, bands, strict=True)]
