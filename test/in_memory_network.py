@@ -306,9 +306,12 @@ class Network:
                     self.dispatch(name, message)
 
     def run_cycles(self, n: int, limit_s: float = 60.0) -> None:
-        """Run until `n` more cycles have ended, with or without service."""
+        """Run until `n` more cycles have ended, with or without service, and been reported."""
         wanted = len(self._ends) + n
         self.run(lambda: len(self._ends) >= wanted, limit_s)
+        for name, role in self._roles.items():
+            while isinstance(role, Transmission) and role.next_deadline() is not None:
+                self.dispatch(name, Timeout())
 
     def run_to(self, state, name: str = 'bs', limit_s: float = 60.0) -> None:
         self.run(lambda: self._roles[name].state is state, limit_s)

@@ -1,5 +1,6 @@
 """The transmission role, which steers a beam to the estimate and reports its capacity."""
 
+import collections
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -27,6 +28,7 @@ from rhs_isac_ros.protocol.events import (
     LogMessage,
     Send,
     SettingsOffered,
+    Timeout,
 )
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
@@ -37,6 +39,12 @@ from rhs_isac_ros.protocol.settings import TransmissionSettings
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
 # Number of cycles whose reports may still arrive.
 _MAX_REMEMBERED = 8
+# Time without messages of a cycle after which the role computes a report [s]. In a process with
+# other roles, the rest of the cycle then comes first.
+_IDLE_S = 5e-3
+# Longest time by which such messages postpone a report [s], and number of postponed reports.
+_MAX_DELAY_S = 0.25
+_MAX_WAITING = 8
 
 
 class _Steered(NamedTuple):
@@ -49,10 +57,20 @@ class _Steered(NamedTuple):
     surface: SurfaceEstimate | None
 
 
+class _Waiting(NamedTuple):
+    """A report to compute: the beam applied in a cycle, the true position, and the last time."""
+
+    steered: _Steered
+    applied: m.RhsConfiguration
+    truth: m.GroundTruth | None
+    deadline_s: float
+
+
 class Transmission(PlainRole):
     """The role that steers the beam.
 
-    The true position affects only the reported capacities, never the beam.
+    The true position affects only the reported capacities, never the beam. As a report takes as
+    long as a beam, the role computes it when no message of a cycle has arrived for a while.
 
     Parameters
     ----------
@@ -77,11 +95,20 @@ class Transmission(PlainRole):
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
             _MAX_REMEMBERED)
         self._counted: NewestDict[int, None] = NewestDict(_MAX_REMEMBERED)
+        self._waiting: collections.deque[_Waiting] = collections.deque()
+        self._active_s = -math.inf
         self._quartiles = RunningQuartiles(len(_FIGURES))
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
         """Process an event and return the beam, or the capacity and its statistics."""
+        if isinstance(event, m.GroundTruth | m.PositionEstimate | m.RhsConfiguration) and (
+                event.cycle_id):
+            self._active_s = now_s
         match event:
+            case Timeout() if self._waiting:
+                # Messages that have arrived meanwhile precede the next report.
+                self._active_s = now_s
+                return self._report(self._waiting.popleft())
             case CodebookOffered(codebook):
                 self._codebooks.put(codebook.id, None)
                 return [LogMessage(f'serving: codebook {codebook.id}')]
@@ -96,8 +123,16 @@ class Transmission(PlainRole):
             case m.PositionEstimate():
                 return self._steer(event)
             case m.RhsConfiguration(mode=m.Mode.TRANSMISSION):
-                return self._report(event)
+                self._await_report(event, now_s)
+                if len(self._waiting) > _MAX_WAITING:
+                    return self._report(self._waiting.popleft())
         return []
+
+    def next_deadline(self) -> float | None:
+        """Return when the next report is due [s], or None."""
+        if not self._waiting:
+            return None
+        return min(self._active_s + _IDLE_S, self._waiting[0].deadline_s)
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use."""
@@ -134,20 +169,21 @@ class Transmission(PlainRole):
             estimate.cycle_id, _Steered(estimate, sent, at_estimate_bps, bands, surface))
         return [Send(sent)]
 
-    def _report(self, applied: m.RhsConfiguration) -> list[Action]:
+    def _await_report(self, applied: m.RhsConfiguration, now_s: float) -> None:
         steered = self._steered.get(applied.cycle_id)
         if steered is None:
             self.count(outcomes.Outcome.WRONG_CYCLE)
-            return []
-        beam = steered.beam
-        if applied.codebook_id != beam.codebook_id:
+        elif applied.codebook_id != steered.beam.codebook_id:
             self.count(outcomes.Outcome.WRONG_CODEBOOK)
-            return []
-        if applied.band != beam.band:
+        elif applied.band != steered.beam.band:
             self.count(outcomes.Outcome.WRONG_BAND)
-            return []
-        truth = self._truth_of(steered.estimate)
-        result = CapacityReport(math.nan, math.nan)
+        else:
+            self._waiting.append(_Waiting(
+                steered, applied, self._truth_of(steered.estimate), now_s + _MAX_DELAY_S))
+
+    def _report(self, waiting: _Waiting) -> list[Action]:
+        steered, applied, truth, _ = waiting
+        beam, result = steered.beam, CapacityReport(math.nan, math.nan)
         if truth:
             used = Beam(applied.analog[0], beam.digital, beam.band)
             result = capacity_report(

@@ -34,8 +34,8 @@ def test_the_messages_of_a_cycle_follow_the_order_of_the_protocol(network):
         assert [type(s) for s in sent if not isinstance(s, BESIDES)] == OF_A_CYCLE
         besides = [s for s in sent if isinstance(s, BESIDES)]
         assert [type(s) for s in besides] == [
-            m.ProtocolState, m.GroundTruth, m.ProtocolState, m.Capacity,
-            m.CapacityStatistics, m.ProtocolState, m.ProtocolState]
+            m.ProtocolState, m.GroundTruth, m.ProtocolState, m.ProtocolState, m.ProtocolState,
+            m.Capacity, m.CapacityStatistics]
         assert [s.phase for s in besides if isinstance(s, m.ProtocolState)] == [
             m.Phase.POSITIONING, m.Phase.ESTIMATING, m.Phase.TRANSMITTING, m.Phase.BEACONING]
     assert net.outcomes() == [(1, 1, 'served'), (2, 1, 'served'), (3, 1, 'served')]

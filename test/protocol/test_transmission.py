@@ -13,6 +13,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
     SettingsOffered,
+    Timeout,
 )
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
@@ -66,7 +67,7 @@ def test_the_transmission_reports_the_capacity_of_the_applied_beam(
     weaker = m.RhsConfiguration(
         cycle_id=3, mode=m.Mode.TRANSMISSION, band=beam.band, codebook_id=beam.codebook_id,
         analog=beam.analog[None] / 2)
-    (_, (report, _)) = feed(transmission, [truth, weaker])
+    (*_, (report, _)) = feed(transmission, [truth, weaker, Timeout()])
     used = Beam(beam.analog / 2, beam.digital)
     assert report.actual_bps == pytest.approx(capacity(scenario, used, PLACE[None])[0])
     assert report.actual_bps < report.perfect_bps
@@ -83,7 +84,7 @@ def test_no_beam_exceeds_the_perfect_one(transmission, scenario, codebooks, exam
         ((beam,),) = feed(transmission, [estimate])
         truth = m.GroundTruth(cycle_id=cycle_id, user=1, position=place, velocity=np.zeros(3))
         applied = configured(beam)
-        (_, (report, _)) = feed(transmission, [truth, applied])
+        (*_, (report, _)) = feed(transmission, [truth, applied, Timeout()])
         assert -0.05 <= report.loss_percent < 100
 
 
@@ -93,7 +94,7 @@ def test_the_position_of_another_cycle_or_user_is_not_used(
     truth = example(m.GroundTruth, **{'cycle_id': 3, 'user': 1} | other)
     ((beam,), _) = feed(transmission, [estimate, truth])
     applied = configured(beam)
-    ((report,),) = feed(transmission, [applied])
+    (_, (report,)) = feed(transmission, [applied, Timeout()])
     assert math.isnan(report.actual_bps)
     assert math.isnan(report.perfect_bps)
     assert report.expected_bps == beam.expected_bps
@@ -128,7 +129,7 @@ def test_late_messages_of_an_older_cycle_do_not_replace_the_present_one(
     later = dataclasses.replace(estimate, cycle_id=4)
     place = dataclasses.replace(truth, cycle_id=4)
     ((beam,), *_) = feed(transmission, [later, place, estimate, truth])
-    ((report, _),) = feed(transmission, [configured(beam)])
+    (_, (report, _)) = feed(transmission, [configured(beam), Timeout()])
     assert report.cycle_id == 4
     assert math.isfinite(report.actual_bps)
     assert transmission.counters == {}
@@ -145,7 +146,7 @@ def reported(transmission, scenario, example, codebook, places, cycle_id=1):
             cycle_id=n, mode=m.Mode.TRANSMISSION, band=beam.band, codebook_id=codebook.id,
             analog=beam.analog[None])
         sent.append(feed(transmission, [m.GroundTruth(
-            cycle_id=n, user=1, position=place, velocity=np.zeros(3)), applied])[1])
+            cycle_id=n, user=1, position=place, velocity=np.zeros(3)), applied, Timeout()])[2])
     return sent
 
 
@@ -169,7 +170,7 @@ def test_a_repeated_report_is_counted_once(transmission, scenario, example, code
     applied = m.RhsConfiguration(
         cycle_id=1, mode=m.Mode.TRANSMISSION, band=report.band, codebook_id=report.codebook_id,
         analog=np.ones((1, 16)))
-    ((again,),) = feed(transmission, [applied])
+    (_, (again,)) = feed(transmission, [applied, Timeout()])
     assert isinstance(again, m.Capacity)
     ((_, statistics),) = reported(
         transmission, scenario, example, codebooks[0], [place], cycle_id=2)
@@ -179,7 +180,7 @@ def test_a_repeated_report_is_counted_once(transmission, scenario, example, code
 def test_without_a_true_position_there_are_no_statistics(transmission, estimate):
     ((beam,),) = feed(transmission, [estimate])
     applied = configured(beam)
-    ((report,),) = feed(transmission, [applied])
+    (_, (report,)) = feed(transmission, [applied, Timeout()])
     assert isinstance(report, m.Capacity)
 
 
@@ -202,7 +203,7 @@ def test_the_perfect_beam_is_chosen_from_the_same_bands(
         role = Transmission(scenario, TransmissionSettings(band))
         (_, (beam,)) = feed(role, [CodebookOffered(codebooks[0]), estimate])
         applied = configured(beam)
-        (_, (report, _)) = feed(role, [truth, applied])
+        (*_, (report, _)) = feed(role, [truth, applied, Timeout()])
         bands = range(2) if band < 0 else [band]
         assert report.perfect_bps == pytest.approx(max(
             capacity(scenario, steer(scenario, PLACE, b), PLACE[None])[0] for b in bands))
@@ -225,10 +226,56 @@ def test_a_cycle_keeps_its_bands_when_the_settings_change(
         LogMessage("settings applied: band '0'")]
     assert role.status()['parameter.band'] == '0'
     moved = dataclasses.replace(estimate, position=estimate.position + 0.1)
-    (again,), (other,), _, (report, _) = feed(role, [estimate, moved, truth, configured(beam)])
+    (again,), (other,), *_, (report, _) = feed(
+        role, [estimate, moved, truth, configured(beam), Timeout()])
     assert again is beam
     assert other.band == 1
     assert report.perfect_bps == pytest.approx(
         capacity(scenario, steer(scenario, PLACE, 1), PLACE[None])[0])
     ((new,),) = feed(role, [dataclasses.replace(estimate, cycle_id=4)])
     assert (new.cycle_id, new.band) == (4, 0)
+
+
+def test_a_report_waits_until_no_message_of_a_cycle_arrives(transmission, estimate, truth):
+    """The beam of the next cycle is not delayed by the report of the last one."""
+    (beam,) = (action.message for action in transmission.handle(estimate, 0.0))
+    transmission.handle(truth, 0.1)
+    assert transmission.next_deadline() is None
+    assert transmission.handle(configured(beam), 0.2) == []
+    assert transmission.next_deadline() == pytest.approx(0.205)
+    later = dataclasses.replace(estimate, cycle_id=4)
+    (answer,) = transmission.handle(later, 0.204)
+    assert isinstance(answer.message, m.Beam)
+    assert transmission.next_deadline() == pytest.approx(0.209)
+    report, statistics = transmission.handle(Timeout(), 0.21)
+    assert (report.message.cycle_id, statistics.message.n_reports) == (3, 1)
+    assert transmission.next_deadline() is None
+
+
+def test_messages_without_a_pause_do_not_postpone_a_report_for_ever(
+        transmission, estimate, truth):
+    (beam,) = (action.message for action in transmission.handle(estimate, 0.0))
+    transmission.handle(configured(beam), 0.0)
+    for n in range(1, 100):
+        transmission.handle(dataclasses.replace(truth, cycle_id=4 + n), n * 4e-3)
+    assert transmission.next_deadline() == pytest.approx(0.25)
+
+
+def test_the_next_report_waits_for_messages_that_arrived_during_the_last_one(
+        transmission, estimate):
+    (beam,) = (action.message for action in transmission.handle(estimate, 0.0))
+    for _ in range(2):
+        transmission.handle(configured(beam), 0.0)
+    assert len(transmission.handle(Timeout(), 0.005)) == 1
+    assert transmission.next_deadline() == pytest.approx(0.01)
+    assert len(transmission.handle(Timeout(), 0.01)) == 1
+    assert transmission.handle(Timeout(), 0.02) == []
+
+
+def test_every_report_is_sent(transmission, estimate):
+    """When too many wait, the oldest one is computed at once."""
+    (beam,) = (action.message for action in transmission.handle(estimate, 0.0))
+    sent = [transmission.handle(configured(beam), 0.0) for _ in range(20)]
+    while transmission.next_deadline() is not None:
+        sent.append(transmission.handle(Timeout(), 1.0))
+    assert sum(len(actions) for actions in sent) == 20
