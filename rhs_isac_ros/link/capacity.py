@@ -50,7 +50,8 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
     ValueError
         If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
     """
-    return capacities(scenario, [beam], positions)[0]
+    (rates,) = capacities(scenario, [beam], positions)
+    return np.asarray(rates)
 
 
 def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray) -> np.ndarray:

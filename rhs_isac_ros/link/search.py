@@ -20,7 +20,7 @@ _MAX_SUBBANDS = 16
 _N_STARTS = 256
 _N_DIRECT = 96
 # Number of configurations that are improved with the multipath, and that remain after each step.
-_N_KEPT = (24, 12, 4)
+_N_KEPT = (24, 12, 8)
 # Number of modes that decide which configurations are improved.
 _N_STRONGEST = 5
 # Number of configurations for the multipath alone, of their random starts and of steps.
@@ -69,7 +69,7 @@ class Tables:
 
 
 def candidate_configurations(
-        tables: Tables, link: BandLink, index: slice | list[int], n: int) -> np.ndarray:
+        tables: Tables, link: BandLink, index: int | slice | list[int], n: int) -> np.ndarray:
     """Find configurations of high capacity, float64 [N_B, n, N_E], each entry 0 or 1.
 
     By the holographic principle, a configuration enables those elements at which a wave on the
@@ -116,7 +116,7 @@ def candidate_configurations(
 @functools.lru_cache(maxsize=16)
 def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     """Compute the tables for a scenario and a calibrated surface."""
-    onboard, spatial, fixed = band_link.arrays(scenario, surface)
+    onboard, spatial, failed = band_link.arrays(scenario, surface)
     subbands = band_link.representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
     on_board = np.moveaxis(onboard[:, subbands], -1, 1)
     modes = _modes(spatial)
@@ -128,7 +128,7 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     # Each start begins with a single sub-band.
     starts[np.arange(_N_STARTS), np.arange(_N_STARTS) % n_subbands] = rng.normal(
         size=(_N_STARTS, 2 * n_feeds))
-    fixed = fixed if fixed.any() else None
+    fixed = failed if failed.any() else None
     peaks = np.abs(paths).sum(axis=1).max(axis=(1, 2, 3)).astype(float) + _MIN_NORM
     scaled = paths * (_AMPLITUDES[1] / peaks)[:, None, None, None, None].astype(np.float32)
     return Tables(

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link.band_link import BandLink
+from rhs_isac_ros.link.band_link import BandLink, representative_subbands
+from rhs_isac_ros.model import Scenario
 
 POSITION = np.array([8.0, -2.0, 0.5])
 
@@ -39,18 +40,47 @@ def test_scatter_multiplies_by_the_covariance(table1):
         atol=1e-9 * np.abs(link.spatial).max())
 
 
-def test_the_modes_contain_nearly_all_of_the_multipath_power(table1):
-    for band in range(2):
-        link = BandLink.to(table1.scenario, POSITION, band)
-        assert link.modes.shape[1] < 20
-        rest = link.spatial - link.modes @ link.modes.T
-        values = np.linalg.eigvalsh(rest)
-        assert values[0] > -1e-9 * np.trace(link.spatial)
-        assert 0 < np.trace(rest) <= 0.02 * np.trace(link.spatial)
+def test_links_in_several_bands_are_those_of_each_band(table1):
+    bands = [1, 0]
+    links = BandLink.to(table1.scenario, POSITION, bands)
+    analog = np.random.default_rng(0).uniform(size=(2, 3, 100))
+    for found, band, configurations in zip(range(2), bands, analog, strict=True):
+        single = BandLink.to(table1.scenario, POSITION, band)
+        np.testing.assert_allclose(
+            links.best_rate(analog)[found], single.best_rate(configurations), rtol=1e-12)
+        np.testing.assert_allclose(
+            links.best_digital(analog)[found], single.best_digital(configurations), rtol=1e-8)
 
 
 def test_shared_arrays_are_read_only(table1):
     link = BandLink.to(table1.scenario, POSITION, 0)
-    for array in (link.onboard, link.spatial, link.modes):
+    for array in (link.onboard, link.spatial, link.fixed):
         with pytest.raises(ValueError, match='read-only'):
             array[0] = 0
+
+
+def test_a_sub_band_has_its_share_of_the_power(table1):
+    """Sub-bands hardly differ here, so that each one has an eighth of the rate."""
+    link, analog = BandLink.to(table1.scenario, POSITION, 0), np.ones(100)
+    part = link.at_subbands(np.array([4]))
+    assert part.los.shape == (1, 100)
+    assert 8 * part.best_rate(analog) == pytest.approx(link.best_rate(analog), rel=1e-4)
+
+
+@pytest.mark.parametrize(('width_hz', 'expected'), [(1e5, [1]), (4e8, [0, 1, 2])])
+def test_sub_bands_that_differ_are_represented_separately(width_hz, expected):
+    scenario = Scenario(n_subbands=3, subband_width_hz=width_hz)
+    np.testing.assert_array_equal(representative_subbands(scenario, 0.5, 8), expected)
+    assert len(representative_subbands(scenario, 0.5, 1)) == 1
+
+
+def test_phases_drift_little_between_representative_sub_bands():
+    scenario = Scenario(n_subbands=64, subband_width_hz=2e6)
+    chosen = representative_subbands(scenario, 1.0, 64)
+    assert 1 < len(chosen) < 16
+    for position in scenario.sample_positions(10, np.random.default_rng(0)):
+        link = BandLink.to(scenario, position, 0)
+        paths = link.onboard * link.los[:, None]
+        rotation = paths[chosen[1:]] * np.conj(paths[chosen[:-1]])
+        common = rotation.sum(axis=(1, 2), keepdims=True)
+        assert np.abs(np.angle(rotation * np.conj(common))).max() <= 1.0
