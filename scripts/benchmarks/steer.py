@@ -1,11 +1,12 @@
-"""Capacity that the beam search does not reach, and latency of the search.
+"""Capacity that the beam search does not reach, and its time, in all bands.
 
 Problem: the capacity has many local maxima. A position error costs well under one per cent of it,
-so the loss can only be measured if the search finds nearly the global maximum everywhere. Three
-figures show this: the capacity relative to that of a long multi-start optimisation, which shares
-nothing with the search but the objective; the latency; and the most negative loss, which occurs
-if the beam for an estimate near the true position has a higher capacity there than the beam for
-that position itself.
+so the loss can only be measured if the search finds nearly the global maximum everywhere. Four
+figures show this: the capacity relative to that of a plain search, one band after the other, and
+the CPU time of both; the capacity relative to that of a long multi-start optimisation, which
+shares nothing with the search but the objective; and the most negative loss, which occurs if the
+beam for an estimate near the true position has a higher capacity there than the beam for that
+position itself.
 """
 
 import os
@@ -16,20 +17,24 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from parts.sequential_steering import steer_sequentially
 from scipy.optimize import minimize
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, steer
 from rhs_isac_ros.link.band_link import BandLink
+from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import ArgumentParser, input_file, integer, positive_int, seed
 from rhs_isac_ros.model.surface import matched_configuration
 
 # Standard deviations of the estimates around the true position [m].
 SPREADS_M = (0.01, 0.1, 0.3, 1.0, 3.0)
+# Covariance of the estimates for which times are measured [m^2].
+COVARIANCE_M2 = np.diag([0.9, 0.2, 0.12])**2
 # Ascents of the long optimisation that are refined element by element.
 REFINED = 5
 
@@ -40,8 +45,11 @@ def main() -> None:
         prog='scripts/benchmark steer', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--scenario', type=input_file, help='YAML file of the scenario')
-    parser.add_argument('--band', type=integer(0), default=0, help='index of the band')
-    parser.add_argument('--positions', type=positive_int, default=100, help='number of positions')
+    parser.add_argument('--band', type=integer(0), help='index of the band; all by default')
+    parser.add_argument('--positions', type=positive_int, default=300,
+                        help='positions for the times and the plain search')
+    parser.add_argument('--long', type=integer(0), default=100, metavar='POSITIONS',
+                        help='positions for the long optimisation, of those')
     parser.add_argument('--starts', type=positive_int, default=150,
                         help='random starts of the long optimisation per position')
     parser.add_argument('--pairs', type=positive_int, default=2000,
@@ -49,14 +57,71 @@ def main() -> None:
     parser.add_argument('--seed', type=seed, default=1, help='seed of all random numbers')
     options = parser.parse_args()
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
-    if options.band >= scenario.n_bands:
+    bands = range(scenario.n_bands) if options.band is None else [options.band]
+    if bands[-1] >= scenario.n_bands:
         parser.error(f'argument --band: {options.band}, expected at most {scenario.n_bands - 1}')
     rng = np.random.default_rng(options.seed)
     positions = scenario.sample_positions(options.positions, rng)
-    print(f'{options.positions} positions, band {options.band}, seed {options.seed}')
-    found = compare_with_long(scenario, options.band, positions, options.starts, rng)
-    compare_with_matched(scenario, options.band, positions, found)
-    compare_with_estimates(scenario, options.band, options.pairs, rng)
+    print(f'{len(positions)} positions, seed {options.seed}')
+    compare_times(scenario, bands, positions)
+    for band in bands:
+        print(f'band {band}')
+        found = compare_with_plain(scenario, band, positions)
+        compare_with_matched(scenario, band, positions, found)
+        n_long = min(options.long, len(positions))
+        if n_long:
+            compare_with_long(scenario, band, positions[:n_long], found, options.starts, rng)
+        compare_with_estimates(scenario, band, options.pairs, rng)
+
+
+def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarray) -> None:
+    """Print the CPU times of the choice of a beam and of its parts, and those of a plain search.
+
+    The calls alternate, so that the load of the machine affects all of them.
+    """
+    def plain(position: np.ndarray) -> None:
+        for band in bands:
+            expected_capacity(
+                scenario, steer_sequentially(scenario, position, band), position, COVARIANCE_M2)
+
+    calls = {
+        'choice of the band': lambda position: choose_beam(
+            scenario, position, COVARIANCE_M2, bands),
+        'beams alone': lambda position: steer_bands(scenario, position, bands),
+        'plain search': plain,
+    }
+    times_s = {name: [] for name in calls}
+    for call in calls.values():
+        call(positions[0])
+    for position in positions:
+        for name, call in calls.items():
+            begin_s = time.process_time()
+            call(position)
+            times_s[name].append(time.process_time() - begin_s)
+    print(f'CPU time for {len(bands)} bands')
+    for name, values in times_s.items():
+        print(f'  {name:22}   {1e3 * np.median(values):.2f} ms median, '
+              f'{1e3 * np.quantile(values, 0.95):.2f} ms 95th percentile')
+    ratio = np.median(times_s['plain search']) / np.median(times_s['choice of the band'])
+    print(f'  {"ratio":22}   {ratio:.1f}, plain search over choice of the band')
+
+
+def compare_with_plain(scenario: Scenario, band: int, positions: np.ndarray) -> np.ndarray:
+    """Print the capacity relative to a plain search; return the capacities [bit/s]."""
+    found = [rate_bps(scenario, steer(scenario, position, band), position)
+             for position in positions]
+    plain = [rate_bps(scenario, steer_sequentially(scenario, position, band), position)
+             for position in positions]
+    print_share('plain search', 100 * np.divide(found, plain))
+    print(f'capacity                   {np.median(found) / 1e6:.2f} Mbit/s median')
+    return np.array(found)
+
+
+def print_share(of: str, share: np.ndarray) -> None:
+    """Print statistics of capacities relative to others [per cent]."""
+    print(f'share of the {of:13} {share.min():.4f} % minimum, {np.median(share):.4f} % '
+          f'median, {share.mean():.4f} % mean of {len(share)}; {np.sum(share > 100.0001)} times '
+          'above it')
 
 
 def rate_bps(scenario: Scenario, beam: Beam, position: np.ndarray) -> float:
@@ -65,27 +130,16 @@ def rate_bps(scenario: Scenario, beam: Beam, position: np.ndarray) -> float:
 
 
 def compare_with_long(
-        scenario: Scenario, band: int, positions: np.ndarray, n_starts: int,
-        rng: np.random.Generator) -> np.ndarray:
-    """Print relative capacity and latency; return the capacities of the search [bit/s]."""
-    steer(scenario, positions[0], band)
-    found, best, times_s, long_s = [], [], [], []
+        scenario: Scenario, band: int, positions: np.ndarray, found: np.ndarray, n_starts: int,
+        rng: np.random.Generator) -> None:
+    """Print the capacity of the search relative to the long optimisation."""
+    best, long_s = [], []
     for position in positions:
-        begin = time.perf_counter()
-        beam = steer(scenario, position, band)
-        times_s.append(time.perf_counter() - begin)
-        found.append(rate_bps(scenario, beam, position))
-        begin = time.perf_counter()
+        begin = time.process_time()
         best.append(long_optimisation(scenario, band, position, n_starts, rng))
-        long_s.append(time.perf_counter() - begin)
-    share = 100 * np.divide(found, best)
-    print(f'share of the long optimum  {share.min():.4f} % minimum, {np.median(share):.4f} % '
-          f'median, {share.mean():.4f} % mean; {np.sum(share > 100.0001)} times above it')
-    print(f'capacity                   {np.median(found) / 1e6:.2f} Mbit/s median')
-    print(f'latency                    {1e3 * np.median(times_s):.2f} ms median, '
-          f'{1e3 * np.quantile(times_s, 0.95):.2f} ms 95th percentile; the long optimisation '
-          f'{np.median(long_s):.1f} s')
-    return np.array(found)
+        long_s.append(time.process_time() - begin)
+    print_share('long optimum', 100 * found[:len(best)] / best)
+    print(f'CPU time of the long optimisation {np.median(long_s):.1f} s')
 
 
 def long_optimisation(
