@@ -1,32 +1,24 @@
 """The scene of a network as markers for RViz, in metres in the frame ``map``."""
 
-import colorsys
 from collections.abc import Iterable
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
 from nav_msgs.msg import Path
-from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
 from rhs_isac_ros.link import BeamPattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions
+from rhs_isac_ros.monitoring.scene_shapes import ellipsoid_95, lobe_m, user_colour
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.topics import MAP_FRAME
 
-# Quantile of the squared distance that contains 95 % of a three-dimensional Gaussian.
-_CHI_SQUARE_95 = float(chdtri(3, 0.05))
 _USER_SIZE_M = 0.25
 # RViz rejects bodies without extent [m].
 _MIN_EXTENT_M = 1e-3
-# Level relative to the maximum of a beam at which a lobe has zero length.
-MIN_LEVEL_DB = -20.0
-# The hues of consecutive users differ by the golden ratio.
-_HUE_STEP = 0.618034
 
 
 def board(scenario: Scenario, configuration: np.ndarray | None, stamp: Time) -> Marker:
@@ -72,32 +64,14 @@ def estimate(message: m.PositionEstimate, stamp: Time) -> Marker:
 
     The ellipsoid contains 95 % of a Gaussian with the mean and covariance of the estimate.
     """
-    variances_m2, axes = np.linalg.eigh(message.covariance_m2)
-    # The eigenvectors may form a reflection; a quaternion needs a rotation.
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
-    x, y, z, w = Rotation.from_matrix(axes).as_quat().tolist()
+    half_m, quaternion = ellipsoid_95(message.covariance_m2)
+    x, y, z, w = quaternion.tolist()
     marker = _marker('estimate', message.user, Marker.SPHERE, stamp)
     marker.pose.position = _point(message.position)
     marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
-    diameters_m = 2 * np.sqrt(_CHI_SQUARE_95 * np.maximum(variances_m2, 0.0))
-    marker.scale = _vector(np.maximum(diameters_m, _MIN_EXTENT_M))
+    marker.scale = _vector(np.maximum(2 * half_m, _MIN_EXTENT_M))
     marker.color = _colour(message.user, 0.35)
     return marker
-
-
-def lobe_m(pattern: BeamPattern) -> np.ndarray:
-    """Return a beam pattern as a surface whose radius is proportional to the level in decibels.
-
-    Returns
-    -------
-    numpy.ndarray
-        Points of the surface, float64 [n_el, n_az, 3] [m].
-    """
-    floor = 10**(MIN_LEVEL_DB / 10)
-    level_db = 10 * np.log10(np.maximum(pattern.relative, floor))
-    radius_m: np.ndarray = pattern.distance_m * (1 - level_db / MIN_LEVEL_DB)
-    points_m: np.ndarray = radius_m[..., None] * pattern.directions
-    return points_m
 
 
 def beam(pattern: BeamPattern, user: int, stamp: Time) -> Marker:
@@ -140,7 +114,7 @@ def _marker(namespace: str, number: int, kind: int, stamp: Time) -> Marker:
 
 
 def _colour(user: int, opacity: float) -> ColorRGBA:
-    red, green, blue = colorsys.hsv_to_rgb(_HUE_STEP * user % 1.0, 0.8, 0.9)
+    red, green, blue = user_colour(user)
     return ColorRGBA(r=red, g=green, b=blue, a=opacity)
 
 

@@ -10,10 +10,10 @@ from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.files import write_picture
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions, feed_positions
+from rhs_isac_ros.monitoring.scene_shapes import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
 from rhs_isac_ros.protocol.messages import Mode
-from rhs_isac_ros.ros.markers import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.tools.ellipses import ellipse_95
 
 _FIGURE_SIZE_IN = (14.0, 9.6)

@@ -5,7 +5,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from visualization_msgs.msg import Marker
 
-from rhs_isac_ros.link import BeamPattern, beam_pattern, steer
+from rhs_isac_ros.link import beam_pattern, steer
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.protocol import messages as m
@@ -87,14 +87,6 @@ def test_the_region_has_the_bounds_of_the_scenario(small):
     assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
     assert (marker.header.frame_id, marker.header.stamp) == ('map', STAMP)
     assert marker.pose.orientation.w == 1
-
-
-def test_the_radius_of_a_lobe_is_the_level_in_decibels():
-    """0 dB is at the distance of the pattern, -20 dB at the centre."""
-    directions = np.array([[[1.0, 0, 0], [0, 1, 0]], [[0, 0, 1], [0.6, 0.8, 0]]])
-    relative = np.array([[1.0, 0.1], [0.01, 0.0]])
-    points = markers.lobe_m(BeamPattern(directions, relative, 8.0))
-    assert points == pytest.approx(np.array([[[8, 0, 0], [0, 4, 0]], [[0, 0, 0], [0, 0, 0]]]))
 
 
 def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
