@@ -19,12 +19,13 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from rhs_isac_ros.ros.processes import MAX_USER_NODES
 
 PACKAGE = 'rhs_isac_ros'
 # A launch that receives SIGTERM does not end its processes, so the kernel does.
 END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 ARGUMENTS = {
-    'users': ('2', 'Number of users.'),
+    'users': ('2', 'Number of users; more than 16 share one process.'),
     'config': ('', 'Scenario file; empty: Table I of the paper.'),
     'codebook': ('', 'Codebook file that fits the scenario; empty: the default codebook.'),
     'seed': ('0', 'Seed of all random numbers.'),
@@ -82,14 +83,21 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             _node(given, 'transmission', 'transmission'),
             _node(given, 'optimizer', 'optimizer', **codebook),
             _node(given, 'channel', 'channel', **seed),
-            *(_node(given, 'user', f'user_{number}', user_id=number, **seed)
-              for number in range(1, users + 1)),
+            *_users(given, users, **seed),
             _node(given, 'bs', 'bs', **seed),
         ]
     if 'true' in (given['visualizer'], given['rviz']):
         nodes.append(_node(given, 'visualizer', 'visualizer'))
     # The recorder misses messages that precede its start and are not latched.
     return [*_recorder(given), *nodes, *_rviz(given)]
+
+
+def _users(given: dict[str, str], users: int, **values: int) -> list[Node]:
+    if users > MAX_USER_NODES:
+        return [LogInfo(msg=f'the {users} users share the node users'),
+                _node(given, 'user', 'users', user_id=1, user_count=users, **values)]
+    return [_node(given, 'user', f'user_{number}', user_id=number, **values)
+            for number in range(1, users + 1)]
 
 
 def _integer(name: str, given: dict[str, str], low: int) -> int:

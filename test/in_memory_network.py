@@ -193,8 +193,13 @@ class Network:
 
     def add_user(self, user: int, place, suffix: str = '') -> None:
         """Start a user; with the suffix ``_twin`` it may have the number of another one."""
-        moves, name = hasattr(place, 'state'), f'user{user}{suffix}'
-        self._mobilities[name] = place if moves else mobility.Static(place)
+        self.add_users({user: place}, f'user{user}{suffix}')
+
+    def add_users(self, places, name: str) -> None:
+        """Start a node with several users."""
+        self._mobilities[name] = {
+            user: place if hasattr(place, 'state') else mobility.Static(place)
+            for user, place in places.items()}
         self.add(name)
 
     def add(self, name: str) -> None:
@@ -399,7 +404,7 @@ class Network:
                 return BaseStation(scenario, self.settings, rng, self._receive, first)
             case 'user':
                 return user_role.User(
-                    int(name.removeprefix('user').removesuffix('_twin')), self._mobilities[name],
+                    self._mobilities[name],
                     user_role.timeouts(step_s, self._beacon_timeout_s), self.instances[name])
             case 'rhs_controller':
                 return RhsController()
@@ -477,6 +482,8 @@ def example(scenario):
     """Function that returns a message of a class with zeros or random numbers, or given values."""
     def make(kind: type[m.Message], rng: np.random.Generator | None = None, **given) -> m.Message:
         sizes, values = scenario.sizes, {}
+        if kind is m.GroundTruths:
+            given = {'users': np.array([1, 2])} | given
         fields = dataclasses.fields(kind)
         for field in fields:
             meta = field.metadata

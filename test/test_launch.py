@@ -93,9 +93,11 @@ def test_both_files_list_the_same_arguments():
     from launch.launch_description_sources import (
         get_launch_description_from_any_launch_file as load,
     )
+    module = load_python_file()
+    assert f'more than {module.MAX_USER_NODES} share' in module.ARGUMENTS['users'][1]
     python, xml = ({argument.name: argument.description for argument in load(
         str(ROOT / 'launch' / file)).get_launch_arguments()} for file in FILES)
-    assert python == xml and python.keys() == load_python_file().ARGUMENTS.keys()
+    assert python == xml and python.keys() == module.ARGUMENTS.keys()
 
 
 ONE_EACH = ['rhs_controller', 'positioner', 'transmission', 'optimizer', 'channel']
@@ -105,6 +107,8 @@ ONE_EACH = ['rhs_controller', 'positioner', 'transmission', 'optimizer', 'channe
 @pytest.mark.parametrize(('values', 'expected'), [
     ({}, [*ONE_EACH, 'user', 'user', 'bs']),
     ({'users': '1', 'record': 'run.mcap'}, ['record', *ONE_EACH, 'user', 'bs']),
+    ({'users': '16'}, [*ONE_EACH, *['user'] * 16, 'bs']),
+    ({'users': '1000'}, [*ONE_EACH, 'LogInfo', 'user', 'bs']),
     ({'composed': 'true'}, ['network']),
     ({'composed': 'true', 'visualizer': 'true'}, ['network', 'visualizer'])])
 def test_the_started_executables(values, expected):

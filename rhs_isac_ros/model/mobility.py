@@ -1,5 +1,6 @@
 """Movement of the users."""
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -77,6 +78,7 @@ class RandomWalk:
         self._origin = self._draw() if start is None else _checked_position(start)
         self._target = self._draw()
         self._departure_s: float | None = None
+        self._begin_leg()
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position [3] [m] and velocity [3] [m/s] on the current leg.
@@ -85,22 +87,22 @@ class RandomWalk:
         """
         if self._departure_s is None:
             self._departure_s = now_s
-        if self._speed_mps == 0:
-            return self._origin.copy(), np.zeros(3)
-        length = self._length()
-        while now_s - self._departure_s >= length / self._speed_mps:
-            self._departure_s += length / self._speed_mps
+        while now_s - self._departure_s >= self._duration_s:
+            self._departure_s += self._duration_s
             self._origin, self._target = self._target, self._draw()
-            length = self._length()
-        velocity = (self._target - self._origin) / length * self._speed_mps
-        return self._origin + velocity * (now_s - self._departure_s), velocity
+            self._begin_leg()
+        return self._origin + self._velocity * (now_s - self._departure_s), self._velocity.copy()
 
     def _draw(self) -> np.ndarray:
         position: np.ndarray = self._scenario.sample_positions(1, self._rng)[0]
         return position
 
-    def _length(self) -> float:
-        return float(np.linalg.norm(self._target - self._origin))
+    def _begin_leg(self) -> None:
+        """Store what is constant on a leg: a node may have many users that walk."""
+        leg = self._target - self._origin
+        length = float(np.linalg.norm(leg))
+        self._velocity = leg / length * self._speed_mps
+        self._duration_s = length / self._speed_mps if self._speed_mps else math.inf
 
 
 def make_plugin(

@@ -9,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.protocol import messages as m
 
 # Messages that the scene state needs.
-RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.PositionEstimate, m.Beam)
+RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.GroundTruths, m.PositionEstimate, m.Beam)
 # Maximum number of positions in a path, and minimum distance between consecutive true positions.
 _MAX_PATH_LENGTH = 200
 _MIN_STEP_M = 0.05
@@ -97,6 +97,9 @@ class SceneState:
                 self.beam, self._beam_s = message, now_s
             case m.GroundTruth():
                 self._updated_user(message.user, now_s).add_truth(message)
+            case m.GroundTruths():
+                for truth in message.each():
+                    self._updated_user(truth.user, now_s).add_truth(truth)
             case m.PositionEstimate():
                 self._updated_user(message.user, now_s).add_estimate(message)
 

@@ -13,6 +13,7 @@ from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros.processes import MAX_USER_NODES
 from rhs_isac_ros.ros.run import entry
 
 # All node classes except the users and ``network``, which only declares the parameter ``users``.
@@ -22,6 +23,8 @@ KINDS = (OptimizerNode, RhsControllerNode, ChannelNode, PositionerNode, Transmis
 def make_network() -> list[Node]:
     """Create all nodes, with users numbered from 1.
 
+    More than `MAX_USER_NODES` users share the node ``users``.
+
     Raises
     ------
     ParameterError
@@ -30,10 +33,14 @@ def make_network() -> list[Node]:
     head = Node('network')
     users = parameters.declare(head, 'network').users
     nodes = [head, *(kind() for kind in KINDS)]
-    for number in range(1, users + 1):
-        overrides = [Parameter('user_id', value=number)]
-        nodes.append(UserNode(f'user_{number}', parameter_overrides=overrides))
-    return nodes
+    if users > MAX_USER_NODES:
+        return [*nodes, _user_node('users', 1, users)]
+    return [*nodes, *(_user_node(f'user_{n}', n, 1) for n in range(1, users + 1))]
+
+
+def _user_node(name: str, first: int, count: int) -> UserNode:
+    return UserNode(name, parameter_overrides=[
+        Parameter('user_id', value=first), Parameter('user_count', value=count)])
 
 
 main = entry('network', make_network)

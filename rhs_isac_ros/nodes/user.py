@@ -1,4 +1,4 @@
-"""The executable ``user``: a user of the system."""
+"""The executable ``user``: one or many users of the system."""
 
 import sys
 from typing import Any
@@ -16,7 +16,7 @@ from rhs_isac_ros.ros.timers import steady_timer
 
 
 class UserNode(RoleNode[User]):
-    """A user of the network."""
+    """One or many users of the network."""
 
     is_unique = False
 
@@ -24,31 +24,41 @@ class UserNode(RoleNode[User]):
         super().__init__('user', name, **node_options)
         values = self.values
         self.start(User(
-            values.user_id, self._mobility(),
-            timeouts(values.step_timeout_s, values.beacon_timeout_s), self.instance))
+            self._mobilities(), timeouts(values.step_timeout_s, values.beacon_timeout_s),
+            self.instance))
         self._peers = PeerMonitor(
             self, REQUIRED_BY_USER, lambda missing: self.dispatch(PeersChanged(missing)))
         steady_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
 
-    def _mobility(self) -> mobility.Mobility:
+    def _mobilities(self) -> dict[int, mobility.Mobility]:
+        """Return the mobility of each user by id."""
+        values = self.values
+        count = values.user_count
+        starts = self._points('position_m')
+        if len(starts) not in (0, count):
+            one = 'one or none' if count == 1 else f'{count}, one for each user, or none'
+            raise ParameterError(f'position_m: {len(starts)} points, expected {one}')
+        if values.mobility == 'waypoints' and count > 1:
+            raise ParameterError(f'user_count: {count}, expected 1 with mobility waypoints')
+        return {values.user_id + n: self._mobility(
+            values.user_id + n, starts[n] if len(starts) else None) for n in range(count)}
+
+    def _mobility(self, user: int, position: np.ndarray | None) -> mobility.Mobility:
+        """Return the mobility of a user that starts at `position`; None: anywhere."""
         values = self.values
         is_moving = values.mobility != 'static'
         if is_moving and values.speed_mps > self.scenario.max_user_speed_mps:
             raise ParameterError(
                 f'speed_mps: {values.speed_mps}, expected at most max_user_speed_mps = '
                 f'{self.scenario.max_user_speed_mps:g} m/s of the scenario')
-        rng = streams.generator(values.seed, streams.USER, values.user_id)
-        start = self._points('position_m')
-        if len(start) > 1:
-            raise ParameterError(f'position_m: {len(start)} points, expected one or none')
+        rng = streams.generator(values.seed, streams.USER, user)
         if values.mobility == 'waypoints':
             waypoints = self._points('waypoints_m')
             if not len(waypoints):
                 raise ParameterError('waypoints_m: empty, expected x, y, z of the first point')
-            if len(start):
+            if position is not None:
                 raise ParameterError('position_m: given, expected none with mobility waypoints')
             return mobility.Waypoints(waypoints.tolist(), values.speed_mps)
-        position = start[0] if len(start) else None
         if values.mobility == 'random_walk':
             return mobility.RandomWalk(self.scenario, values.speed_mps, rng, position)
         if values.mobility == 'static':
@@ -56,7 +66,8 @@ class UserNode(RoleNode[User]):
                 self.scenario.sample_positions(1, rng)[0] if position is None else position)
         try:
             return mobility.make_plugin(
-                values.mobility, self.scenario, values.speed_mps, rng, position)
+                values.mobility, self.scenario, values.speed_mps, rng,
+                None if position is None else position.tolist())
         except plugins.PluginError as error:
             raise ParameterError(f'mobility: {error}') from None
 
@@ -77,7 +88,9 @@ class UserNode(RoleNode[User]):
         return points
 
     def _publish_ground_truth(self) -> None:
-        self.publish(self.role.ground_truth(self.now_s()))
+        role, now_s = self.role, self.now_s()
+        self.publish(role.ground_truths(now_s) if len(role.users) > 1
+                     else role.ground_truth(role.users[0], now_s))
 
 
 main = entry('user', lambda: [UserNode()])

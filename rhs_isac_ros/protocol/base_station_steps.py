@@ -141,15 +141,19 @@ class BaseStationSteps(BaseStationGuards):
         return self._beacon(now_s)
 
     def beacon_again(self, event: Timeout, now_s: float) -> list[Action]:
-        """Send another beacon of the cycle."""
+        """Send another beacon of the cycle, which invites more users if not all were invited."""
+        # If all users were invited, they may be absent for as long as the base station is alone.
+        lost = [] if self._users.all_invited else self._lose_absent(now_s)
         self._cycle.attempt += 1
-        return self._beacon(now_s)
+        return [*self._beacon(now_s), *lost]
 
     def _beacon(self, now_s: float) -> list[Action]:
         # Nothing in the cycle depends on the codebook before the grant.
         self._codebook = self._offered
         self._times.start(now_s)
-        return [Send(m.Beacon(cycle_id=self._cycle.id, attempt=self._cycle.attempt))]
+        first, last = self._users.invite(self._cycle.attempt)
+        return [Send(m.Beacon(cycle_id=self._cycle.id, attempt=self._cycle.attempt,
+                              first_user=first, last_user=last))]
 
     def count_ack(self, event: m.Ack, now_s: float) -> None:
         """Count an ack against the user's rate."""
@@ -175,16 +179,21 @@ class BaseStationSteps(BaseStationGuards):
 
     def grant(self, event: m.Ack | Timeout, now_s: float) -> list[Action]:
         """Grant the cycle to one of the users that answered."""
-        lost = self._users.remove_absent()
-        self.count(Outcome.USER_LOST, len(lost))
-        self._instances.forget(lost, now_s)
+        lost = self._lose_absent(now_s)
         cycle = self._cycle
         cycle.user = self._users.select()
         cycle.user_instance = self._instances.owner(cycle.user)
         cycle.band = -1
         return [Send(m.Grant(
             cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance)),
-                *self._outages.log_lost_users(lost)]
+                *lost]
+
+    def _lose_absent(self, now_s: float) -> list[Action]:
+        """Count the invited users that did not answer, and remove those that no longer do."""
+        lost = self._users.remove_absent()
+        self.count(Outcome.USER_LOST, len(lost))
+        self._instances.forget(lost, now_s)
+        return [*self._outages.log_lost_users(lost)]
 
     # Positioning
 

@@ -23,7 +23,7 @@ def array(
     dims
         Dimensions as numbers, or as symbols of `Scenario.sizes` or of `Message.own_sizes`.
     kind
-        ``float`` or ``complex``.
+        ``float``, ``complex`` or ``int``.
     low, high
         Range of the entries of a real array, inclusive.
     nan_allowed
@@ -39,9 +39,9 @@ def index(symbol: str) -> Any:
     return dataclasses.field(metadata={'index_of': symbol})
 
 
-def number(low: float, high: float) -> Any:
+def number(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
     """Declare a number with an inclusive range."""
-    return dataclasses.field(metadata={'low': low, 'high': high})
+    return dataclasses.field(default=default, metadata={'low': low, 'high': high})
 
 
 def size(symbol: str) -> Any:

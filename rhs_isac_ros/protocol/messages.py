@@ -2,7 +2,7 @@
 
 import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -89,9 +89,11 @@ def same(one: Message, other: Message) -> bool:
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Beacon(Message):
-    """Invitation from the base station to take part in a cycle."""
+    """Invitation from the base station to a range of users to take part in a cycle."""
 
     attempt: int
+    first_user: int = number(1, _LAST_USER, default=1)
+    last_user: int = number(1, _LAST_USER, default=_LAST_USER)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -253,6 +255,27 @@ class GroundTruth(Message):
     user: int = number(1, _LAST_USER)
     position: np.ndarray = array('3', low=-1e6, high=1e6)
     velocity: np.ndarray = array('3')
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class GroundTruths(Message):
+    """True positions of all users of one node."""
+
+    users: np.ndarray = array('USERS', int, low=1, high=_LAST_USER)
+    position: np.ndarray = array('USERS 3', low=-1e6, high=1e6)
+    velocity: np.ndarray = array('USERS 3')
+
+    def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """Return the number of users, USERS."""
+        return {'USERS': len(self.users)}
+
+    def each(self) -> Iterator[GroundTruth]:
+        """Yield the true position of each user."""
+        for user, position, velocity in zip(
+                self.users.tolist(), self.position, self.velocity, strict=True):
+            yield GroundTruth(
+                cycle_id=self.cycle_id, sender=self.sender, scenario_id=self.scenario_id,
+                user=user, position=position, velocity=velocity)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

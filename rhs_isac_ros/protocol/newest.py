@@ -1,5 +1,6 @@
 """Dictionaries of bounded size."""
 
+import itertools
 from typing import TypeVar
 
 Key = TypeVar('Key')
@@ -34,7 +35,10 @@ class NewestDict(dict[Key, Value]):
         """
         self.pop(key, None)
         self[key] = value
-        surplus = [known for known in self if known != pinned][:-self.max_size]
+        # Stops at the last entry to discard, because most calls discard none.
+        n_surplus = len(self) - (pinned in self) - self.max_size
+        surplus = list(itertools.islice(
+            (known for known in self if known != pinned), max(n_surplus, 0)))
         for known in surplus:
             del self[known]
         return len(surplus)

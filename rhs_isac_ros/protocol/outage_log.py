@@ -7,6 +7,8 @@ from rhs_isac_ros.protocol.outcomes import Outcome
 
 # The reason that concerns one user; all others concern the whole network.
 _USER_REASON = Outcome.USER_GONE.value
+# Maximum number of users that one message names.
+_MAX_NAMED = 8
 
 
 class OutageLog:
@@ -38,8 +40,15 @@ class OutageLog:
 
     @staticmethod
     def log_lost_users(users: Iterable[int]) -> list[LogMessage]:
-        """Return a warning for each user that stopped answering beacons."""
-        return [LogMessage(f'user {user} no longer answers', warning=True) for user in users]
+        """Return a warning about users that stopped answering beacons, if any."""
+        names = [str(user) for user in users]
+        if not names:
+            return []
+        shown = ', '.join(names[:_MAX_NAMED])
+        others = f' and {len(names) - _MAX_NAMED} others' if len(names) > _MAX_NAMED else ''
+        text = (f'users {shown}{others} no longer answer' if len(names) > 1
+                else f'user {shown} no longer answers')
+        return [LogMessage(text, warning=True)]
 
     def log_lost_cycle(self, cycle_id: int, user: int, reason: str) -> list[LogMessage]:
         """Return a warning about a cycle without service, unless its reason was logged before."""

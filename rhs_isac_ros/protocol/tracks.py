@@ -7,10 +7,7 @@ from rhs_isac_ros.positioning.search import SearchEstimator
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.newest import NewestDict
-
-# Number of users with a track: more than are located before the first tracks end by their gap. A
-# track takes up to 20 kB.
-_MAX_USERS = 4096
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
 
 @dataclasses.dataclass
@@ -39,7 +36,7 @@ class Tracks:
     """
 
     def __init__(self) -> None:
-        self._tracks: NewestDict[int, _Track] = NewestDict(_MAX_USERS)
+        self._tracks: NewestDict[int, _Track] = NewestDict(MAX_USERS)
 
     def __len__(self) -> int:
         """Return the number of tracks."""
@@ -81,9 +78,9 @@ class Tracks:
         return estimate
 
     def _end_old(self, now_s: float) -> None:
-        # The oldest tracks come first.
+        # The oldest track comes first.
         while self._tracks:
             user, track = next(iter(self._tracks.items()))
             if now_s <= track.time_s + MAX_GAP_S:
-                break
+                return
             del self._tracks[user]

@@ -1,14 +1,20 @@
 """The users that a base station waits for, and the order in which it serves them."""
 
+import bisect
 from collections.abc import Callable
 
 import numpy as np
 
 POLICIES = ('round_robin', 'first', 'random')
+# Maximum number of registered users, which bounds the memory whatever ids the acks contain.
+MAX_USERS = 4096
+LAST_NUMBER = 2**32 - 1
+# Number of registered users that the first beacon of a cycle invites, and the factor by which
+# each further beacon of the cycle extends it. All acks of a cycle take time, but one user is
+# served.
+INVITED, _EXTENSION = 8, 8
 # Number of consecutive beacons without an answer after which a user is removed.
 _MAX_MISSED = 3
-# Maximum number of registered users, which bounds the memory whatever ids the acks contain.
-_MAX_USERS = 1024
 
 
 class UserScheduler:
@@ -23,8 +29,10 @@ class UserScheduler:
 
     Attributes
     ----------
+    all_invited
+        Whether the latest beacon invited all users.
     answered
-        Users that answered in this cycle, in order.
+        Users that answered in this cycle, in order; the values have no meaning.
 
     Raises
     ------
@@ -40,8 +48,13 @@ class UserScheduler:
         self._served: dict[int, tuple[int, int]] = {}
         # By user: consecutive beacons without an answer.
         self._missed: dict[int, int] = {}
+        # The registered users in ascending order.
+        self._numbers: list[int] = []
+        # The registered users that were invited and have not answered yet.
+        self._awaited: set[int] = set()
         self._turn = 0
-        self.answered: list[int] = []
+        self.all_invited = True
+        self.answered: dict[int, None] = {}
 
     def set_policy(self, policy: str) -> None:
         """Change the policy; the turns of the users are kept.
@@ -56,29 +69,67 @@ class UserScheduler:
         self._policy = policy
 
     def begin_cycle(self) -> None:
-        """Clear the answers."""
-        self.answered = []
+        """Clear the answers, and wait for all registered users until `invite` is called."""
+        self.answered = {}
+        self.all_invited, self._awaited = True, set(self._missed)
+
+    def invite(self, attempt: int) -> tuple[int, int]:
+        """Choose the users to wait for, and return their first and last number.
+
+        The range contains the user whose turn it is. The ranges of all turns cover every number,
+        so that new users are invited within a round.
+
+        Parameters
+        ----------
+        attempt
+            Number of beacons of this cycle that nobody answered; each extends the range.
+        """
+        numbers, size = self._numbers, INVITED * _EXTENSION**min(attempt, 8)
+        self.all_invited = size >= len(numbers)
+        if self.all_invited:
+            self._awaited = set(numbers)
+            return 1, LAST_NUMBER
+        begin = bisect.bisect_left(numbers, self._next()) // size * size
+        invited = numbers[begin:begin + size]
+        self._awaited = set(invited)
+        return (numbers[begin - 1] + 1 if begin else 1,
+                invited[-1] if begin + size < len(numbers) else LAST_NUMBER)
+
+    def _next(self) -> int:
+        """Return the registered user whose turn it is."""
+        match self._policy:
+            case 'first':
+                return self._numbers[self._turn * INVITED % len(self._numbers)]
+            case 'random':
+                return int(self._rng.choice(self._numbers))
+        # Without a function of the user, because this is done in every cycle.
+        return min(zip(self._served.values(), self._served, strict=True))[1]
 
     def is_full_for(self, user: int) -> bool:
         """Return whether a user is new while the maximum number of users is registered."""
-        return user not in self._missed and len(self._missed) >= _MAX_USERS
+        return user not in self._missed and len(self._missed) >= MAX_USERS
 
     def register(self, user: int) -> None:
         """Wait for a user, without counting it among those that answered."""
         # A new user comes after all that wait and before the one served last, so that users that
         # leave and return do not gain turns.
-        self._served.setdefault(user, (self._turn, 0))
+        if user not in self._missed:
+            self._served[user] = self._turn, 0
+            bisect.insort(self._numbers, user)
         self._missed[user] = 0
 
     def add_answer(self, user: int) -> None:
         """Register a user as answering in this cycle."""
         self.register(user)
-        self.answered.append(user)
+        self._awaited.discard(user)
+        self.answered[user] = None
 
     def remove(self, user: int) -> None:
         """Stop waiting for a user until it answers again."""
-        self._missed.pop(user, None)
-        self._served.pop(user, None)
+        if self._missed.pop(user, None) is not None:
+            del self._served[user]
+            del self._numbers[bisect.bisect_left(self._numbers, user)]
+            self._awaited.discard(user)
 
     @property
     def n_users(self) -> int:
@@ -96,12 +147,15 @@ class UserScheduler:
         """Return whether no further answers are needed once `user` has answered."""
         if self._policy == 'first':
             return True
-        return self._missed.keys() <= {*self.answered, user}
+        return self._awaited <= {user}
 
     def remove_absent(self) -> list[int]:
-        """Count missed beacons; remove and return the users that missed too many in a row."""
+        """Count missed beacons; remove and return the users that missed too many in a row.
+
+        Beacons that do not invite a user do not count.
+        """
         lost = []
-        for user in sorted(self._missed.keys() - set(self.answered)):
+        for user in sorted(self._awaited):
             self._missed[user] += 1
             if self._missed[user] >= _MAX_MISSED:
                 self.remove(user)
@@ -111,9 +165,9 @@ class UserScheduler:
     def select(self) -> int:
         """Return the user to serve, one of those that answered."""
         if self._policy == 'first':
-            chosen = self.answered[0]
+            chosen = next(iter(self.answered))
         elif self._policy == 'random':
-            chosen = int(self._rng.choice(self.answered))
+            chosen = int(self._rng.choice(list(self.answered)))
         else:
             chosen = min(self.answered, key=lambda user: (self._served[user], user))
         self._turn += 1

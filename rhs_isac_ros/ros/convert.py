@@ -227,6 +227,10 @@ def _reshape(values: array.array[float], shape: array.array[int]) -> np.ndarray:
     return np.frombuffer(values).reshape(tuple(shape))
 
 
+def _encode_numbers(values: np.ndarray) -> array.array[int]:
+    return array.array('I', values.astype(np.uint32).tobytes())
+
+
 def _encode_vector(kind: Any, values: np.ndarray) -> Any:
     x, y, z = values.tolist()
     return kind(x=x, y=y, z=z)
@@ -242,6 +246,7 @@ _CODECS: dict[str, tuple[_Codec, _Codec]] = {
     'rhs_isac_msgs/ComplexArray': (_encode_complex, _decode_complex),
     'geometry_msgs/Point': (functools.partial(_encode_vector, Point), _decode_vector),
     'geometry_msgs/Vector3': (functools.partial(_encode_vector, Vector3), _decode_vector),
+    'sequence<uint32>': (_encode_numbers, functools.partial(np.asarray, dtype=int)),
     'double[3]': (np.ascontiguousarray, np.asarray),
     'double[4]': (np.ascontiguousarray, np.asarray),
     'double[9]': (np.ravel, lambda values: np.reshape(values, (3, 3))),

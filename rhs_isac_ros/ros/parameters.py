@@ -22,6 +22,7 @@ from rhs_isac_ros.protocol.settings import (
     PositionerSettings,
     TransmissionSettings,
 )
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros.parameter import Parameter, ParameterError
 
 if TYPE_CHECKING:
@@ -59,11 +60,15 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
     ),
     'user': (
         _SCENARIO, _SEED,
-        Parameter('user_id', 1, 'Id of the user.', low=1, high=2**31 - 1),
+        Parameter('user_id', 1, 'Id of the user, or the first of several.', low=1,
+                  high=2**31 - 1),
+        Parameter('user_count', 1, 'Number of users of the node, with consecutive ids.', low=1,
+                  high=MAX_USERS),
         Parameter('mobility', 'static', 'Mobility model.', choices=mobility.KINDS,
                   plugins=plugins.MOBILITIES),
         Parameter('position_m', [],
-                  'Initial position x, y, z; empty: a random point of the region of interest.',
+                  'Initial position x, y, z of each user; empty: random points of the region of '
+                  'interest.',
                   'm', -1e6, 1e6),
         Parameter('waypoints_m', [], 'Waypoints: x, y, z of each, in order.', 'm', -1e6, 1e6),
         Parameter('speed_mps', 1.0, 'Speed, at most max_user_speed_mps of the scenario.',
@@ -99,7 +104,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
                   0.1, 3600.0),
     ),
     'network': (
-        Parameter('users', 2, 'Number of users.', low=1, high=1000),
+        Parameter('users', 2, 'Number of users.', low=1, high=MAX_USERS),
     ),
 }
 

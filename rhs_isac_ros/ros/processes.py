@@ -15,6 +15,9 @@ from ament_index_python.packages import get_package_prefix
 
 from rhs_isac_ros.executables import PARENT_ID
 
+# Maximum number of users with nodes of their own, unless more are requested; more share one node,
+# because every beacon and every cycle wakes each node of a user.
+MAX_USER_NODES = 16
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
 _PROCESSES_PER_CORE = 40

@@ -10,11 +10,17 @@ from rclpy.qos import (
 )
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
 # For handshakes and signals, which must all arrive and are useless to late joiners. The depth
-# holds the pilots of a band, or simultaneous acks of many users.
+# holds the pilots of a band.
 EXCHANGE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+
+# For acks: all users answer the beacon of a base station to which they are new.
+ACKS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=MAX_USERS, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)
 
 # For the same messages, received by an observer of the whole network: its queue must hold those
@@ -44,5 +50,10 @@ _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
 def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSProfile:
-    """Return `LATCHED` for messages that represent a current value, otherwise `exchange`."""
+    """Return `LATCHED` for messages that represent a current value, otherwise `exchange`.
+
+    Acks need a deeper queue than `EXCHANGE`.
+    """
+    if kind is m.Ack and exchange is EXCHANGE:
+        return ACKS
     return LATCHED if kind in _LATCHED_MESSAGES else exchange

@@ -21,6 +21,7 @@ NAMES: Mapping[type[m.Message], str] = {
     m.Capacity: 'capacity',
     m.CapacityStatistics: 'capacity_statistics',
     m.GroundTruth: 'ground_truth',
+    m.GroundTruths: 'ground_truths',
     m.ProtocolState: 'protocol_state',
 }
 # Topics without a message of the protocol.

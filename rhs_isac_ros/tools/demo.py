@@ -30,7 +30,12 @@ from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.processes import Processes, max_processes, private_domain
+from rhs_isac_ros.ros.processes import (
+    MAX_USER_NODES,
+    Processes,
+    max_processes,
+    private_domain,
+)
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo_report import draw, summary, table
@@ -58,8 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     check_domain(parser)
-    check_users(parser, options.users,
-                f'scripts/run network --ros-args -p users:={options.users}')
+    together = options.users > min(MAX_USER_NODES, max_user_processes())
+    if together:
+        print(f'the {options.users} users share one process', file=sys.stderr)
     check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
                    {'--record': options.record, '--picture': options.picture})
     try:
@@ -86,7 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with processes:
                 start_network(
                     processes, options.users, options.seed, options.config, codebook_file,
-                    scenario, positioner=positioner_parameters(options.prior, scenario))
+                    scenario, together=together,
+                    positioner=positioner_parameters(options.prior, scenario))
                 problem = watch(observer, processes, options.cycles, _show_progress)
         except (KeyboardInterrupt, ExternalShutdownException):
             problem = ''
@@ -118,19 +125,17 @@ def positioner_parameters(prior: str, scenario: Scenario) -> dict[str, Any]:
     return {'prior': prior, 'track_speed_mps': max(scenario.max_user_speed_mps, 0.01)}
 
 
-def check_users(parser: argparse.ArgumentParser, users: int, instead: str = '') -> None:
-    """Exit with a usage error if a process for each user would overload this machine.
-
-    Parameters
-    ----------
-    instead
-        Arguments or a command that run more users in one process, for the message.
-    """
-    limit = max_processes() - _N_OTHERS
+def check_users(parser: argparse.ArgumentParser, users: int) -> None:
+    """Exit with a usage error if a process for each user would overload this machine."""
+    limit = max_user_processes()
     if users > limit:
-        parser.error(
-            f'argument --users: {users}, expected at most {limit} on this machine, because each '
-            'user is a process' + (f'; for more in one process: {instead}' if instead else ''))
+        parser.error(f'argument --users: {users}, expected at most {limit} on this machine, '
+                     'because each user is a process')
+
+
+def max_user_processes() -> int:
+    """Return the number of users that this machine can run as processes of their own."""
+    return max_processes() - _N_OTHERS
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
@@ -164,7 +169,7 @@ def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Pa
 def start_network(
         processes: Processes, users: int, seed: int, scenario_file: Path | None,
         codebook_file: Path, scenario: Scenario, rest_s: float = 0.1, first_cycle: int = 1,
-        impairments: Impairments | None = None,
+        impairments: Impairments | None = None, together: bool = False,
         positioner: Mapping[str, Any] | None = None) -> None:
     """Start each node of a network in a process of its own.
 
@@ -183,6 +188,8 @@ def start_network(
         numbers are derived from the clock, so that the base station can be restarted.
     impairments
         Impairments of signals and packets; by default none.
+    together
+        Whether the users share one node, named ``users``, instead of a node for each.
     positioner
         Further parameters of the positioner.
     """
@@ -195,9 +202,11 @@ def start_network(
     processes.start('optimizer', codebook_file=codebook_file, **common)
     impaired = dataclasses.asdict(impairments or Impairments())
     processes.start('channel', seed=seed, **impaired, **common)
-    for user in range(1, users + 1):
-        processes.start('user', f'user_{user}', user_id=user, seed=seed, mobility='random_walk',
-                        speed_mps=scenario.max_user_speed_mps, **common)
+    nodes = [('users', 1, users)] if together else [
+        (f'user_{user}', user, 1) for user in range(1, users + 1)]
+    for name, first, count in nodes:
+        processes.start('user', name, user_id=first, user_count=count, seed=seed,
+                        mobility='random_walk', speed_mps=scenario.max_user_speed_mps, **common)
     processes.start('bs', seed=seed, rest_s=rest_s, first_cycle=first_cycle, **common)
 
 

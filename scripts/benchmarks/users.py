@@ -1,8 +1,8 @@
 """Cycle rate and waiting times with few users and with many.
 
-Problem: all users answer every beacon, but only one is served. By how much do the other users slow
-the cycles down? The network runs twice, with few users and with many, and is compared with the
-hops of a cycle in bare rclpy, measured in the same run.
+Problem: a cycle serves one user. By how much do the others slow it down, as processes of their own
+or in one process? The networks are compared with one of few users and with the hops of a cycle in
+bare rclpy, measured in the same run.
 """
 
 import argparse
@@ -26,9 +26,11 @@ from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo import check_users, start_network
+from rhs_isac_ros.tools.demo import max_user_processes, start_network
 
 TIMEOUT_S = 600.0
+# Minimum number of measured cycles.
+MIN_CYCLES = 200
 
 
 def main() -> int:
@@ -37,58 +39,59 @@ def main() -> int:
         prog='scripts/benchmark users', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--few', type=positive_int, default=2,
-                        help='number of users in the first run')
-    parser.add_argument('--users', type=positive_int, default=64,
-                        help='number of users in the second run')
-    parser.add_argument('--rounds', type=positive_int, default=5, help='cycles for each user')
-    parser.add_argument('--composed', action='store_true',
-                        help='run all nodes in one process instead of one process per node')
+                        help='number of users of the network to compare with')
+    parser.add_argument('--separate', type=positive_int, default=64,
+                        help='number of users as processes of their own; fewer if this machine '
+                        'cannot run as many')
+    parser.add_argument('--users', type=positive_int, default=1000,
+                        help='number of users that share one process')
+    parser.add_argument('--only', choices=('separate', 'together'),
+                        help='compare only one of the two networks with many users')
+    parser.add_argument('--rounds', type=positive_int, default=2, help='cycles for each user')
     parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     check_domain(parser)
-    if not options.composed:
-        check_users(parser, max(options.few, options.users), '--composed')
+    separate = min(options.separate, max_user_processes())
+    if separate < options.separate and options.only != 'together':
+        print(f'{separate} instead of {options.separate} users as processes, because this '
+              'machine cannot run more')
+    networks = {'separate': (separate, False), 'together': (options.users, True)}
+    chosen = {name: networks[name] for name in ([options.only] if options.only else networks)}
     os.environ.update(private_domain())
     use_discovery_profile()
     rclpy.init(args=[])
     scenario = Scenario()
-    cycles = options.rounds * options.users
     try:
-        few, many = (run_network(scenario, users, cycles, options.composed)
-                     for users in (options.few, options.users))
+        # Before and after, because other programs may slow down the machine for a while.
+        few = [run_network(scenario, options.few, options.rounds, False)]
+        many = {name: run_network(scenario, users, options.rounds, together)
+                for name, (users, together) in chosen.items()}
+        few.append(run_network(scenario, options.few, options.rounds, False))
         hop_s = np.median(ping_pong(scenario)) / 2
     finally:
         rclpy.try_shutdown()
     hops = hops_of(scenario)
-    figures = {
-        'composed': options.composed, 'hop_us': 1e6 * hop_s, 'floor_ms': 1e3 * hops * hop_s,
-        'few': few, 'many': many, 'rate_ratio': many['rate_hz'] / few['rate_hz'],
-        'fair': many['longest_wait_cycles'] <= options.users,
-    }
-    where = 'one process' if options.composed else 'one process per node'
-    for name in ('few', 'many'):
-        run = figures[name]
-        print(f'{run["users"]:3d} users, {where}: {run["rate_hz"]:.2f} cycles/s, cycle '
-              f'{run["cycle_ms"]:.1f} ms, {run["given_up"]} given up; longest wait '
-              f'{run["longest_wait_cycles"]} cycles, {run["longest_wait_s"]:.2f} s')
-    print(f'bare rclpy: {figures["floor_ms"]:.2f} ms for the {hops} hops of a cycle')
-    print(f'rate with {options.users} users relative to that with {options.few}: '
-          f'{figures["rate_ratio"]:.2f}; fair, one round at most: {figures["fair"]}')
+    rate_hz = np.mean([run['rate_hz'] for run in few])
+    for run in many.values():
+        run['rate_ratio'] = run['rate_hz'] / rate_hz
+    for run in (*few, *many.values()):
+        print(describe(run))
+    print(f'bare rclpy: {1e3 * hops * hop_s:.2f} ms for the {hops} hops of a cycle')
     if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+        write_whole(options.json, json.dumps({
+            'hop_us': 1e6 * hop_s, 'floor_ms': 1e3 * hops * hop_s, 'few': few, **many},
+            indent=2) + '\n')
     return 0
 
 
-def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> dict:
-    """Run a network until each user has been served, then measure a number of cycles."""
+def run_network(scenario: Scenario, users: int, rounds: int, together: bool) -> dict:
+    """Run a network until each user has been served, then measure a number of rounds."""
+    cycles = max(rounds * users, MIN_CYCLES)
     observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
-            if composed:
-                processes.start('network', users=users, rest_s=0.0)
-            else:
-                start_network(
-                    processes, users, 0, None, default_codebook_file(), scenario, rest_s=0.0)
+            start_network(processes, users, 0, None, default_codebook_file(), scenario,
+                          rest_s=0.0, together=together)
             ended = observer.log.ended
             wait_until(
                 observer, lambda: {cycle.user for cycle in ended} == {*range(1, users + 1)},
@@ -99,12 +102,24 @@ def run_network(scenario: Scenario, users: int, cycles: int, composed: bool) -> 
     ends = ended[first:first + cycles]
     served = [end for end in ends if end.outcome == 'served']
     ended_s = np.array([end.ended_s for end in served])
+    longest, longest_s = longest_wait([end.user for end in served], ended_s)
     return {
-        'users': users, 'cycles': len(ends), 'given_up': len(ends) - len(served),
+        'users': users, 'together': together, 'cycles': len(ends),
+        'given_up': len(ends) - len(served),
         'rate_hz': (len(served) - 1) / (ended_s[-1] - ended_s[0]),
         'cycle_ms': 1e3 * np.median([end.ended_s - end.began_s for end in served]),
-        **waits([end.user for end in served], ended_s),
+        'longest_wait_cycles': longest, 'longest_wait_s': longest_s, 'fair': longest <= users,
     }
+
+
+def describe(run: dict) -> str:
+    """Return a line about a run of a network."""
+    where = 'in one process' if run['together'] else 'as processes'
+    ratio = f' ({run["rate_ratio"]:.2f} of that of few)' if 'rate_ratio' in run else ''
+    fair = 'at most one round' if run['fair'] else 'MORE THAN ONE ROUND'
+    return (f'{run["users"]:4d} users {where}: {run["rate_hz"]:.2f} cycles/s{ratio}, cycle '
+            f'{run["cycle_ms"]:.1f} ms, {run["given_up"]} given up; longest wait '
+            f'{run["longest_wait_cycles"]} cycles, {run["longest_wait_s"]:.2f} s: {fair}')
 
 
 def wait_until(observer: NetworkObserver, done: Callable[[], bool], goal: str) -> None:
@@ -113,7 +128,7 @@ def wait_until(observer: NetworkObserver, done: Callable[[], bool], goal: str) -
         raise RuntimeError(f'{goal}: not within {TIMEOUT_S:g} s')
 
 
-def waits(order: list[int], ended_s: np.ndarray) -> dict:
+def longest_wait(order: list[int], ended_s: np.ndarray) -> tuple[int, float]:
     """Return the longest wait of any user between two of its cycles, in cycles and in seconds."""
     last: dict[int, int] = {}
     longest, longest_s = 0, 0.0
@@ -125,7 +140,7 @@ def waits(order: list[int], ended_s: np.ndarray) -> dict:
     # Users that are not served again were still waiting at the end.
     for index in last.values():
         longest = max(longest, len(order) - index)
-    return {'longest_wait_cycles': longest, 'longest_wait_s': longest_s}
+    return longest, longest_s
 
 
 if __name__ == '__main__':

@@ -36,7 +36,7 @@ CASES = {
                           '(2, 8, 4, 1)', 'set codebook_file (codebook:= of a launch)']),
     'codebook parameter': ('optimizer', {'codebook.id': 'deadbeefdeadbeef'},
                            ['codebook.id', "'deadbeefdeadbeef'"]),
-    'users': ('network', {'users': 0}, ['users', '0', '1 to 1000']),
+    'users': ('network', {'users': 0}, ['users', '0', '1 to 4096']),
     'network': ('network', {'policy': 'best'}, ['policy', "'best'"]),
     'allowed users': ('bs', {'allowed_users': '7, 5-3'}, ['allowed_users', "'5-3'", '10-20']),
     'unknown parameter': ('user', {'user_di': 2}, ['user_di: unknown parameter', 'user_id']),

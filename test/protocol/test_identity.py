@@ -49,7 +49,7 @@ def test_the_newer_of_two_users_with_one_number_is_served(network, places):
         assert text.startswith('user 1: ') and text.endswith(end)
     assert not [text for text in net.logged('user1_twin') if 'two nodes' in text]
     assert 'conflict.user_1' in net['bs'].status()
-    assert 'conflict.user' in net['user1'].status()
+    assert 'conflict.user_1' in net['user1'].status()
 
 
 def test_the_older_user_is_served_again_when_the_newer_one_has_gone(network, places):

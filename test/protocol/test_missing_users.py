@@ -81,3 +81,40 @@ def test_a_user_that_stops_answering_is_logged_once(network):
     net.run_cycles(4)
     assert set(net.served()[-2:]) == {1, 2}
     assert net.logged('bs') == ['user 2 no longer answers']
+
+
+def crowd(places, users):
+    return {user: places[user % len(places)] for user in users}
+
+
+def many(network, places, groups, **options):
+    """Return a network whose users share a node for each group."""
+    net = network({}, **options)
+    for number, users in enumerate(groups, 1):
+        net.add_users(crowd(places, users), f'user{number}')
+    return net
+
+
+def test_many_users_are_served_in_turn(network, places):
+    net = many(network, places, [range(1, 31), range(101, 111)])
+    net.run_cycles(3 * 40)
+    served = net.served()
+    assert sorted(served[40:80]) == [*range(1, 31), *range(101, 111)]
+    assert served[80:120] == served[40:80]
+    # The base station starts before the users.
+    assert net['bs'].counters.keys() == {'unanswered', 'late_ack'}
+    assert len(net.sent(m.Ack)) < 40 + 120 * 12
+    net.verify()
+
+
+def test_users_that_crash_together_do_not_stop_the_others(network, places):
+    net = many(network, places, [range(1, 31), range(101, 131)])
+    net.run_cycles(120)
+    net.remove('user1', noticed=False)
+    net.run_cycles(90)
+    assert set(net.served()[-60:]) == {*range(101, 131)}
+    assert net['bs'].counters['user_lost'] + net['bs'].counters['user_gone'] == 30
+    net.add('user1')
+    net.run_cycles(120)
+    assert set(net.served()[-60:]) == {*range(1, 31), *range(101, 131)}
+    net.verify()

@@ -1,5 +1,7 @@
 """Log messages about outages."""
 
+import pytest
+
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.outage_log import OutageLog
 
@@ -68,10 +70,15 @@ def test_user_gone_is_logged_once_per_user_until_that_user_is_served():
     assert outages.log_lost_cycle(7, 2, 'user_gone') == []
 
 
-def test_each_lost_user_is_logged():
-    assert OutageLog().log_lost_users([4, 9]) == [
-        LogMessage('user 4 no longer answers', warning=True),
-        LogMessage('user 9 no longer answers', warning=True)]
+@pytest.mark.parametrize(('users', 'text'), [
+    ([4], 'user 4 no longer answers'), ([4, 9], 'users 4, 9 no longer answer'),
+    (range(1, 12), 'users 1, 2, 3, 4, 5, 6, 7, 8 and 3 others no longer answer')])
+def test_lost_users_are_logged_in_one_message(users, text):
+    assert OutageLog().log_lost_users(users) == [LogMessage(text, warning=True)]
+
+
+def test_no_message_is_logged_without_a_lost_user():
+    assert OutageLog().log_lost_users([]) == []
 
 
 def test_missing_roles_are_logged_once_until_a_cycle_begins():

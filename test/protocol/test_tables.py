@@ -71,7 +71,7 @@ def machine(scenario):
             return bs.BaseStation(scenario, settings(), np.random.default_rng(0), receive)
         if name == 'user':
             timeouts_s = {state: 1.0 for state in user.State if state not in role.endless}
-            return user.User(1, mobility.Static((10, 0, 0)), timeouts_s)
+            return user.User({1: mobility.Static((10, 0, 0))}, timeouts_s)
         return rhs_controller.RhsController()
     return make
 
@@ -217,7 +217,7 @@ def test_rows_that_drop_messages_precede_rows_of_single_states(name):
             acting = [other for other in earlier if other.source is not ANY]
             # A grant to another user ends the wait of this one, before any refusal.
             assert {other.guard for other in acting} <= {
-                user.UserSteps.other_user_granted, user.UserSteps.other_instance_granted}
+                user.Steps.other_user_granted, user.Steps.other_instance_granted}
 
 
 # The machines

@@ -99,13 +99,12 @@ def test_more_than_64_users_have_tracks(locate):
     assert locate(70, user=1, now_s=0.3).n_phases == 2
 
 
-def test_the_number_of_tracks_is_bounded(monkeypatch, estimator, signals):
-    monkeypatch.setattr('rhs_isac_ros.protocol.tracks._MAX_USERS', 2)
-    tracks = Tracks()
-    counts = [tracks.locate(signals(n, user=user), estimator, 1.0, n / 10).n_phases
+def test_the_number_of_tracks_is_bounded(monkeypatch, locate):
+    monkeypatch.setattr(locate.tracks._tracks, 'max_size', 2)
+    counts = [locate(n, user=user, now_s=n / 10).n_phases
               for n, user in enumerate([1, 2, 1, 3, 1, 2])]
     assert counts == [1, 1, 2, 1, 3, 1]
-    assert len(tracks) == 2
+    assert len(locate.tracks) == 2
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
 def user():
     """User 4, connected, with timeouts of 2 s for a grant and 3 s after it."""
     way = mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)
-    made = User(4, way, {State.ACKNOWLEDGED: 2.0, State.GRANTED: 3.0})
+    made = User({4: way}, {State.ACKNOWLEDGED: 2.0, State.GRANTED: 3.0})
     made.handle(PeersChanged(()), 0.0)
     return made
 
@@ -60,7 +60,7 @@ def test_every_further_beacon_is_answered_and_restarts_the_timeout(user, cycle_i
 
 
 def test_a_grant_is_answered_with_the_present_position(user):
-    user.ground_truth(8.0)
+    user.ground_truth(4, 8.0)
     (truth,) = grant(user)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
     np.testing.assert_allclose(truth.position, (7, 0, 0))
@@ -69,9 +69,9 @@ def test_a_grant_is_answered_with_the_present_position(user):
 
 
 def test_a_true_position_has_cycle_0_unless_given(user):
-    assert user.ground_truth(0.0).cycle_id == 0
-    assert user.ground_truth(0.0, 9).cycle_id == 9
-    assert user.ground_truth(0.0).user == 4
+    assert user.ground_truth(4, 0.0).cycle_id == 0
+    assert user.ground_truth(4, 0.0, 9).cycle_id == 9
+    assert user.ground_truth(4, 0.0).user == 4
 
 
 def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
@@ -188,3 +188,66 @@ def test_a_connected_user_keeps_its_state(user, state):
     user.state = state
     assert user.handle(PeersChanged(()), 1.0) == []
     assert user.state is state
+
+
+@pytest.fixture
+def users():
+    """Users 4 to 6 of one node, connected."""
+    made = User({user: mobility.Static((user, 0.0, 0.0)) for user in (4, 5, 6)},
+                timeouts(0.5, 1.5))
+    made.handle(PeersChanged(()), 0.0)
+    return made
+
+
+def invite(first, last, cycle_id=7, attempt=0):
+    return m.Beacon(cycle_id=cycle_id, attempt=attempt, first_user=first, last_user=last)
+
+
+@pytest.mark.parametrize(('first', 'last', 'invited'), [
+    (1, 9, [4, 5, 6]), (5, 5, [5]), (5, 9, [5, 6]), (1, 4, [4])])
+def test_each_invited_user_of_a_node_answers(users, first, last, invited):
+    acks = answers(users, invite(first, last), 1.0)
+    assert [(type(ack), ack.cycle_id, ack.user) for ack in acks] == [
+        (m.Ack, 7, user) for user in invited]
+    assert users.state is State.ACKNOWLEDGED
+
+
+@pytest.mark.parametrize(('state', 'counters'), [
+    (State.LISTENING, {}), (State.NO_BEACON, {}), (State.ACKNOWLEDGED, {}),
+    (State.GRANTED, {'abandoned': 1})])
+def test_a_beacon_to_other_users_is_not_answered_but_proves_an_active_base_station(
+        users, state, counters):
+    users.state = state
+    assert answers(users, invite(7, 9), 1.0) == []
+    assert users.state is State.LISTENING
+    assert users.next_deadline() == 2.5
+    assert users.counters == counters
+    assert answers(users, m.Grant(cycle_id=7, user=5), 1.5) == []
+    assert users.counters == counters | {'wrong_cycle': 1}
+
+
+@pytest.mark.parametrize('user', [4, 6])
+def test_a_cycle_serves_the_user_of_the_node_that_is_granted_it(users, user):
+    users.handle(invite(1, 9), 1.0)
+    (truth,) = answers(users, m.Grant(cycle_id=7, user=user), 1.1)
+    assert (truth.user, *truth.position) == (user, user, 0, 0)
+    pilots = answers(users, m.PilotRequest(cycle_id=7, user=user, band=0, n_frames=2), 1.2)
+    assert {pilot.user for pilot in pilots} == {user}
+    for other in ({4, 5, 6} - {user}):
+        assert answers(
+            users, m.PilotRequest(cycle_id=7, user=other, band=1, n_frames=2), 1.2) == []
+        assert answers(users, m.Data(
+            cycle_id=7, user=other, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0),
+            1.2) == []
+    assert users.counters == {'wrong_user': 2}
+    (data,) = answers(users, m.Data(
+        cycle_id=7, user=user, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0), 1.3)
+    assert data.user == user
+    assert users.state is State.LISTENING
+
+
+def test_the_true_positions_of_all_users_of_a_node(users):
+    truths = users.ground_truths(3.0)
+    assert truths.cycle_id == 0
+    assert [(truth.user, *truth.position, *truth.velocity) for truth in truths.each()] == [
+        (user, user, 0, 0, 0, 0, 0) for user in (4, 5, 6)]

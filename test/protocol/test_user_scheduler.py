@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.protocol.user_scheduler import POLICIES, UserScheduler
+from rhs_isac_ros.protocol.user_scheduler import (
+    INVITED,
+    LAST_NUMBER,
+    MAX_USERS,
+    POLICIES,
+    UserScheduler,
+)
 
 
 @pytest.fixture
@@ -104,9 +110,9 @@ def test_a_returning_user_has_no_priority(make):
 def test_a_cycle_begins_without_answers(make):
     scheduler = make()
     cycle(scheduler, 1, 2)
-    assert scheduler.answered == [1, 2]
+    assert list(scheduler.answered) == [1, 2]
     scheduler.begin_cycle()
-    assert scheduler.answered == []
+    assert not scheduler.answered
 
 
 def test_without_registered_users_one_answer_is_enough(make):
@@ -181,7 +187,7 @@ def test_a_registered_user_is_waited_for_but_has_not_answered(make):
     scheduler = make()
     cycle(scheduler, 1)
     scheduler.register(2)
-    assert scheduler.answered == [1]
+    assert list(scheduler.answered) == [1]
     scheduler.begin_cycle()
     assert not scheduler.is_complete_with(1)
     scheduler.add_answer(1)
@@ -202,7 +208,7 @@ def test_registering_again_does_not_change_the_turn(make):
 def test_the_number_of_registered_users_is_limited(make):
     scheduler = make()
     scheduler.begin_cycle()
-    for user in range(1, 1025):
+    for user in range(1, MAX_USERS + 1):
         assert not scheduler.is_full_for(user)
         scheduler.add_answer(user)
     assert scheduler.is_full_for(5000)
@@ -222,3 +228,95 @@ def test_a_new_policy_keeps_the_turns(make):
     with pytest.raises(ValueError, match="policy: 'best', expected one of"):
         scheduler.set_policy('best')
     assert cycle(scheduler, 3, 2, 1) == 1
+
+
+def served_in_turn(scheduler, present, n):
+    """Return the users served in cycles in which the invited ones of `present` answer."""
+    served = []
+    for _ in range(n):
+        scheduler.begin_cycle()
+        answering, attempt = [], 0
+        while not answering:
+            first, last = scheduler.invite(attempt)
+            answering = [user for user in present if first <= user <= last]
+            if not answering:
+                assert not scheduler.all_invited
+                scheduler.remove_absent()
+                attempt += 1
+        for user in answering:
+            scheduler.add_answer(user)
+        scheduler.remove_absent()
+        served.append(scheduler.select())
+    return served
+
+
+@pytest.mark.parametrize('n', [0, 1, INVITED])
+def test_few_users_are_invited_together(make, n):
+    scheduler = make()
+    for user in range(1, n + 1):
+        scheduler.register(3 * user)
+    assert scheduler.invite(0) == (1, LAST_NUMBER)
+    assert scheduler.all_invited
+
+
+@pytest.mark.parametrize('policy', POLICIES)
+def test_of_many_users_few_are_invited(make, policy):
+    scheduler, numbers = make(policy), [7 * n for n in range(1, 101)]
+    for user in numbers:
+        scheduler.register(user)
+    ranges = set()
+    for _ in range(400):
+        scheduler.begin_cycle()
+        first, last = scheduler.invite(0)
+        ranges.add((first, last))
+        invited = [user for user in numbers if first <= user <= last]
+        assert 1 <= len(invited) <= INVITED
+        for user in invited:
+            assert scheduler.is_complete_with(0) is (policy == 'first')
+            scheduler.add_answer(user)
+        assert scheduler.is_complete_with(0)
+        scheduler.select()
+    # Together, the ranges contain every number once.
+    ranges = sorted(ranges)
+    assert (ranges[0][0], ranges[-1][1]) == (1, LAST_NUMBER)
+    assert all(first == last + 1 for (_, last), (first, _)
+               in zip(ranges, ranges[1:], strict=False))
+
+
+@pytest.mark.parametrize('present', [range(1, 1001), range(5, 5000, 37)], ids=['dense', 'sparse'])
+def test_no_user_waits_longer_than_a_round(make, present):
+    scheduler = make()
+    n = len(present)
+    served_in_turn(scheduler, present, 1)
+    served = served_in_turn(scheduler, present, 3 * n)
+    for user in present:
+        turns = [turn for turn, other in enumerate(served) if other == user]
+        assert max(np.diff([-1, *turns, 3 * n])) <= n
+
+
+def test_new_users_between_many_are_served_within_two_rounds(make):
+    scheduler = make()
+    served_in_turn(scheduler, range(2, 202, 2), 100)
+    served = served_in_turn(scheduler, range(1, 211), 210 + 100)
+    assert set(served) == {*range(1, 211)}
+
+
+def test_users_that_leave_together_delay_the_others_by_few_beacons(make):
+    scheduler = make()
+    served_in_turn(scheduler, range(1, 1001), 300)
+    served = served_in_turn(scheduler, range(501, 1001), 600)
+    assert scheduler.n_users == 500
+    assert set(served) == {*range(501, 1001)}
+
+
+def test_only_invited_users_miss_a_beacon(make):
+    scheduler = make()
+    served_in_turn(scheduler, range(1, 101), 100)
+    for _ in range(5):
+        scheduler.begin_cycle()
+        scheduler.invite(0)
+        scheduler.add_answer(1)
+        lost = scheduler.remove_absent()
+        assert set(lost) <= {*range(1, INVITED + 1)}
+        scheduler.select()
+    assert scheduler.n_users > 100 - 2 * INVITED

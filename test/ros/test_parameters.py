@@ -223,6 +223,10 @@ def test_nodes_share_declarations_of_equal_names():
     ({'mobility': 'waypoints', 'waypoints_m': [10.0]}, r'waypoints_m: 1 numbers'),
     ({'mobility': 'waypoints', 'waypoints_m': [10.0, 0.0, 0.0, 0.0, 6.0, 0.0]},
      r'waypoints_m: .* x > 0'),
+    ({'user_count': 2, 'position_m': [9.0, 1.0, -0.5]},
+     'position_m: 1 points, expected 2, one for each user, or none'),
+    ({'user_count': 2, 'mobility': 'waypoints', 'waypoints_m': [9.0, 1.0, -0.5]},
+     'user_count: 2, expected 1 with mobility waypoints'),
     ({'mobility': 'random_walk', 'speed_mps': 5.6},
      r'speed_mps: 5.6, expected at most max_user_speed_mps = 5.55'),
 ])
@@ -247,6 +251,31 @@ def test_the_parameters_of_a_user_set_its_initial_position(bench, values, positi
     bench.until(lambda: truths, 'the true position')
     assert truths[0].position == pytest.approx(position, abs=1e-12)
     assert truths[0].user == 1
+
+
+def test_the_users_of_a_node_have_consecutive_ids_and_one_message_for_all_positions(bench):
+    places = [[9.0, 1.0, -0.5], [8.0, 0.0, 0.5]]
+    bench.add(UserNode, parameter_overrides=[
+        Parameter('user_id', value=7), Parameter('user_count', value=2),
+        Parameter('position_m', value=[*places[0], *places[1]])])
+    probe = bench.add(Node, 'probe')
+    each, several = bench.collect(probe, m.GroundTruth), bench.collect(probe, m.GroundTruths)
+    bench.until(lambda: several, 'the true positions')
+    assert [(truth.user, truth.position.tolist()) for truth in several[0].each()] == [
+        (7, places[0]), (8, places[1])]
+    assert not each
+
+
+def test_the_users_of_a_node_walk_as_they_would_alone(bench):
+    walk = [Parameter('mobility', value='random_walk'), Parameter('speed_mps', value=0.0),
+            Parameter('seed', value=3)]
+    bench.add(UserNode, 'users', parameter_overrides=[
+        *walk, Parameter('user_count', value=2)])
+    bench.add(UserNode, 'alone', parameter_overrides=[*walk, Parameter('user_id', value=2)])
+    probe = bench.add(Node, 'probe')
+    alone, several = bench.collect(probe, m.GroundTruth), bench.collect(probe, m.GroundTruths)
+    bench.until(lambda: several and alone, 'the true positions')
+    assert several[0].position[1].tolist() == alone[0].position.tolist()
 
 
 def test_a_user_without_a_position_starts_in_the_region(bench):

@@ -5,6 +5,7 @@ from rclpy.node import Node
 from rclpy.validate_topic_name import validate_topic_name
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros import convert, qos, topics
 
 ALL = [*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS]
@@ -59,4 +60,9 @@ def test_only_the_statistics_are_latched():
     assert {kind for kind in topics.NAMES if qos.profile_for(kind) is qos.LATCHED} == {
         m.CapacityStatistics}
     assert {kind for kind in topics.NAMES if qos.profile_for(kind) is qos.EXCHANGE} == set(
-        topics.NAMES) - {m.CapacityStatistics}
+        topics.NAMES) - {m.CapacityStatistics, m.Ack}
+
+
+def test_the_queue_of_acks_holds_those_of_all_users():
+    assert qos.profile_for(m.Ack).depth == MAX_USERS
+    assert qos.profile_for(m.Ack, qos.OBSERVATION) is qos.OBSERVATION

@@ -39,7 +39,8 @@ def test_the_file_matches_the_output_of_the_command(capsys):
 
 def test_a_user_may_not_publish_messages_of_another_role():
     allowed = rules(permissions.policy(users=3))
-    own = {f'/{name}' for name in ('ack', 'data', 'ground_truth', 'pilot', topics.DIAGNOSTICS)}
+    own = {f'/{name}' for name in ('ack', 'data', 'ground_truth', 'ground_truths', 'pilot',
+                                   topics.DIAGNOSTICS)}
     common = {'/parameter_events', '/rosout'}
     for number in (1, 2, 3):
         assert allowed[f'/user_{number}']['publish'] == own | common
