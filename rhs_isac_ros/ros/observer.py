@@ -28,6 +28,8 @@ class CycleObserver(Node):
         Required sizes by symbol, as in `Scenario.sizes`; None: any.
     on_malformed
         Called with the error of each malformed message; by default it is logged.
+    log
+        Collects the cycles; by default a new log.
 
     Attributes
     ----------
@@ -40,9 +42,9 @@ class CycleObserver(Node):
             receives: Iterable[type[m.Message]] = cycle_log.RECEIVES,
             sizes: Mapping[str, int] | None = None,
             on_malformed: Callable[[m.MessageError], None] | None = None,
-            **node_options: Any) -> None:
+            log: cycle_log.CycleLog | None = None, **node_options: Any) -> None:
         super().__init__('cycle_observer', **node_options)
-        self.log = cycle_log.CycleLog()
+        self.log = log or cycle_log.CycleLog()
         if recorder is not None:
             # One subscription for both, so that a replay yields the same cycles in the same order.
             kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}

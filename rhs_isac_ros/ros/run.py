@@ -21,7 +21,7 @@ from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.resources import discovery_profile_file
 
 # Maximum time between two checks for a signal.
-_POLL_S = 0.5
+_POLL_S = 0.1
 # Environment variable with the profile file of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 

@@ -1,6 +1,7 @@
 """The executable ``demo``: runs a whole network as processes and reports on its cycles."""
 
 import argparse
+import contextlib
 import dataclasses
 import os
 import sys
@@ -26,6 +27,7 @@ from rhs_isac_ros.model.arguments import (
     positive_int,
     seed,
 )
+from rhs_isac_ros.monitoring.cycle_log import CycleLog
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.ros.command_line import check_domain
@@ -38,7 +40,7 @@ from rhs_isac_ros.ros.processes import (
 )
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo_report import draw, summary, table
+from rhs_isac_ros.tools.demo_report import draw, prepare_drawing, summary, table
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
@@ -84,28 +86,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     os.environ.update(private_domain())
     use_discovery_profile()
-    rclpy.init(args=[])
-    observer = CycleObserver(recorder)
+    log = CycleLog()
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        processes = Processes(Path(logs), {'ROS_LOG_DIR': logs})
-        try:
-            with processes:
+        # The log of the cycles is complete when the processes are about to end.
+        with Processes(Path(logs), {'ROS_LOG_DIR': logs}, fork=True) as processes:
+            problem = ''
+            with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
                 start_network(
                     processes, options.users, options.seed, options.config, codebook_file,
                     scenario, together=together,
                     positioner=positioner_parameters(options.prior, scenario))
-                problem = watch(observer, processes, options.cycles, _show_progress)
-        except (KeyboardInterrupt, ExternalShutdownException):
-            problem = ''
-        finally:
-            observer.destroy_node()  # type: ignore[no-untyped-call]
-            try_shutdown()
-            if recorder is not None:
-                recorder.close()
+                problem = _observe(log, processes, recorder, options.cycles)
+            processes.interrupt()
+            with contextlib.suppress(KeyboardInterrupt):
+                return _report(log, scenario, options, problem)
+    return 0
+
+
+def _observe(
+        log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int) -> str:
+    """Observe a number of cycles, and return the error that ended them; empty if none did."""
+    # The network needs a moment to start.
+    prepare_drawing()
+    rclpy.init(args=[])
+    observer = CycleObserver(recorder, log=log)
     try:
-        return _report(observer, scenario, options, problem)
-    except KeyboardInterrupt:
-        return 0
+        return watch(observer, processes, cycles, _show_progress)
+    finally:
+        observer.destroy_node()  # type: ignore[no-untyped-call]
+        try_shutdown()
+        if recorder is not None:
+            recorder.close()
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
@@ -270,9 +281,8 @@ def _show_progress(complete: int, goal: int) -> None:
 
 
 def _report(
-        observer: CycleObserver, scenario: Scenario, options: argparse.Namespace, problem: str
-) -> int:
-    complete, given_up = observer.log.complete, observer.log.given_up
+        log: CycleLog, scenario: Scenario, options: argparse.Namespace, problem: str) -> int:
+    complete, given_up = log.complete, log.given_up
     if complete:
         print(table(complete))
         print(summary(complete, given_up))
@@ -282,7 +292,7 @@ def _report(
         print(f'recording: {options.record}')
     if problem:
         print_error(problem, 'demo')
-    return 1 if problem or observer.log.failed else 0
+    return 1 if problem or log.failed else 0
 
 
 if __name__ == '__main__':

@@ -58,6 +58,17 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
     return '\n'.join(lines)
 
 
+def prepare_drawing() -> None:
+    """Import what `draw` needs, while there is nothing else to do."""
+    # Not at the start of the program, which has more urgent imports.
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import patches, pyplot
+
+    del patches, pyplot
+
+
 def draw(cycles: Sequence[CompleteCycle], scenario: Scenario, path: Path) -> None:
     """Draw the region of interest from above, with true positions and estimates.
 
@@ -66,10 +77,7 @@ def draw(cycles: Sequence[CompleteCycle], scenario: Scenario, path: Path) -> Non
     OSError
         If the file cannot be written.
     """
-    # Imported here because it is slow and only the picture needs it.
-    import matplotlib
-
-    matplotlib.use('Agg')
+    prepare_drawing()
     from matplotlib import pyplot as plt
     from matplotlib.patches import Ellipse, Rectangle
 
