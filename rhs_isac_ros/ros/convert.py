@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import array
-import dataclasses
-import enum
-import functools
 import json
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 import rhs_isac_msgs.msg as ros
@@ -23,9 +19,8 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import TrackEstimate
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
+from rhs_isac_ros.ros import cdr
 from rhs_isac_ros.ros.topics import MAP_FRAME, NAMES, USER_FRAME
-
-_Codec = Callable[[Any], Any]
 
 # Variance of an unknown angular velocity [rad^2/s^2], the value that ROS drivers use.
 _UNKNOWN_ROTATION_VARIANCE = 1e6
@@ -52,20 +47,27 @@ def to_ros(
     Any
         A message of `ros_type`.
     """
-    result = ros_type(type(message))()
-    for name, encode, _ in _FIELDS[type(message)]:
-        value = getattr(message, name)
-        setattr(result, name, encode(value) if encode else value)
-    if stamp is not None:
-        result.header.stamp = stamp
-    result.header.frame_id = MAP_FRAME
-    if identity is not None:
-        result.sender, result.scenario_id = identity
-    return result
+    stamp_ns = 10**9 * stamp.sec + stamp.nanosec if stamp is not None else 0
+    return deserialize_message(to_bytes(message, stamp_ns, identity), ros_type(type(message)))
+
+
+def to_bytes(
+        message: Message, stamp_ns: int, identity: tuple[int, str] | None = None) -> bytes:
+    """Serialize a message (CDR), as a publisher of `ros_type` accepts it.
+
+    Parameters
+    ----------
+    stamp_ns
+        Time for the header [ns].
+    identity
+        Sender and id of the scenario; by default those of the message.
+    """
+    sender, scenario_id = identity or (message.sender, message.scenario_id)
+    return _CODECS[type(message)].encode(message, MAP_FRAME, stamp_ns, sender, scenario_id)
 
 
 def from_ros(kind: type[Message], message: Any) -> Message:
-    """Convert a message of `ros_type` from ROS; the arrays may share its memory.
+    """Convert a message of `ros_type` from ROS.
 
     Raises
     ------
@@ -73,44 +75,30 @@ def from_ros(kind: type[Message], message: Any) -> Message:
         If an array does not fill its shape, or an enumeration field is not one of its
         constants.
     """
-    values = {}
-    for name, _, decode in _FIELDS[kind]:
-        value = getattr(message, name)
-        try:
-            values[name] = decode(value) if decode else value
-        except ValueError as error:
-            raise MessageError(f'{kind.__name__}.{name}: {error}') from None
-    return kind(**values)
+    return _CODECS[kind].decode(serialize_message(message))
 
 
 def from_bytes(kind: type[Message], serialized: bytes) -> Message:
     """Convert a serialized message (CDR), as a raw subscription receives it.
-
-    Raises
-    ------
-    MessageError
-        If the bytes are not a message of `ros_type`, or for the reasons given in `from_ros`.
-    """
-    return from_ros(kind, deserialize(kind, serialized))
-
-
-def deserialize(kind: type[Message], serialized: bytes) -> Any:
-    """Return the ROS message that bytes (CDR) contain, as a raw subscription receives them.
 
     Other subscriptions of rclpy silently drop what they cannot deserialize.
 
     Raises
     ------
     MessageError
-        If the bytes are not a message of `ros_type`.
+        If the bytes are not a message of `ros_type`, or for the reasons given in `from_ros`.
     """
+    if serialized.startswith(cdr.HEADER):
+        return _CODECS[kind].decode(serialized)
+    # Another machine may send another byte order.
     try:
-        return deserialize_message(serialized, ros_type(kind))
+        message = deserialize_message(serialized, ros_type(kind))
     # rclpy raises a RuntimeError without a public class; a string may be invalid UTF-8.
     except (RuntimeError, ValueError) as error:
         raise MessageError(
             f'{kind.__name__}: invalid CDR data of {len(serialized)} bytes: '
             f'{str(error).splitlines()[0]}') from None
+    return from_ros(kind, message)
 
 
 def codebook_to_ros(
@@ -227,42 +215,9 @@ def _reshape(values: array.array[float], shape: array.array[int]) -> np.ndarray:
     return np.frombuffer(values).reshape(tuple(shape))
 
 
-def _encode_numbers(values: np.ndarray) -> array.array[int]:
-    return array.array('I', values.astype(np.uint32).tobytes())
-
-
 def _encode_vector(kind: Any, values: np.ndarray) -> Any:
     x, y, z = values.tolist()
     return kind(x=x, y=y, z=z)
 
 
-def _decode_vector(message: Any) -> np.ndarray:
-    return np.array([message.x, message.y, message.z])
-
-
-# Encoder and decoder by ROS type; numbers and strings need neither.
-_CODECS: dict[str, tuple[_Codec, _Codec]] = {
-    'rhs_isac_msgs/RealArray': (_encode_real, _decode_real),
-    'rhs_isac_msgs/ComplexArray': (_encode_complex, _decode_complex),
-    'geometry_msgs/Point': (functools.partial(_encode_vector, Point), _decode_vector),
-    'geometry_msgs/Vector3': (functools.partial(_encode_vector, Vector3), _decode_vector),
-    'sequence<uint32>': (_encode_numbers, functools.partial(np.asarray, dtype=int)),
-    'double[3]': (np.ascontiguousarray, np.asarray),
-    'double[4]': (np.ascontiguousarray, np.asarray),
-    'double[9]': (np.ravel, lambda values: np.reshape(values, (3, 3))),
-}
-
-
-def _fields_of(kind: type[Message]) -> list[tuple[str, _Codec | None, _Codec | None]]:
-    """Return name, encoder and decoder of each field of a message class."""
-    types = ros_type(kind).get_fields_and_field_types()
-    result: list[tuple[str, _Codec | None, _Codec | None]] = []
-    for field in dataclasses.fields(kind):
-        encode, decode = _CODECS.get(types[field.name], (None, None))
-        if isinstance(field.type, type) and issubclass(field.type, enum.IntEnum):
-            encode, decode = int, field.type
-        result.append((field.name, encode, decode))
-    return result
-
-
-_FIELDS = {kind: _fields_of(kind) for kind in NAMES}
+_CODECS = {kind: cdr.Codec(kind, ros_type(kind).get_fields_and_field_types()) for kind in NAMES}

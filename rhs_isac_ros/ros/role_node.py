@@ -210,9 +210,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         except m.MessageError as error:
             self._log_error('not sent', error)
             return False
-        stamp = self.get_clock().now().to_msg()
+        stamp_ns = self.get_clock().now().nanoseconds
         self._role_publishers[type(message)].publish(
-            convert.to_ros(message, stamp, self._identity))
+            convert.to_bytes(message, stamp_ns, self._identity))
         return True
 
     def execute(self, action: Action) -> None:
@@ -229,11 +229,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         def receive(serialized: bytes) -> None:
             self._statistics.count_received(kind)
             try:
-                ros_message = convert.deserialize(kind, serialized)
-                if ros_message.scenario_id not in ('', self.scenario.id):
-                    self._drop_foreign(ros_message)
+                message = convert.from_bytes(kind, serialized)
+                if message.scenario_id not in ('', self.scenario.id):
+                    self._drop_foreign(message)
                     return
-                message = convert.from_ros(kind, ros_message)
                 m.check(message, self._sizes)
             except m.MessageError as error:
                 self.role.counters['malformed'] += 1
@@ -243,7 +242,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self.dispatch(message)
         return receive
 
-    def _drop_foreign(self, message: Any) -> None:
+    def _drop_foreign(self, message: m.Message) -> None:
         """Count a message of another scenario, and log the first of each sender."""
         self.role.counters[Outcome.WRONG_SCENARIO.value] += 1
         if message.sender not in self._foreign and len(self._foreign) < _MAX_LOGGED:

@@ -189,9 +189,9 @@ def fuzz(
 def _is_malformed(kind: type[m.Message], content: bytes, scenario: Scenario) -> bool:
     """Return whether nodes drop a mutation as malformed, rather than for its scenario."""
     try:
-        message = convert.deserialize(kind, content)
+        message = convert.from_bytes(kind, content)
         if message.scenario_id in ('', scenario.id):
-            m.check(convert.from_ros(kind, message), scenario.sizes)
+            m.check(message, scenario.sizes)
     except m.MessageError:
         return True
     return False

@@ -1,0 +1,270 @@
+"""The encoding of the messages of the protocol on the wire, without ROS messages in between.
+
+The conversion of a ROS message calls a Python function for each of its fields and nested messages,
+which takes longer than the transport. Publishers and raw subscriptions of rclpy exchange encoded
+messages instead: common data representation (CDR), version 1, little endian.
+"""
+
+import dataclasses
+import enum
+import math
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.protocol.messages import Message, MessageError
+
+# Representation identifier of CDR version 1, little endian, and two bytes of options.
+HEADER = b'\0\1\0\0'
+_NANOSECONDS = 10**9
+_SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
+
+
+class _Type(NamedTuple):
+    """How a type of ROS is encoded.
+
+    Attributes
+    ----------
+    wire
+        Characters of `struct` for numbers, ``s`` for a string, ``*I`` and ``*d`` for sequences.
+    encode, decode
+        From a value to its items on the wire, and back.
+    """
+
+    wire: tuple[str, ...]
+    encode: Callable[[Any], Sequence[Any]]
+    decode: Callable[[Sequence[Any]], Any]
+
+
+class _Run(NamedTuple):
+    """Numbers of fixed size, and the string or sequence that follows them, if any.
+
+    Attributes
+    ----------
+    layouts
+        By position in the message modulo 8, on which the padding depends.
+    tail
+        Wire type of what follows; empty for the last run.
+    """
+
+    layouts: tuple[struct.Struct, ...]
+    n_items: int
+    tail: str
+
+
+class _Field(NamedTuple):
+    name: str
+    first: int
+    last: int
+    encode: Callable[[Any], Sequence[Any]] | None
+    decode: Callable[[Any], Any] | None
+
+
+class Codec:
+    """Encodes and decodes one class of messages.
+
+    Parameters
+    ----------
+    kind
+        Class of the messages.
+    types
+        Types by field, as in ``get_fields_and_field_types`` of the ROS type.
+    """
+
+    def __init__(self, kind: type[Message], types: dict[str, str]) -> None:
+        self._kind = kind
+        enums = {field.name: field.type for field in dataclasses.fields(kind)
+                 if isinstance(field.type, type) and issubclass(field.type, enum.IntEnum)}
+        # The stamp and the frame of the header.
+        wire = ['i', 'I', 's']
+        fields = []
+        for name, text in types.items():
+            if name == 'header':
+                continue
+            first = len(wire)
+            if text in _TYPES:
+                one = _TYPES[text]
+                wire += one.wire
+                fields.append(_Field(name, first, len(wire), one.encode, one.decode))
+            else:
+                wire.append(_SCALARS[text])
+                fields.append(_Field(name, first, first + 1, None, enums.get(name)))
+        self._fields, self._runs = tuple(fields), tuple(_runs(wire))
+
+    def encode(
+            self, message: Message, frame: str, stamp_ns: int, sender: int, scenario_id: str
+    ) -> bytes:
+        """Return the bytes of a message; the arguments replace its own values."""
+        items: list[Any] = [*divmod(stamp_ns, _NANOSECONDS), frame]
+        for name, _, _, encode, _ in self._fields:
+            value = getattr(message, name)
+            if encode is not None:
+                items += encode(value)
+            elif name == 'sender':
+                items.append(sender)
+            elif name == 'scenario_id':
+                items.append(scenario_id)
+            else:
+                items.append(value)
+        pieces = [HEADER]
+        position, first = len(HEADER), 0
+        for layouts, n_items, tail in self._runs:
+            layout, last = layouts[position & 7], first + n_items
+            position += layout.size
+            if not tail:
+                pieces.append(layout.pack(*items[first:last]))
+                break
+            content = items[last]
+            if tail == 's':
+                content = content.encode() + b'\0'
+                pieces += layout.pack(*items[first:last], len(content)), content
+            else:
+                pieces.append(layout.pack(*items[first:last], len(content)))
+                padding = _padding(position) if tail == '*d' and len(content) else 0
+                content = bytes(padding) + content.tobytes()
+                pieces.append(content)
+            position += len(content)
+            first = last + 1
+        return b''.join(pieces)
+
+    def decode(self, data: bytes) -> Message:
+        """Return the message of bytes that begin with `HEADER`; arrays do not share their memory.
+
+        Raises
+        ------
+        MessageError
+            If the bytes end too early, an array does not fill its shape, or an enumeration field
+            is not one of its constants.
+        """
+        try:
+            items = self._items(data)
+        except (struct.error, ValueError) as error:
+            raise MessageError(f'{self._kind.__name__}: invalid CDR data of {len(data)} bytes: '
+                               f'{error}') from None
+        values = {}
+        for name, first, last, encode, decode in self._fields:
+            if decode is None:
+                values[name] = items[first]
+                continue
+            try:
+                values[name] = decode(items[first] if encode is None else items[first:last])
+            except ValueError as error:
+                raise MessageError(f'{self._kind.__name__}.{name}: {error}') from None
+        return self._kind(**values)
+
+    def _items(self, data: bytes) -> list[Any]:
+        items: list[Any] = []
+        position = len(HEADER)
+        for layouts, _, tail in self._runs:
+            layout = layouts[position & 7]
+            items += layout.unpack_from(data, position)
+            position += layout.size
+            if not tail:
+                break
+            size = items.pop()
+            if tail == 's':
+                content = data[position:position + size]
+                if len(content) < size:
+                    raise ValueError(f'string of {size} bytes')
+                items.append(content.removesuffix(b'\0').decode())
+                position += size
+            elif tail == '*I':
+                items.append(np.frombuffer(data, '<u4', size, position) if size else _NONE)
+                position += 4 * size
+            elif size:
+                position += _padding(position)
+                items.append(np.frombuffer(data, '<f8', size, position))
+                position += 8 * size
+            else:
+                items.append(_NONE)
+        return items
+
+
+def _runs(wire: Sequence[str]) -> list[_Run]:
+    runs, numbers = [], ''
+    for one in [*wire, '']:
+        if one in _SIZES:
+            numbers += one
+            continue
+        # A string or a sequence begins with its size.
+        written = numbers + 'I' if one else numbers
+        runs.append(_Run(tuple(_layout(written, start) for start in range(8)), len(numbers), one))
+        numbers = ''
+    return runs
+
+
+def _layout(numbers: str, start: int) -> struct.Struct:
+    """Return the layout of numbers that begin at a position, each aligned to its size."""
+    text, position = '<', start
+    for number in numbers:
+        padding = (len(HEADER) - position) % _SIZES[number]
+        text += f'{padding}x{number}'
+        position += padding + _SIZES[number]
+    return struct.Struct(text)
+
+
+def _padding(position: int) -> int:
+    """Return the number of bytes before a number of eight bytes."""
+    return (len(HEADER) - position) % 8
+
+
+_NONE = np.empty(0)
+
+
+def _encode_real(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(values.shape, '<u4'), values.ravel()
+
+
+def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
+    flat = values.ravel()
+    return np.array(values.shape, '<u4'), flat.real, flat.imag
+
+
+def _decode_real(items: Sequence[np.ndarray]) -> np.ndarray:
+    shape, values = items
+    # The numbers are not aligned in memory, so that computations with them would be slow.
+    return values.astype(float).reshape(_shape(values, shape))
+
+
+def _decode_complex(items: Sequence[np.ndarray]) -> np.ndarray:
+    shape, real, imag = items
+    sizes = _shape(real, shape)
+    _shape(imag, shape)
+    result = np.empty(len(real), complex)
+    result.real, result.imag = real, imag
+    return result.reshape(sizes)
+
+
+def _shape(values: np.ndarray, shape: np.ndarray) -> list[int]:
+    sizes: list[int] = shape.tolist()
+    if len(values) != math.prod(sizes) or not len(values):
+        raise ValueError(
+            f'{len(values)} values, expected shape {sizes} with at least one value')
+    return sizes
+
+
+def _numbers(n: int) -> _Type:
+    return _Type(('d',) * n, lambda values: values.ravel().tolist(), np.array)
+
+
+def _encode_integers(values: np.ndarray) -> tuple[np.ndarray]:
+    return (values.astype('<u4'),)
+
+
+def _decode_integers(items: Sequence[np.ndarray]) -> np.ndarray:
+    return items[0].astype(int)
+
+
+_SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's'}
+_TYPES = {
+    'geometry_msgs/Point': _numbers(3),
+    'geometry_msgs/Vector3': _numbers(3),
+    'double[3]': _numbers(3),
+    'double[4]': _numbers(4),
+    'double[9]': _numbers(9)._replace(decode=lambda items: np.array(items).reshape(3, 3)),
+    'sequence<uint32>': _Type(('*I',), _encode_integers, _decode_integers),
+    'rhs_isac_msgs/RealArray': _Type(('*I', '*d'), _encode_real, _decode_real),
+    'rhs_isac_msgs/ComplexArray': _Type(('*I', '*d', '*d'), _encode_complex, _decode_complex),
+}
