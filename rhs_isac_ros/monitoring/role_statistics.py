@@ -55,7 +55,8 @@ class RoleStatistics:
         self._missing_roles: tuple[str, ...] = ()
         self._unavailable: set[str] = set()
         self._cycle_began_s: float | None = None
-        self._durations_s: dict[str, collections.deque[float]] = {}
+        self._durations_s: dict[str, collections.deque[float]] = collections.defaultdict(
+            lambda: collections.deque(maxlen=_MAX_DURATIONS))
         self._faults: collections.Counter[str] = collections.Counter()
 
     def set_available(self, node: str, available: bool) -> None:
@@ -103,8 +104,7 @@ class RoleStatistics:
                     self._add_duration('cycle_ms', now_s - self._cycle_began_s)
 
     def _add_duration(self, name: str, duration_s: float) -> None:
-        self._durations_s.setdefault(
-            name, collections.deque(maxlen=_MAX_DURATIONS)).append(duration_s)
+        self._durations_s[name].append(duration_s)
 
     def report(
             self, phase: str, counters: Mapping[str, int], blocked: bool = False,

@@ -112,7 +112,8 @@ def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[st
         described = ', '.join(d if d.isdigit() else f'{d} = {e}'
                            for d, e in zip(dims, expected, strict=True))
         return f'shape {list(value.shape)}, expected [{described}]'
-    if not (np.isfinite(value) | (meta['nan_allowed'] & np.isnan(value))).all():
+    finite = np.isfinite(value)
+    if not finite.all() and not (meta['nan_allowed'] and (finite | np.isnan(value)).all()):
         return 'not finite, expected finite numbers'
     if meta['low'] > -math.inf and value.size and (
             value.min() < meta['low'] or value.max() > meta['high']):
