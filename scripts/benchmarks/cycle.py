@@ -3,7 +3,9 @@
 Problem: a cycle is a chain of messages, each sent in response to the previous one, with the
 computations of the nodes in between. How much time does the network add to bare rclpy? The floor
 is the same number of hops, measured in the same run and with the same executor as ping-pong of a
-bare publisher and subscription between two processes.
+bare publisher and subscription: between two processes for a network whose nodes are processes, and
+between two nodes of one process for a network in one process. The computations are those of the
+estimator, as it reports them, and of the beam, measured alone on the estimates of the run.
 """
 
 import argparse
@@ -11,26 +13,34 @@ import json
 import os
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
 import rclpy
+from parts.chain import ChainObserver, Cycle
 from parts.hops import hops_of, ping_pong
+from rclpy.experimental import EventsExecutor
 
 from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.link import choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo import check_users, start_network, watch
+from rhs_isac_ros.tools.demo import check_users, start_network
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
+# Cycles that are not evaluated.
+WARM_UP = 10
+# Maximum time between two served cycles.
+TIMEOUT_S = 60.0
+WHERE = {'processes': 'one process per node', 'composed': 'all nodes in one process'}
 
 
 def main() -> int:
@@ -40,56 +50,117 @@ def main() -> int:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--users', type=positive_int, default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
+    parser.add_argument('--layout', choices=WHERE, action='append',
+                        help='only this arrangement of the nodes; by default both')
     parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     check_domain(parser)
     check_users(parser, options.users)
     os.environ.update(private_domain())
-    scenario = Scenario()
-    hops = hops_of(scenario)
     use_discovery_profile()
-    rclpy.init(args=[])
-    try:
-        before_s = ping_pong(scenario)
-        cycles = run_cycles(scenario, options.users, options.cycles)
-        after_s = ping_pong(scenario)
-    finally:
-        rclpy.try_shutdown()
-    hop_s = np.median(np.concatenate([before_s, after_s])) / 2
-    # Discard the first cycles as warm-up.
-    cycles = cycles[10:]
-    cycle_s = np.median([record.ended_s - record.began_s for record in cycles])
-    figures = {
-        'users': options.users, 'cycles': len(cycles), 'hops': hops,
-        'cycle_ms': 1e3 * cycle_s, 'floor_ms': 1e3 * hops * hop_s,
-        'ratio': cycle_s / (hops * hop_s), 'hop_us': 1e6 * hop_s,
-        'estimator_ms': 1e3 * np.median([r.estimate.latency_s for r in cycles]),
-        'phases_ms': {phase.name.lower(): 1e3 * np.median(
-            [r.durations_s().get(phase, np.nan) for r in cycles]) for phase in m.Phase},
-    }
-    print(f'cycle     {figures["cycle_ms"]:7.2f} ms  from beacon to end, median of {len(cycles)}, '
-          f'{options.users} users, one process per node')
-    print(f'floor     {figures["floor_ms"]:7.2f} ms  {hops} hops of {figures["hop_us"]:.0f} us')
-    print(f'ratio     {figures["ratio"]:7.2f}')
-    print(f'estimator {figures["estimator_ms"]:7.2f} ms')
-    for phase, value in figures['phases_ms'].items():
-        print(f'  {phase:12s}{value:7.2f} ms')
+    results = {}
+    for layout in options.layout or WHERE:
+        results[layout] = measure(options.users, options.cycles, composed=layout == 'composed')
+        report(results[layout], layout)
     if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+        write_whole(options.json, json.dumps(results, indent=2) + '\n')
     return 0
 
 
-def run_cycles(scenario: Scenario, users: int, cycles: int) -> list:
-    """Run the network and return the records of its complete cycles."""
-    observer = CycleObserver()
+def measure(users: int, cycles: int, composed: bool) -> dict:
+    """Run ping-pong, the network, and ping-pong again; return the figures."""
+    scenario = Scenario()
+    rclpy.init(args=[])
+    try:
+        before_s = ping_pong(scenario, composed)
+        chains = run_cycles(scenario, users, cycles, composed)[WARM_UP:]
+        after_s = ping_pong(scenario, composed)
+    finally:
+        rclpy.try_shutdown()
+    hops_s = np.concatenate([before_s, after_s]) / 2
+    hop_s, n_hops = float(np.median(hops_s)), hops_of(scenario)
+    cycles_s = np.array([chain.duration_s for chain in chains])
+    estimates = [chain.all(m.PositionEstimate)[0] for chain in chains]
+    compute_s = float(np.median([estimate.latency_s for estimate in estimates])
+                      + np.median(beam_times_s(scenario, estimates)))
+    cycle_s, floor_s = float(np.median(cycles_s)), n_hops * hop_s
+    return {
+        'users': users, 'cycles': len(chains), 'hops': n_hops, 'hop_us': 1e6 * hop_s,
+        'hop_p99_us': 1e6 * np.percentile(hops_s, 99), 'floor_ms': 1e3 * floor_s,
+        'cycle_ms': 1e3 * cycle_s, 'cycle_p99_ms': 1e3 * np.percentile(cycles_s, 99),
+        'ratio': cycle_s / floor_s, 'compute_ms': 1e3 * compute_s,
+        'messages_ratio': (cycle_s - compute_s) / floor_s,
+        'phases_ms': {phase.name.lower(): value for phase, value in zip(
+            m.Phase, 1e3 * np.median([np.diff(chain.began_s()) for chain in chains], axis=0),
+            strict=True)},
+        'links': links(chains, hop_s),
+    }
+
+
+def run_cycles(scenario: Scenario, users: int, cycles: int, composed: bool) -> list[Cycle]:
+    """Run the network and return its cycles."""
+    observer, executor = ChainObserver(), EventsExecutor()
+    executor.add_node(observer)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
-            start_network(processes, users, 0, None, default_codebook_file(), scenario, REST_S)
-            problem = watch(observer, processes, cycles, lambda *_: None)
+            if composed:
+                processes.start('network', users=users, rest_s=REST_S, mobility='random_walk',
+                                speed_mps=scenario.max_user_speed_mps)
+            else:
+                start_network(
+                    processes, users, 0, None, default_codebook_file(), scenario, REST_S)
+            served, end_s = 0, time.monotonic() + TIMEOUT_S
+            while observer.served < WARM_UP + cycles:
+                executor.spin_once(timeout_sec=0.5)
+                if observer.served != served:
+                    served, end_s = observer.served, time.monotonic() + TIMEOUT_S
+                if processes.ended() or time.monotonic() > end_s:
+                    name = next(iter(processes.ended()), 'network' if composed else 'bs')
+                    raise RuntimeError(f'{served} cycles; log of {name}:\n{processes.log(name)}')
+    executor.shutdown()
     observer.destroy_node()
-    if problem:
-        raise RuntimeError(problem)
-    return observer.log.complete
+    return observer.cycles()
+
+
+def beam_times_s(scenario: Scenario, estimates: list[m.PositionEstimate]) -> np.ndarray:
+    """Measure the choice of the beam for the estimates of a run, float64 [N] [s]."""
+    times_s = []
+    for estimate in estimates:
+        begin_s = time.perf_counter()
+        choose_beam(scenario, estimate.position, estimate.covariance_m2,
+                    range(scenario.n_bands), None)
+        times_s.append(time.perf_counter() - begin_s)
+    return np.array(times_s)
+
+
+def links(chains: list[Cycle], hop_s: float) -> list[dict]:
+    """Return median and 99th percentile of the time between a message and the previous one."""
+    times_s: dict[tuple[str, str], list[float]] = {}
+    for chain in chains:
+        for link in chain.links():
+            times_s.setdefault((link.name, link.sender), []).append(link.elapsed_s)
+    return [{'message': name, 'sender': sender, 'ms': 1e3 * np.median(values),
+             'p99_ms': 1e3 * np.percentile(values, 99),
+             'beyond_hop_ms': 1e3 * (np.median(values) - hop_s)}
+            for (name, sender), values in times_s.items() if len(values) > len(chains) / 2]
+
+
+def report(figures: dict, layout: str) -> None:
+    """Print the figures of an arrangement of the nodes."""
+    print(f'{WHERE[layout]}, {figures["users"]} users, {figures["cycles"]} cycles')
+    print(f'cycle     {figures["cycle_ms"]:7.2f} ms  median; 99th percentile '
+          f'{figures["cycle_p99_ms"]:.2f} ms')
+    print(f'floor     {figures["floor_ms"]:7.2f} ms  {figures["hops"]} hops of '
+          f'{figures["hop_us"]:.0f} us; 99th percentile {figures["hop_p99_us"]:.0f} us')
+    print(f'ratio     {figures["ratio"]:7.2f}')
+    print(f'computing {figures["compute_ms"]:7.2f} ms  estimate and beam')
+    print(f'ratio     {figures["messages_ratio"]:7.2f}     without computing')
+    for phase, value in figures['phases_ms'].items():
+        print(f'  {phase:12s}{value:7.2f} ms')
+    print('time since the previous message was sent, and beyond a bare hop:')
+    for link in figures['links']:
+        print(f'  {link["message"]:24s} {link["sender"]:15s}{link["ms"]:7.2f} ms '
+              f'{link["beyond_hop_ms"]:7.2f} ms; 99th percentile {link["p99_ms"]:.2f} ms')
 
 
 if __name__ == '__main__':

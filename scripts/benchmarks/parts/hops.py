@@ -28,8 +28,14 @@ def hops_of(scenario: Scenario) -> int:
     return len(BEFORE) + scenario.n_bands * len(PER_BAND) + len(AFTER)
 
 
-def ping_pong(scenario: Scenario) -> np.ndarray:
-    """Measure round trips between this process and another one, float64 [N] [s]."""
+def ping_pong(scenario: Scenario, composed: bool = False) -> np.ndarray:
+    """Measure round trips between two nodes, float64 [N] [s].
+
+    Parameters
+    ----------
+    composed
+        Whether both nodes run in this process, rather than one in another process.
+    """
     feeds = np.ones((scenario.n_subbands, scenario.n_feeds), complex)
     message = convert.to_ros(m.FeedSignals(cycle_id=1, user=1, band=0, frame=0, signals=feeds),
         None)
@@ -46,8 +52,10 @@ def ping_pong(scenario: Scenario) -> np.ndarray:
         FeedSignals, 'benchmark/pong', on_pong, qos.EXCHANGE,
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
     executor = EventsExecutor()
-    executor.add_node(node)
-    other = subprocess.Popen([sys.executable, __file__])
+    nodes = [node, *make_pong()] if composed else [node]
+    for each in nodes:
+        executor.add_node(each)
+    other = None if composed else subprocess.Popen([sys.executable, __file__])
     try:
         while not (publisher.get_subscription_count() and node.count_publishers('benchmark/pong')):
             executor.spin_once(timeout_sec=0.1)
@@ -58,25 +66,24 @@ def ping_pong(scenario: Scenario) -> np.ndarray:
                 publisher.publish(message)
             executor.spin_once(timeout_sec=1.0)
     finally:
-        other.terminate()
-        other.wait()
+        if other is not None:
+            other.terminate()
+            other.wait()
         executor.shutdown()
-        node.destroy_node()
+        for each in nodes:
+            each.destroy_node()
     return np.array(times_s[ROUND_TRIPS // 10:])
 
 
-def pong() -> int:
-    """Echo each message until a signal ends the process."""
-    def make() -> list[Node]:
-        node = Node('pong')
-        publisher = node.create_publisher(FeedSignals, 'benchmark/pong', qos.EXCHANGE)
-        node.create_subscription(
-            FeedSignals, 'benchmark/ping', publisher.publish, qos.EXCHANGE,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
-        return [node]
-
-    return run(make, [])
+def make_pong() -> list[Node]:
+    """Return a node that echoes each message."""
+    node = Node('pong')
+    publisher = node.create_publisher(FeedSignals, 'benchmark/pong', qos.EXCHANGE)
+    node.create_subscription(
+        FeedSignals, 'benchmark/ping', publisher.publish, qos.EXCHANGE,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+    return [node]
 
 
 if __name__ == '__main__':
-    sys.exit(pong())
+    sys.exit(run(make_pong, []))
