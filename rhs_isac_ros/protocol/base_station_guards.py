@@ -121,10 +121,6 @@ class BaseStationGuards(StateMachine[State]):
         """Whether feed signals belong to another band."""
         return event.band != self._cycle.band
 
-    def configures_other_band(self, event: m.RhsConfiguration, now_s: float) -> bool:
-        """Whether positioning configurations belong to another band."""
-        return event.mode is m.Mode.POSITIONING and event.band != self._cycle.band
-
     def duplicate_frame(self, event: m.FeedSignals, now_s: float) -> bool:
         """Whether the frame was received before."""
         return event in self._cycle.frames
@@ -172,8 +168,17 @@ class BaseStationGuards(StateMachine[State]):
         """Whether only this frame of all bands was missing."""
         return self._cycle.frames.n_missing() <= 1
 
+    def before_configured_band(self, event: m.FeedSignals, now_s: float) -> bool:
+        """Whether the frame completes a band, and the configurations of the next are reported."""
+        return (self.last_frame_of_band(event, now_s)
+                and self._cycle.band + 1 in self._cycle.configured)
+
+    def for_band(self, event: m.RhsConfiguration, now_s: float) -> bool:
+        """Whether the RHS has reported the configurations of the band."""
+        return event.mode is m.Mode.POSITIONING and event.band == self._cycle.band
+
     def for_positioning(self, event: m.RhsConfiguration, now_s: float) -> bool:
-        """Whether the RHS has applied a band's configurations."""
+        """Whether the RHS has reported the configurations of any band."""
         return event.mode is m.Mode.POSITIONING
 
     def for_beam(self, event: m.RhsConfiguration, now_s: float) -> bool:

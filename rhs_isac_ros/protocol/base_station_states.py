@@ -15,7 +15,7 @@ class State(enum.Enum):
     PAUSED = 'paused'              # waits for an operator to resume or step the cycles
     RESTING = 'resting'            # waits between cycles
     BEACONING = 'beaconing'        # waits for acks
-    CONFIGURING = 'configuring'    # waits for the RHS to apply a band's configurations
+    CONFIGURING = 'configuring'    # waits for the RHS to report a band's configurations
     SOUNDING = 'sounding'          # waits for the feed signals of a band
     ESTIMATING = 'estimating'      # waits for the position estimate
     STEERING = 'steering'          # waits for the beam and for the RHS to apply it
@@ -53,6 +53,8 @@ class Cycle:
         Instance of the channel that sent the first frame; 0 before it or if unknown.
     band
         Band that is being sounded.
+    configured
+        Bands whose configurations the RHS has reported.
     received
         Signals that were sent to the positioner, once all frames are complete.
     beam_applied
@@ -66,6 +68,7 @@ class Cycle:
     user_instance: int = 0
     channel: int = 0
     band: int = 0
+    configured: set[int] = dataclasses.field(default_factory=set)
     received: m.ReceivedSignals | None = None
     beam: m.Beam | None = None
     beam_applied: bool = False

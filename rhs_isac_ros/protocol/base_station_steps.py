@@ -183,7 +183,6 @@ class BaseStationSteps(BaseStationGuards):
         cycle = self._cycle
         cycle.user = self._users.select()
         cycle.user_instance = self._instances.owner(cycle.user)
-        cycle.band = -1
         return [Send(m.Grant(
             cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance)),
                 *lost]
@@ -201,15 +200,25 @@ class BaseStationSteps(BaseStationGuards):
         """Publish the phase."""
         return self._announce(m.Phase.POSITIONING, now_s)
 
-    def command_next_band(self, event: Event, now_s: float) -> list[Action]:
-        """Request the configurations of the next band."""
-        self._cycle.band += 1
-        return self.command_band(event, now_s)
+    def command_bands(self, event: Event, now_s: float) -> list[Action]:
+        """Request the configurations of all bands, so that they are ready when a band begins."""
+        return [self._command(band) for band in range(self._scenario.n_bands)]
 
     def command_band(self, event: Event, now_s: float) -> list[Action]:
         """Request the configurations of the band."""
-        return [Send(m.RhsCommand(
-            cycle_id=self._cycle.id, band=self._cycle.band, codebook_id=self._codebook_id))]
+        return [self._command(self._cycle.band)]
+
+    def _command(self, band: int) -> Send:
+        return Send(m.RhsCommand(
+            cycle_id=self._cycle.id, band=band, codebook_id=self._codebook_id))
+
+    def store_configured(self, event: m.RhsConfiguration, now_s: float) -> None:
+        """Store that the RHS has reported the configurations of a band."""
+        self._cycle.configured.add(event.band)
+
+    def begin_next_band(self, event: m.FeedSignals, now_s: float) -> None:
+        """Begin the next band."""
+        self._cycle.band += 1
 
     def request_pilots(self, event: Event, now_s: float) -> list[Action]:
         """Request the pilots of the band."""

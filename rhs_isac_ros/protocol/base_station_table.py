@@ -100,7 +100,7 @@ TABLE = (
         target=State.BEACONING),
 
     Row(source=(State.BEACONING,), event=Timeout, guard=Steps.some_acks,
-        actions=(Steps.grant, Steps.command_next_band, Steps.announce_positioning),
+        actions=(Steps.grant, Steps.command_bands, Steps.announce_positioning),
         target=State.CONFIGURING),
     Row(source=(State.BEACONING,), event=Timeout, guard=Steps.pausing,
         actions=(Steps.apply_settings, Steps.log_unanswered), target=State.PAUSED),
@@ -154,7 +154,7 @@ TABLE = (
     Row(source=NOT_BEACONING, event=m.Ack, actions=(Steps.count_ack, Steps.register_user),
         outcome=Outcome.LATE_ACK),
     Row(source=(State.BEACONING,), event=m.Ack, guard=Steps.last_ack,
-        actions=(Steps.count_ack, Steps.accept_ack, Steps.grant, Steps.command_next_band,
+        actions=(Steps.count_ack, Steps.accept_ack, Steps.grant, Steps.command_bands,
                  Steps.announce_positioning),
         target=State.CONFIGURING),
     Row(source=(State.BEACONING,), event=m.Ack, actions=(Steps.count_ack, Steps.accept_ack)),
@@ -162,11 +162,12 @@ TABLE = (
     # Reports of the RHS: a band's configurations, or the configuration of the beam.
     Row(event=m.RhsConfiguration, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
     Row(event=m.RhsConfiguration, guard=Steps.wrong_codebook, outcome=Outcome.WRONG_CODEBOOK),
-    Row(event=m.RhsConfiguration, guard=Steps.configures_other_band,
-        outcome=Outcome.WRONG_BAND),
-    Row(source=(State.CONFIGURING,), event=m.RhsConfiguration, guard=Steps.for_positioning,
-        actions=(Steps.request_pilots,), target=State.SOUNDING),
-    Row(source=(State.SOUNDING,), event=m.RhsConfiguration, guard=Steps.for_positioning),
+    Row(source=(State.CONFIGURING,), event=m.RhsConfiguration, guard=Steps.for_band,
+        actions=(Steps.store_configured, Steps.request_pilots), target=State.SOUNDING),
+    Row(source=(State.CONFIGURING, State.SOUNDING), event=m.RhsConfiguration,
+        guard=Steps.for_positioning, actions=(Steps.store_configured,)),
+    Row(source=(State.ESTIMATING, State.STEERING, State.TRANSMITTING), event=m.RhsConfiguration,
+        guard=Steps.for_positioning, outcome=Outcome.DUPLICATE),
     # The beam and its configuration come from two roles, in either order.
     Row(source=(State.ESTIMATING,), event=m.RhsConfiguration, guard=Steps.for_beam,
         actions=(Steps.store_beam_applied,), target=State.STEERING),
@@ -186,8 +187,12 @@ TABLE = (
     Row(event=m.FeedSignals, guard=Steps.duplicate_frame, outcome=Outcome.DUPLICATE),
     Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_frame,
         actions=(Steps.store_frame, Steps.send_signals), target=State.ESTIMATING),
+    Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.before_configured_band,
+        actions=(Steps.store_frame, Steps.begin_next_band, Steps.request_pilots),
+        enter_again=True),
+    # The report of the RHS is late or lost.
     Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_frame_of_band,
-        actions=(Steps.store_frame, Steps.command_next_band), target=State.CONFIGURING),
+        actions=(Steps.store_frame, Steps.begin_next_band), target=State.CONFIGURING),
     Row(source=(State.SOUNDING,), event=m.FeedSignals, actions=(Steps.store_frame,)),
 
     # Position estimates.

@@ -12,7 +12,7 @@ from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
 
-# Number of cycles and commands kept to recognise late and repeated messages.
+# Number of cycles kept to recognise late and repeated messages.
 _MAX_REMEMBERED = 8
 
 
@@ -20,7 +20,7 @@ class State(enum.Enum):
     """States of the RHS controller."""
 
     IDLE = 'idle'                  # applies no configuration
-    POSITIONING = 'positioning'    # applies a band's configurations, one for each frame
+    POSITIONING = 'positioning'    # applies the bands' configurations, one for each frame
     TRANSMITTING = 'transmitting'  # applies the configuration of a beam
 
 
@@ -35,9 +35,8 @@ class RhsControllerSteps(StateMachine[State]):
         self._beam_sender = 0
         # The user of each granted cycle.
         self._granted: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
-        # Cycle, band and codebook of the latest executed commands; the last one is the current
-        # command.
-        self._applied: NewestDict[tuple[int, int, str], None] = NewestDict(_MAX_REMEMBERED)
+        # Band and codebook of the executed commands of each cycle.
+        self._applied: NewestDict[int, set[tuple[int, str]]] = NewestDict(_MAX_REMEMBERED)
         # Reset by the next executed command, so that each outage is logged once.
         self._unknown_logged = False
 
@@ -52,13 +51,16 @@ class RhsControllerSteps(StateMachine[State]):
         return event.codebook_id not in self._codebooks
 
     def repeats_command(self, event: m.RhsCommand, now_s: float) -> bool:
-        """Whether the configurations of a command are those applied now."""
-        current = next(reversed(self._applied), None)
-        return self.state is State.POSITIONING and _key(event) == current
+        """Whether a command of the current cycle was executed before."""
+        return (self.state is State.POSITIONING and event.cycle_id == self._cycle_id
+                and self._is_applied(event))
 
     def stale_command(self, event: m.RhsCommand, now_s: float) -> bool:
-        """Whether a command was executed before."""
-        return _key(event) in self._applied
+        """Whether a command was executed before, and its cycle or its positioning has ended."""
+        return self._is_applied(event)
+
+    def _is_applied(self, command: m.RhsCommand) -> bool:
+        return (command.band, command.codebook_id) in self._applied.get(command.cycle_id, ())
 
     def wrong_cycle(self, event: m.Beam, now_s: float) -> bool:
         """Whether a beam belongs to a cycle other than that of the last command."""
@@ -94,7 +96,8 @@ class RhsControllerSteps(StateMachine[State]):
     def apply_band(self, event: m.RhsCommand, now_s: float) -> list[Action]:
         """Report the codebook's configurations of a band."""
         self._cycle_id, self._unknown_logged = event.cycle_id, False
-        self._applied.put(_key(event), None)
+        applied = self._applied.get(event.cycle_id, set())
+        self._applied.put(event.cycle_id, applied | {(event.band, event.codebook_id)})
         analog = self._codebooks.take(event.codebook_id).analog[event.band]
         return [Send(m.RhsConfiguration(
             cycle_id=event.cycle_id, mode=m.Mode.POSITIONING, band=event.band,
@@ -115,10 +118,6 @@ class RhsControllerSteps(StateMachine[State]):
         return [LogMessage(
             f'codebook {event.codebook_id!r} rejected; in use: {self._codebooks.in_use!r}, '
             f'available: {self._codebooks.ids()}', warning=True)]
-
-
-def _key(command: m.RhsCommand) -> tuple[int, int, str]:
-    return command.cycle_id, command.band, command.codebook_id
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

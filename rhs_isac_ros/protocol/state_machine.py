@@ -43,6 +43,9 @@ class Transition(Generic[StateT, RoleT, EventT]):
         Outcome to count, or None.
     restart_timeout
         Whether to restart the timeout although the state does not change.
+    enter_again
+        Whether the state is entered again, although it does not change: the timeout restarts, and
+        `StateMachine.repeats` is 0.
     """
 
     source: tuple[StateT, ...] | None = ANY
@@ -52,6 +55,7 @@ class Transition(Generic[StateT, RoleT, EventT]):
     target: StateT | None = SAME
     outcome: Outcome | None = None
     restart_timeout: bool = False
+    enter_again: bool = False
 
 
 class StateMachine(CountingRole, Generic[StateT]):
@@ -73,7 +77,7 @@ class StateMachine(CountingRole, Generic[StateT]):
     state
         Current state.
     repeats
-        Number of times that the timeout of the current state was restarted.
+        Number of times that the timeout was restarted since the current state was entered.
     """
 
     STATES: ClassVar[type[enum.Enum]]
@@ -146,10 +150,10 @@ class StateMachine(CountingRole, Generic[StateT]):
         for action in row.actions:
             actions += action(self, event, now_s) or ()
         target = row.target or self.state
-        changes = target is not self.state
-        if changes or row.restart_timeout:
+        enters = row.enter_again or target is not self.state
+        if enters or row.restart_timeout:
             self.state = target
-            self.repeats = 0 if changes else self.repeats + 1
+            self.repeats = 0 if enters else self.repeats + 1
             # Looked up after the actions, which may have changed the timeouts.
             timeout_s = self._timeouts_s.get(self.state)
             self._deadline_s = None if timeout_s is None else now_s + timeout_s

@@ -15,10 +15,10 @@ from rhs_isac_ros.protocol.base_station_states import State
 
 PACKAGE = Path(rhs_isac_ros.__file__).parent
 # Messages of one cycle with two bands of two frames.
-OF_A_BAND = [m.RhsCommand, m.RhsConfiguration, m.PilotRequest, m.Pilot, m.Pilot, m.FeedSignals,
-             m.FeedSignals]
-OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, *OF_A_BAND, *OF_A_BAND, m.ReceivedSignals,
-              m.PositionEstimate, m.Beam, m.RhsConfiguration, m.Data, m.Data, m.Data, m.Data]
+OF_A_BAND = [m.PilotRequest, m.Pilot, m.Pilot, m.FeedSignals, m.FeedSignals]
+OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, m.RhsCommand, m.RhsCommand, m.RhsConfiguration,
+              m.RhsConfiguration, *OF_A_BAND, *OF_A_BAND, m.ReceivedSignals, m.PositionEstimate,
+              m.Beam, m.RhsConfiguration, m.Data, m.Data, m.Data, m.Data]
 BESIDES = (m.ProtocolState, m.GroundTruth, m.Capacity, m.CapacityStatistics)
 
 

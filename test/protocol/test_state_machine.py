@@ -37,6 +37,10 @@ class Fail:
     pass
 
 
+class Renew:
+    pass
+
+
 class LightSteps(StateMachine):
     """A traffic light that records its actions."""
 
@@ -63,7 +67,8 @@ class LightSteps(StateMachine):
 
 class Light(LightSteps):
     STATES = State
-    EVENT_NAMES = {Go: 'go', Stop: 'stop', Blink: 'blink', Wait: 'wait', Fail: 'fail'}
+    EVENT_NAMES = {Go: 'go', Stop: 'stop', Blink: 'blink', Wait: 'wait', Fail: 'fail',
+                   Renew: 'renew'}
     TABLE = (
         Transition(event=Go, guard=LightSteps.past, outcome=Outcome.STALE),
         Transition(source=(State.RED,), event=Go, guard=LightSteps.fast, target=State.GREEN,
@@ -76,6 +81,7 @@ class Light(LightSteps):
                    target=State.RED),
         Transition(source=(State.RED,), event=Wait),
         Transition(source=(State.RED, State.GREEN), event=Blink, restart_timeout=True),
+        Transition(event=Renew, enter_again=True),
         Transition(event=Blink, actions=(LightSteps.log,), outcome=Outcome.DUPLICATE),
         Transition(event=Fail, actions=(LightSteps.log,), target=State.DARK,
                    outcome=Outcome.OVERFLOW),
@@ -151,6 +157,13 @@ def test_a_restarted_timeout_is_counted_until_the_state_changes():
             State.RED, 3.0 * n + 10.0, n)
     light.handle(Go(), 7.0)
     assert light.repeats == 0
+
+
+def test_a_state_that_is_entered_again_has_a_new_deadline_and_no_repeats():
+    light = Light()
+    light.handle(Blink(), 3.0)
+    light.handle(Renew(), 4.0)
+    assert (light.state, light.next_deadline(), light.repeats) == (State.RED, 14.0, 0)
 
 
 def test_a_row_without_source_applies_in_any_state():

@@ -61,7 +61,7 @@ WRONG = [
     (m.FeedSignals, {'band': 1, 'frame': 1}, 'bs', {}, 'duplicate'),
     (m.RhsConfiguration, {}, 'bs', {'cycle_id': 1}, 'wrong_cycle'),
     (m.RhsConfiguration, {}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),
-    (m.RhsConfiguration, {}, 'bs', {'band': 1}, 'wrong_band'),
+    (m.RhsConfiguration, {}, 'bs', {'band': 1}, ''),
     (m.RhsConfiguration, {}, 'bs', {}, ''),
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {'cycle_id': -1}, 'wrong_cycle'),
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'bs', {'codebook_id': 'x'}, 'wrong_codebook'),

@@ -128,8 +128,10 @@ def _step(message: m.Message) -> str | None:
             return 'end' if message.outcome else None
         case m.RhsConfiguration(mode=m.Mode.TRANSMISSION):
             return f'{name} (beam)'
-        case (m.RhsCommand() | m.RhsConfiguration() | m.PilotRequest() | m.Pilot()
-              | m.FeedSignals()):
+        case m.RhsCommand() | m.RhsConfiguration() if message.band > 0:
+            # Sent in parallel with those of the first band.
+            return None
+        case m.PilotRequest() | m.Pilot() | m.FeedSignals():
             return f'{name} {message.band}'
         case m.Data():
             return f'{name} {message.direction.name.lower()} {message.stage.name.lower()}'

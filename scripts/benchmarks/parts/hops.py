@@ -15,9 +15,10 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.run import run
 
-# Messages of a cycle in order. The pilots of a band are sent in parallel and count once.
-BEFORE = ('beacon', 'ack')
-PER_BAND = ('rhs/command', 'rhs/configuration', 'pilot_request', 'pilot', 'feed_signals')
+# Messages of a cycle in order. Those that are sent in parallel count once: the pilots of a band,
+# and the commands of all bands.
+BEFORE = ('beacon', 'ack', 'rhs/command', 'rhs/configuration')
+PER_BAND = ('pilot_request', 'pilot', 'feed_signals')
 AFTER = ('received_signals', 'position_estimate', 'beam', 'rhs/configuration',
          'data', 'data', 'data', 'data')
 ROUND_TRIPS = 2000
