@@ -12,10 +12,11 @@ from rhs_isac_ros.ros.run import entry
 
 
 class Radio(PlainRole):
-    """Answers each pilot with the signals that the receivers at the feeds measure.
+    """Answers the pilots of a band with the signals that the receivers at the feeds measure.
 
-    `measure` takes a band, a configuration [N_E] and the pilot. It configures the surface, lets
-    the user transmit, and returns the noisy signals at the feeds, complex [N_SB, K] [sqrt(W)].
+    `measure` takes a band, its configurations [F, N_E] and the pilots. In each frame, it
+    configures the surface and lets the user transmit. It returns the noisy signals at the feeds,
+    complex [F, N_SB, K] [sqrt(W)].
     `carry` takes data and returns the number of bits that were received.
     """
 
@@ -52,11 +53,10 @@ class Radio(PlainRole):
         for _ in range(len(self._waiting)):
             pilot = self._waiting.popleft()
             if pilot.cycle_id == self._cycle_id and pilot.band in self._applied:
-                configuration = self._applied[pilot.band][pilot.frame]
-                feeds = self._measure(pilot.band, configuration, pilot)
+                feeds = self._measure(pilot.band, self._applied[pilot.band], pilot)
                 answers.append(Send(m.FeedSignals(
                     cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender,
-                    band=pilot.band, frame=pilot.frame, signals=feeds)))
+                    band=pilot.band, signals=feeds)))
             else:
                 # The queue is bounded, so the oldest pilots, those of unfinished cycles, are
                 # discarded.
@@ -72,7 +72,7 @@ class RadioNode(RoleNode):
         self.start(Radio(measure, carry))
 
 
-def measure(band, configuration, pilot):
+def measure(band, configurations, pilot):
     """Measure with your hardware here."""
     raise NotImplementedError('no radio yet')
 

@@ -43,8 +43,8 @@ class _CycleMessages:
     applied: dict[int, list[m.RhsConfiguration]] = dataclasses.field(
         default_factory=lambda: collections.defaultdict(list))
     beam_applied: list[m.RhsConfiguration] = dataclasses.field(default_factory=list)
-    # Signals by band and frame.
-    feeds: dict[tuple[int, int], list[m.FeedSignals]] = dataclasses.field(
+    # Signals by band.
+    feeds: dict[int, list[m.FeedSignals]] = dataclasses.field(
         default_factory=lambda: collections.defaultdict(list))
     signals: list[m.ReceivedSignals] = dataclasses.field(default_factory=list)
     estimates: list[m.PositionEstimate] = dataclasses.field(default_factory=list)
@@ -64,7 +64,7 @@ class _CycleMessages:
             case m.RhsConfiguration():
                 self.beam_applied.append(message)
             case m.FeedSignals():
-                self.feeds[message.band, message.frame].append(message)
+                self.feeds[message.band].append(message)
             case m.ReceivedSignals():
                 self.signals.append(message)
             case m.PositionEstimate():
@@ -184,10 +184,9 @@ class InvariantChecker:
             if ids != {estimate.codebook_id}:
                 missing = None if ids else m.RhsConfiguration
                 yield missing, f'band {band} measured with {sorted(ids) or "no configuration"}'
-        frames = [(band, frame) for band in range(sizes['N_B']) for frame in range(sizes['F'])]
-        absent = [key for key in frames if not cycle.feeds.get(key)]
+        absent = [band for band in range(sizes['N_B']) if not cycle.feeds.get(band)]
         if absent:
-            yield m.FeedSignals, f'incomplete: no signals of (band, frame) {absent}'
+            yield m.FeedSignals, f'incomplete: no signals of bands {absent}'
         users = {feeds.user for messages in cycle.feeds.values() for feeds in messages}
         if users - {estimate.user}:
             yield None, f'signals of users {sorted(users)}'
@@ -196,19 +195,17 @@ class InvariantChecker:
         if codebook is None:
             yield None, 'codebook that was never offered'
         elif not absent:
-            yield from self._content_faults(cycle, codebook, frames)
+            yield from self._content_faults(cycle, codebook)
 
-    def _content_faults(
-            self, cycle: _CycleMessages, codebook: Codebook, frames: list[tuple[int, int]]
-    ) -> Iterator[_Fault]:
+    def _content_faults(self, cycle: _CycleMessages, codebook: Codebook) -> Iterator[_Fault]:
         """Compare the received signals with those at the feeds, combined by the codebook."""
         yield from self._position_faults(cycle)
         for band, reports in cycle.applied.items():
             if any(not np.array_equal(report.analog, codebook.analog[band]) for report in reports):
                 yield None, f'band {band} measured with a configuration not in the codebook'
         # Two channels may have answered, but the base station must have used one of them.
-        channels = [feeds for sender in {feeds.sender for feeds in cycle.feeds[frames[0]]}
-                    if (feeds := _feeds_of(sender, cycle, frames))]
+        channels = [feeds for sender in {feeds.sender for feeds in cycle.feeds[0]}
+                    if (feeds := _feeds_of(sender, cycle, self._scenario.n_bands))]
         if not channels:
             yield None, 'signals of several channels'
         elif not any(self._matches(feeds, cycle, codebook) for feeds in channels):
@@ -217,9 +214,7 @@ class InvariantChecker:
     def _matches(
             self, feeds: list[np.ndarray], cycle: _CycleMessages, codebook: Codebook) -> bool:
         """Return whether the received signals are those at the feeds, combined, and noise."""
-        sizes = self._scenario.sizes
-        stacked = np.stack(feeds).reshape(sizes['N_B'], sizes['F'], *feeds[0].shape)
-        expected = receive_feeds(self._scenario, codebook, stacked, None)
+        expected = receive_feeds(self._scenario, codebook, np.stack(feeds), None)
         noise = np.abs(cycle.signals[0].signals - expected)**2
         allowed = (_MAX_NOISE_FACTOR * self._scenario.noise_power_w
                    + 1e-12 * np.abs(expected).max()**2)
@@ -262,9 +257,8 @@ def _identity_faults(estimate: m.PositionEstimate, cycle: _CycleMessages) -> Ite
         yield None, f'estimate for other nodes of the user than granted: {sorted(instances)}'
 
 
-def _feeds_of(
-        sender: int, cycle: _CycleMessages, frames: list[tuple[int, int]]) -> list[np.ndarray]:
-    """Return the signals of all frames from one channel; empty if a frame is missing."""
-    found = [feeds.signals for key in frames
-             for feeds in [f for f in cycle.feeds[key] if f.sender == sender][:1]]
-    return found if len(found) == len(frames) else []
+def _feeds_of(sender: int, cycle: _CycleMessages, n_bands: int) -> list[np.ndarray]:
+    """Return the signals of all bands from one channel; empty if a band is missing."""
+    found = [feeds.signals for band in range(n_bands)
+             for feeds in [f for f in cycle.feeds[band] if f.sender == sender][:1]]
+    return found if len(found) == n_bands else []

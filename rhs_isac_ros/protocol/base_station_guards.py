@@ -17,7 +17,6 @@ from rhs_isac_ros.protocol.events import (
     StoodBy,
     Timeout,
 )
-from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
 from rhs_isac_ros.protocol.outage_log import OutageLog
 from rhs_isac_ros.protocol.pending_settings import PendingSettings
 from rhs_isac_ros.protocol.phase_times import PhaseTimes
@@ -48,7 +47,7 @@ class BaseStationGuards(StateMachine[State]):
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._outages, self._times = OutageLog(), PhaseTimes()
-        self._cycle = Cycle(first_cycle_id - 1, FrameBuffer(scenario.sizes))
+        self._cycle = Cycle(first_cycle_id - 1)
 
     def _use(self, settings: BaseStationSettings) -> None:
         self._users.set_policy(settings.policy)
@@ -121,9 +120,9 @@ class BaseStationGuards(StateMachine[State]):
         """Whether feed signals belong to another band."""
         return event.band != self._cycle.band
 
-    def duplicate_frame(self, event: m.FeedSignals, now_s: float) -> bool:
-        """Whether the frame was received before."""
-        return event in self._cycle.frames
+    def duplicate_signals(self, event: m.FeedSignals, now_s: float) -> bool:
+        """Whether the signals of the band were received before."""
+        return event.band in self._cycle.signals
 
     def not_delivered_uplink(self, event: m.Data, now_s: float) -> bool:
         """Whether data are anything other than uplink data delivered by the channel."""
@@ -160,18 +159,13 @@ class BaseStationGuards(StateMachine[State]):
         """Whether the ack completes the set of users to wait for."""
         return self._users.is_complete_with(event.user)
 
-    def last_frame_of_band(self, event: m.FeedSignals, now_s: float) -> bool:
-        """Whether only this frame of the band was missing."""
-        return self._cycle.frames.n_missing(self._cycle.band) <= 1
-
-    def last_frame(self, event: m.FeedSignals, now_s: float) -> bool:
-        """Whether only this frame of all bands was missing."""
-        return self._cycle.frames.n_missing() <= 1
+    def last_band(self, event: m.FeedSignals, now_s: float) -> bool:
+        """Whether the band is the last one."""
+        return self._cycle.band == self._scenario.n_bands - 1
 
     def before_configured_band(self, event: m.FeedSignals, now_s: float) -> bool:
-        """Whether the frame completes a band, and the configurations of the next are reported."""
-        return (self.last_frame_of_band(event, now_s)
-                and self._cycle.band + 1 in self._cycle.configured)
+        """Whether the RHS has reported the configurations of the next band."""
+        return self._cycle.band + 1 in self._cycle.configured
 
     def for_band(self, event: m.RhsConfiguration, now_s: float) -> bool:
         """Whether the RHS has reported the configurations of the band."""

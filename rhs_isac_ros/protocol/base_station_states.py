@@ -3,8 +3,9 @@
 import dataclasses
 import enum
 
+import numpy as np
+
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 
 
@@ -48,27 +49,29 @@ class Cycle:
     user
         User that was granted the cycle; 0 before the grant.
     user_instance
-        The granted instance of the user; if unknown, that of the first frame; otherwise 0.
+        The granted instance of the user; if unknown, that of the first signals; otherwise 0.
     channel
-        Instance of the channel that sent the first frame; 0 before it or if unknown.
+        Instance of the channel that sent the first signals; 0 before them or if unknown.
     band
         Band that is being sounded.
     configured
         Bands whose configurations the RHS has reported.
+    signals
+        Feed signals by band, complex128 [F, N_SB, K].
     received
-        Signals that were sent to the positioner, once all frames are complete.
+        Signals that were sent to the positioner, once all bands are complete.
     beam_applied
         Whether the RHS has reported the configuration of the beam.
     """
 
     id: int
-    frames: FrameBuffer
     attempt: int = 0
     user: int = 0
     user_instance: int = 0
     channel: int = 0
     band: int = 0
     configured: set[int] = dataclasses.field(default_factory=set)
+    signals: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
     received: m.ReceivedSignals | None = None
     beam: m.Beam | None = None
     beam_applied: bool = False

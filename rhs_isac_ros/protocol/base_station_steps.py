@@ -1,5 +1,7 @@
 """The actions of the base station's table."""
 
+import numpy as np
+
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_guards import BaseStationGuards
 from rhs_isac_ros.protocol.base_station_states import Cycle, timeouts
@@ -19,7 +21,6 @@ from rhs_isac_ros.protocol.events import (
     StoodBy,
     Timeout,
 )
-from rhs_isac_ros.protocol.frame_buffer import FrameBuffer
 from rhs_isac_ros.protocol.outcomes import Outcome
 
 
@@ -43,7 +44,7 @@ class BaseStationSteps(BaseStationGuards):
     def skip_cycles(self, event: Resumed, now_s: float) -> None:
         """Skip the ids of cycles that another base station has used."""
         first = max(event.first_cycle_id, self._cycle.id + 1)
-        self._cycle = Cycle(first - 1, FrameBuffer(self._scenario.sizes))
+        self._cycle = Cycle(first - 1)
 
     def store_settings(self, event: SettingsOffered, now_s: float) -> None:
         """Store settings until they may be applied."""
@@ -136,7 +137,7 @@ class BaseStationSteps(BaseStationGuards):
     def begin_cycle(self, event: Event, now_s: float) -> list[Action]:
         """Begin a cycle with its first beacon."""
         self._outages.clear_waiting()
-        self._cycle = Cycle(self._cycle.id + 1, FrameBuffer(self._scenario.sizes))
+        self._cycle = Cycle(self._cycle.id + 1)
         self._users.begin_cycle()
         return self._beacon(now_s)
 
@@ -227,17 +228,18 @@ class BaseStationSteps(BaseStationGuards):
             cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance,
             band=cycle.band, n_frames=self._scenario.n_frames))]
 
-    def store_frame(self, event: m.FeedSignals, now_s: float) -> None:
-        """Store the feed signals of a frame; all frames come from the same instances."""
+    def store_signals(self, event: m.FeedSignals, now_s: float) -> None:
+        """Store the feed signals of a band; those of all bands come from the same instances."""
         self._cycle.user_instance = self._cycle.user_instance or event.user_instance
         self._cycle.channel = self._cycle.channel or event.sender
-        self._cycle.frames.add(event)
+        self._cycle.signals[event.band] = event.signals
 
     def send_signals(self, event: m.FeedSignals, now_s: float) -> list[Action]:
-        """Combine all frames and send the received signals to the positioner."""
+        """Combine the signals of all bands and send the received signals to the positioner."""
         assert self._codebook
         cycle = self._cycle
-        signals = self._receiver(self._codebook, cycle.frames.stack(), cycle.user, cycle.id,
+        feeds = np.stack([cycle.signals[band] for band in range(self._scenario.n_bands)])
+        signals = self._receiver(self._codebook, feeds, cycle.user, cycle.id,
                                  self._settings.in_use.receiver_noise)
         cycle.received = m.ReceivedSignals(
             cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance,

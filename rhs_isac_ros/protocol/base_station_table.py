@@ -43,7 +43,7 @@ EVENT_NAMES = {
     CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
     PauseRequested: 'pause', ResumeRequested: 'resume', StepRequested: 'step',
     StoodBy: 'stood_by', Resumed: 'resumed', Timeout: 'timeout', m.Ack: 'ack',
-    m.RhsConfiguration: 'configured', m.FeedSignals: 'frame', m.PositionEstimate: 'estimate',
+    m.RhsConfiguration: 'configured', m.FeedSignals: 'signals', m.PositionEstimate: 'estimate',
     m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
 
 TABLE = (
@@ -184,16 +184,15 @@ TABLE = (
     Row(event=m.FeedSignals, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
     Row(event=m.FeedSignals, guard=Steps.wrong_instance, outcome=Outcome.WRONG_INSTANCE),
     Row(event=m.FeedSignals, guard=Steps.wrong_band, outcome=Outcome.WRONG_BAND),
-    Row(event=m.FeedSignals, guard=Steps.duplicate_frame, outcome=Outcome.DUPLICATE),
-    Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_frame,
-        actions=(Steps.store_frame, Steps.send_signals), target=State.ESTIMATING),
+    Row(event=m.FeedSignals, guard=Steps.duplicate_signals, outcome=Outcome.DUPLICATE),
+    Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_band,
+        actions=(Steps.store_signals, Steps.send_signals), target=State.ESTIMATING),
     Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.before_configured_band,
-        actions=(Steps.store_frame, Steps.begin_next_band, Steps.request_pilots),
+        actions=(Steps.store_signals, Steps.begin_next_band, Steps.request_pilots),
         enter_again=True),
     # The report of the RHS is late or lost.
-    Row(source=(State.SOUNDING,), event=m.FeedSignals, guard=Steps.last_frame_of_band,
-        actions=(Steps.store_frame, Steps.begin_next_band), target=State.CONFIGURING),
-    Row(source=(State.SOUNDING,), event=m.FeedSignals, actions=(Steps.store_frame,)),
+    Row(source=(State.SOUNDING,), event=m.FeedSignals,
+        actions=(Steps.store_signals, Steps.begin_next_band), target=State.CONFIGURING),
 
     # Position estimates.
     Row(event=m.PositionEstimate, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),

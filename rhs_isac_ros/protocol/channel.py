@@ -78,9 +78,9 @@ class _Cycle:
 class Channel(PlainRole):
     """The role of the channel.
 
-    It answers a pilot or a data packet once it has received the true position of the user and the
-    configuration of the surface, in any order. The position applies to the whole cycle: messages
-    take longer in the network than the signals that they emulate.
+    It answers the pilots of a band or a data packet once it has received the true position of the
+    user and the configuration of the surface, in any order. The position applies to the whole
+    cycle: messages take longer in the network than the signals that they emulate.
 
     Parameters
     ----------
@@ -197,18 +197,18 @@ class Channel(PlainRole):
 
     def _propagate(self, pilot: m.Pilot, cycle: _Cycle, applied: np.ndarray) -> m.FeedSignals:
         band = pilot.band
-        elements = element_signals(
-            cycle.los[band], cycle.multipath[band][:, pilot.frame],
-            complex(pilot.symbol_re, pilot.symbol_im))
-        configuration = applied[pilot.frame]
         if cycle.surface is not None:
-            configuration = cycle.surface.applied(configuration)
-        feeds = feed_signals(self._scenario, band, configuration, elements)
+            applied = cycle.surface.applied(applied)
+        feeds = np.stack([
+            feed_signals(self._scenario, band, configuration, element_signals(
+                cycle.los[band], cycle.multipath[band][:, frame], symbol))
+            for frame, (configuration, symbol) in enumerate(
+                zip(applied, pilot.symbols, strict=True))])
         if cycle.factors is not None:
-            feeds = feeds * cycle.factors[band, :, pilot.frame, None]
+            feeds = feeds * cycle.factors[band].T[:, :, None]
         return m.FeedSignals(
             cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender, band=band,
-            frame=pilot.frame, signals=feeds)
+            signals=feeds)
 
     def _deliver(self, data: m.Data, cycle: _Cycle) -> m.Data | None:
         """Return the data within the capacity of the true channel; the rest is lost."""

@@ -145,24 +145,21 @@ class PilotRequest(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Pilot(Message):
-    """Pilot of a user in one frame, a symbol of unit magnitude."""
+    """Pilots of a user for a band, a symbol of unit magnitude in each frame."""
 
     user: int = number(1, _LAST_USER)
     band: int = index('N_B')
-    frame: int = index('F')
-    symbol_re: float
-    symbol_im: float
+    symbols: np.ndarray = array('F', complex)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class FeedSignals(Message):
-    """Signals at the feeds for one pilot."""
+    """Signals at the feeds for the pilots of a band."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
     band: int = index('N_B')
-    frame: int = index('F')
-    signals: np.ndarray = array('N_SB K', complex)
+    signals: np.ndarray = array('F N_SB K', complex)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

@@ -203,12 +203,11 @@ class UserSteps(StateMachine[State]):
         return [Send(truth)]
 
     def send_pilots(self, event: m.PilotRequest, now_s: float) -> list[Action]:
-        """Send a pilot in each frame of a band."""
+        """Send the pilots of a band, one for each frame."""
         self._sounded = event.cycle_id, event.band
         return [Send(m.Pilot(
-            cycle_id=event.cycle_id, user=event.user, band=event.band, frame=frame,
-            symbol_re=1.0, symbol_im=0.0))
-                for frame in range(event.n_frames)]
+            cycle_id=event.cycle_id, user=event.user, band=event.band,
+            symbols=np.ones(event.n_frames, complex)))]
 
     def send_uplink(self, event: m.Data, now_s: float) -> list[Action]:
         """Answer downlink data with the same amount of uplink data."""

@@ -13,7 +13,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
 # For handshakes and signals, which must all arrive and are useless to late joiners. The depth
-# holds the pilots of a band.
+# holds the acks of the users of a beacon, and messages that arrive during a computation.
 EXCHANGE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE)

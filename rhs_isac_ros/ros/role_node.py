@@ -26,7 +26,6 @@ from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.log_once import LogOnce
-from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
 from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
@@ -63,7 +62,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     Raises
     ------
     ParameterError
-        If a parameter is invalid, or the scenario has more frames than the depth of the topics.
+        If a parameter is invalid.
     ScenarioError
         If the scenario file is invalid.
     """
@@ -76,10 +75,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         super().__init__(executable, name, **node_options)
         self._executable = executable
         self.scenario = scenario_of(self.values)
-        if self.scenario.n_frames > qos.EXCHANGE.depth:
-            raise ParameterError(
-                f'scenario_file: n_frames {self.scenario.n_frames}, expected at most '
-                f'{qos.EXCHANGE.depth}, the depth of the topics')
         self._sizes = self.scenario.sizes
         self.instance = new_instance()
         self._identity = self.instance, self.scenario.id

@@ -22,8 +22,8 @@ SIZES = SCENARIO.sizes
 COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
          m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'],
          m.RhsConfiguration: SIZES['N_B'] + 1,
-         m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'] * SIZES['F'],
-         m.FeedSignals: SIZES['N_B'] * SIZES['F'], m.Data: 4, m.ProtocolState: 4}
+         m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'],
+         m.FeedSignals: SIZES['N_B'], m.Data: 4, m.ProtocolState: 4}
 # Parameters of the nodes, in another order than in test_start_and_stop.
 BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.02, 'ack_timeout_s': 0.3},
         'positioner': {}, 'optimizer': {}, 'rhs_controller': {}}
@@ -130,7 +130,7 @@ def test_received_signals_are_the_combined_feed_signals_and_noise(cycles):
     for messages in cycles.messages:
         feeds = np.empty((2, 4, 8, 3), complex)
         for message in messages[m.FeedSignals]:
-            feeds[message.band, message.frame] = message.signals
+            feeds[message.band] = message.signals
         received, = messages[m.ReceivedSignals]
         residuals.append(received.signals - receive_feeds(SCENARIO, codebook, feeds, None))
     power = np.mean(np.abs(residuals)**2)
@@ -276,17 +276,16 @@ def test_nan_from_a_faulty_node_is_dropped(network, join):
     sent = collections.Counter()
 
     def send_nan(request):
-        for frame in range(request.n_frames):
-            signals = np.full((8, 3), complex(math.nan, 0))
-            feeds.publish(convert.to_ros(m.FeedSignals(
-                cycle_id=request.cycle_id, user=request.user, band=request.band, frame=frame,
-                signals=signals), None))
+        signals = np.full((4, 8, 3), complex(math.nan, 0))
+        feeds.publish(convert.to_ros(m.FeedSignals(
+            cycle_id=request.cycle_id, user=request.user, band=request.band, signals=signals),
+            None))
         stamp = watch.node.get_clock().now().to_msg()
         signals = np.full((2, 8, 4), complex(0, math.inf))
         received.publish(convert.to_ros(m.ReceivedSignals(
             cycle_id=request.cycle_id, user=request.user, codebook_id=codebook.id,
             signals=signals), stamp))
-        sent.update({m.FeedSignals: request.n_frames, m.ReceivedSignals: 1})
+        sent.update({m.FeedSignals: 1, m.ReceivedSignals: 1})
 
     since = {kind: len(messages) for kind, messages in watch.received.items()}
     watch.hooks[m.PilotRequest] = send_nan
@@ -295,7 +294,7 @@ def test_nan_from_a_faulty_node_is_dropped(network, join):
     del watch.hooks[m.PilotRequest]
     watch.until(lambda: all(sum(map(not_finite, watch.received[kind][since[kind]:])) == n
                             for kind, n in sent.items()), 'the messages with NaN')
-    assert sent[m.FeedSignals] >= 24
+    assert sent[m.FeedSignals] >= 6
     assert 'dropped: FeedSignals.signals: not finite' in running['bs'].log
     assert 'dropped: ReceivedSignals.signals: not finite' in running['positioner'].log
     for kind in watch.received:

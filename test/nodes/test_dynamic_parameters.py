@@ -194,10 +194,7 @@ def test_band_and_impairments_change(running):
 
 def frame_change(running):
     """Largest relative change of the feed signals between the first two frames of a band."""
-    frames = {}
-    for feeds in running.watch.received[m.FeedSignals]:
-        frames.setdefault((feeds.cycle_id, feeds.band), {})[feeds.frame] = feeds.signals
-    _, latest = max((key, value) for key, value in frames.items() if {0, 1} <= value.keys())
+    latest = running.watch.received[m.FeedSignals][-1].signals
     return np.abs(latest[1] - latest[0]).max() / np.abs(latest[0]).max()
 
 
@@ -207,7 +204,7 @@ def test_failed_elements_are_switched_on_and_off(running):
     running.until_reported('channel', parameter__failed_element_share='1.0',
                            pending__failed_element_share=None)
     n_before = len(running.watch.received[m.FeedSignals])
-    running.watch.until(lambda: len(running.watch.received[m.FeedSignals]) > n_before + 20,
+    running.watch.until(lambda: len(running.watch.received[m.FeedSignals]) > n_before + 5,
                         'feed signals', [running.process])
     # Doppler changes the multipath by about 1e-3 from frame to frame.
     assert frame_change(running) < 5e-3

@@ -32,8 +32,8 @@ def configuration(codebooks):
 
 
 @pytest.fixture
-def pilots():
-    return pilots_of(3, 1)
+def pilots(scenario):
+    return pilots_of(scenario, 3, 1)
 
 
 @pytest.fixture
@@ -60,26 +60,23 @@ def downlink():
 def test_the_channel_answers_pilots_for_any_order_of_messages(
         scenario, truth, configuration, pilots):
     answers = []
-    for order in itertools.permutations([truth, configuration, *pilots]):
+    for order in itertools.permutations([truth, configuration, pilots]):
         sent = feed(Channel(scenario, 0), order)
         # No answer before all messages that it needs have arrived.
-        known = max(order.index(truth), order.index(configuration))
-        assert all(not s for s in sent[:known])
-        answers.append({f.frame: f for batch in sent for f in batch})
-    for found in answers:
-        assert found.keys() == {0, 1}
-        for frame, feeds in found.items():
-            assert (feeds.cycle_id, feeds.user, feeds.band) == (3, 1, 0)
-            np.testing.assert_array_equal(feeds.signals, answers[0][frame].signals)
-    assert not np.isclose(answers[0][0].signals, answers[0][1].signals).any()
+        assert sent[:2] == [[], []]
+        answers += sent[2]
+    assert len(answers) == 6
+    for feeds in answers:
+        assert (feeds.cycle_id, feeds.user, feeds.band) == (3, 1, 0)
+        np.testing.assert_array_equal(feeds.signals, answers[0].signals)
+    assert not np.isclose(answers[0].signals[0], answers[0].signals[1]).any()
 
 
 def test_feed_signals_follow_configuration_and_symbol(scenario, truth, configuration, pilots):
     def signals(analog, symbol):
         report = m.RhsConfiguration(
             cycle_id=3, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=analog)
-        pilot = m.Pilot(
-            cycle_id=3, user=1, band=0, frame=0, symbol_re=symbol.real, symbol_im=symbol.imag)
+        pilot = m.Pilot(cycle_id=3, user=1, band=0, symbols=np.full(2, symbol))
         (feeds,) = feed(Channel(scenario, 0), [truth, report, pilot])[-1]
         return feeds.signals
 
@@ -100,10 +97,10 @@ def test_the_multipath_has_zero_mean_and_the_line_of_sight_is_1(scenario, config
                   m.RhsConfiguration(
                       cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0, codebook_id='x',
                       analog=np.ones((2, 16))),
-                  m.Pilot(
-                      cycle_id=cycle_id, user=1, band=0, frame=0, symbol_re=1.0, symbol_im=0.0)]
+                  pilots_of(scenario, cycle_id, 1)]
         ((feeds,),) = feed(Channel(scenario, 0), events)[-1:]
-        sums = sums + np.array([feeds.signals, np.abs(feeds.signals)**2])
+        first = feeds.signals[0]
+        sums = sums + np.array([first, np.abs(first)**2])
     mean, power = sums / n
     los = los_gain(scenario, PLACE[None], 0)[0]
     expected = np.einsum('jm,jkm->jk', los, onboard_matrix(scenario)[0])
@@ -122,7 +119,7 @@ def test_a_pilot_of_another_user_is_not_answered(scenario, truth, configuration,
 def test_a_pilot_of_another_node_with_the_number_is_not_answered(
         scenario, truth, configuration, pilots):
     channel = Channel(scenario, 0)
-    known, foreign, by_hand = (dataclasses.replace(pilots[0], sender=sender)
+    known, foreign, by_hand = (dataclasses.replace(pilots, sender=sender)
                                for sender in (5, 6, 0))
     sent = feed(channel, [dataclasses.replace(truth, sender=5), configuration, foreign, known,
                           by_hand])
@@ -155,8 +152,7 @@ def test_a_pilot_of_the_next_cycle_waits_for_it(scenario, truth, configuration, 
     channel = Channel(scenario, 0)
     later = m.RhsConfiguration(
         cycle_id=4, mode=m.Mode.POSITIONING, band=0, codebook_id='x', analog=configuration.analog)
-    events = [truth, configuration, m.Pilot(
-        cycle_id=4, user=1, band=0, frame=0, symbol_re=1.0, symbol_im=0.0), later,
+    events = [truth, configuration, pilots_of(scenario, 4, 1), later,
               m.GroundTruth(cycle_id=4, user=1, position=PLACE, velocity=np.zeros(3))]
     sent = feed(channel, events)
     assert sent[:4] == [[]] * 4
@@ -214,13 +210,15 @@ def received(channel, codebook, user, cycle_id):
         m.GroundTruth(cycle_id=cycle_id, user=user, position=PLACE, velocity=np.zeros(3)),
         m.RhsConfiguration(cycle_id=cycle_id, mode=m.Mode.POSITIONING, band=0,
                            codebook_id='x', analog=codebook.analog[0]),
-        *pilots_of(cycle_id, user)]
-    return np.array([feeds.signals for sent in feed(channel, events) for feeds in sent])
+        m.Pilot(cycle_id=cycle_id, user=user, band=0,
+                symbols=np.ones(len(codebook.analog[0]), complex))]
+    ((feeds,),) = feed(channel, events)[-1:]
+    return feeds.signals
 
 
-def pilots_of(cycle_id, user):
-    return [m.Pilot(cycle_id=cycle_id, user=user, band=0, frame=frame, symbol_re=1.0,
-                    symbol_im=0.0) for frame in (0, 1)]
+def pilots_of(scenario, cycle_id, user):
+    return m.Pilot(cycle_id=cycle_id, user=user, band=0,
+                   symbols=np.ones(scenario.n_frames, complex))
 
 
 def make_deviating(scenario, **impairments):
@@ -252,8 +250,8 @@ def test_a_new_deviation_of_the_impaired_channel_applies_from_the_next_cycle(sce
         make_deviating(scenario), Impairments(), np.random.default_rng(0))
     before = received(channel, codebooks[0], 1, 1)
     channel.handle(SettingsOffered(Impairments(phase_std_rad=7.0)), 0.0)
-    again = [feeds.signals for sent in feed(channel, pilots_of(1, 1)) for feeds in sent]
-    np.testing.assert_array_equal(again, before)
+    ((again,),) = feed(channel, [pilots_of(scenario, 1, 1)])
+    np.testing.assert_array_equal(again.signals, before)
     assert not np.allclose(received(channel, codebooks[0], 1, 2), before, rtol=1e-3)
 
 

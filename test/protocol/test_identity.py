@@ -141,9 +141,11 @@ def test_signals_of_another_instance_are_rejected(network, example, changes, acc
     net = network()
     net.run_to(State.SOUNDING)
     station, first = net['bs'], net.sent(m.Grant)[-1]
-    signals = [example(m.FeedSignals, cycle_id=first.cycle_id, user=1, frame=frame,
+    signals = [example(m.FeedSignals, cycle_id=first.cycle_id, user=1, band=band,
                        user_instance=first.user_instance, sender=net.instances['channel'])
-               for frame in (0, 1)]
+               for band in (0, 1)]
+    station.handle(example(m.RhsConfiguration, cycle_id=first.cycle_id, band=1,
+                           codebook_id=net.sent(m.RhsCommand)[-1].codebook_id), net.now_s)
     station.handle(signals[0], net.now_s)
     station.handle(dataclasses.replace(signals[1], **changes), net.now_s)
     assert (station.state is State.SOUNDING) != accepted
@@ -154,7 +156,7 @@ def test_signals_of_several_channels_are_a_violation(network):
     net = network()
     net.run_cycles(1)
     for number, sent in enumerate(net.log):
-        if isinstance(sent.message, m.FeedSignals) and sent.message.frame == 1:
+        if isinstance(sent.message, m.FeedSignals) and sent.message.band == 1:
             net.log[number] = sent._replace(message=dataclasses.replace(sent.message, sender=77))
     assert any('several channels' in text for text in violations(net))
 

@@ -32,9 +32,9 @@ LOST = [
     (m.PilotRequest, {}, 'user1', 'user_gone', {}),
     (m.PilotRequest, {'band': 1}, 'user1', 'user_gone', {}),
     (m.Pilot, {}, 'channel', 'user_gone', {}),
-    (m.Pilot, {'band': 1, 'frame': 1}, 'channel', 'user_gone', {}),
+    (m.Pilot, {'band': 1}, 'channel', 'user_gone', {}),
     (m.FeedSignals, {}, 'bs', 'user_gone', {}),
-    (m.FeedSignals, {'band': 1, 'frame': 1}, 'bs', 'user_gone', {}),
+    (m.FeedSignals, {'band': 1}, 'bs', 'user_gone', {}),
     (m.ReceivedSignals, {}, 'positioner', 'positioner_silent', {}),
     (m.PositionEstimate, {}, 'bs', 'served', {}),
     (m.PositionEstimate, {}, 'transmission', 'transmission_silent', {}),
@@ -141,24 +141,6 @@ def test_a_band_begins_once_its_configurations_are_reported(network):
     assert net.outcomes() == [(1, 1, 'served')]
     assert [command.band for command in net.sent(m.RhsCommand)] == [0, 1, 1]
     assert net.counters() == {'bs': {'retry_rhs': 1}, 'rhs_controller': {'duplicate': 1}}
-
-
-def test_a_repeated_request_keeps_the_frames_received(network):
-    """The first attempt loses the first frame of each band, the second one the second."""
-    requests = []
-
-    def loses(message, recipient):
-        if isinstance(message, m.FeedSignals):
-            if message.frame == requests.count(message.band) - 1:
-                return []
-        if isinstance(message, m.PilotRequest) and recipient == 'user1':
-            requests.append(message.band)
-        return [(1e-3, message)]
-    net = network(transport=loses, retries=3)
-    net.run_cycles(1)
-    assert net.outcomes() == [(1, 1, 'served')]
-    assert net.counters()['bs'] == {'retry_band': 2}
-    net.verify()
 
 
 def test_every_subscription_is_among_the_lost_messages(subscriptions):

@@ -70,8 +70,9 @@ SHAPES = [
     (m.RhsConfiguration, 'analog', (2, 15), '[FRAMES = 2, N_E = 16]'),
     (m.RhsConfiguration, 'analog', (16,), '[FRAMES = 2, N_E = 16]'),
     (m.RhsConfiguration, 'analog', (0, 16), '[FRAMES = 2, N_E = 16]'),
-    (m.FeedSignals, 'signals', (2, 3), '[N_SB = 3, K = 2]'),
-    (m.FeedSignals, 'signals', (3, 2, 1), '[N_SB = 3, K = 2]'),
+    (m.Pilot, 'symbols', (3,), '[F = 2]'),
+    (m.FeedSignals, 'signals', (3, 2), '[F = 2, N_SB = 3, K = 2]'),
+    (m.FeedSignals, 'signals', (3, 3, 2), '[F = 2, N_SB = 3, K = 2]'),
     (m.ReceivedSignals, 'signals', (2, 3), '[N_B = 2, N_SB = 3, F = 2]'),
     (m.ReceivedSignals, 'signals', (2, 2, 3), '[N_B = 2, N_SB = 3, F = 2]'),
     (m.ReceivedSignals, 'signals', (0,), '[N_B = 2, N_SB = 3, F = 2]'),
@@ -167,10 +168,10 @@ def test_an_index_out_of_range_is_named(example, scenario, kind, field, symbol, 
         f'{kind.__name__}.{field}: {value}, expected 0 to 1 ({symbol} = 2)')
 
 
-def test_bands_and_frames_are_indices():
+def test_bands_are_indices():
     assert {(kind.__name__, field) for kind, field, _ in INDICES} == {
         (kind.__name__, field.name) for kind in KINDS for field in dataclasses.fields(kind)
-        if field.name in ('band', 'frame')}
+        if field.name == 'band'}
 
 
 NUMBERS = [(kind, field) for kind in KINDS for field in dataclasses.fields(kind)

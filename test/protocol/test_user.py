@@ -76,10 +76,9 @@ def test_a_true_position_has_cycle_0_unless_given(user):
 
 def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
     grant(user)
-    pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=1, n_frames=3), 12.5)
-    assert [(p.cycle_id, p.user, p.band, p.frame) for p in pilots] == [
-        (7, 4, 1, frame) for frame in range(3)]
-    assert {complex(p.symbol_re, p.symbol_im) for p in pilots} == {1 + 0j}
+    pilots, = answers(user, m.PilotRequest(cycle_id=7, user=4, band=1, n_frames=3), 12.5)
+    assert (pilots.cycle_id, pilots.user, pilots.band) == (7, 4, 1)
+    assert pilots.symbols.tolist() == [1 + 0j] * 3
     assert user.next_deadline() == 15.5
 
 
@@ -142,9 +141,9 @@ def test_other_messages_to_another_user_are_ignored(user, other):
 
 def test_a_pilot_request_that_overtakes_the_grant_implies_it(user):
     user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
-    truth, *pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=0, n_frames=2), 10.5)
+    truth, pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=0, n_frames=2), 10.5)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
-    assert [(type(p), p.frame) for p in pilots] == [(m.Pilot, 0), (m.Pilot, 1)]
+    assert (type(pilots), len(pilots.symbols)) == (m.Pilot, 2)
     assert user.state is State.GRANTED
     assert user.handle(m.Grant(cycle_id=7, user=4), 11.0) == []
     assert user.next_deadline() == 13.5

@@ -28,6 +28,8 @@ pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
 
 PLACE = np.array([10.0, 0.5, 0.2])
 HUGE = (1e100, 1e200, 1e308)
+# Of the scenario of `small_files`.
+N_FRAMES = 2
 
 
 def add(bench, files, kind, **values):
@@ -113,7 +115,7 @@ def truth(cycle_id, place=PLACE):
 
 
 def pilot(cycle_id, symbol=1.0):
-    return m.Pilot(cycle_id=cycle_id, user=1, band=0, frame=1, symbol_re=symbol, symbol_im=0.0)
+    return m.Pilot(cycle_id=cycle_id, user=1, band=0, symbols=np.full(N_FRAMES, symbol + 0j))
 
 
 def applied(scenario, cycle_id, mode=m.Mode.POSITIONING, rows=None):

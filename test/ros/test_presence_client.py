@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -64,7 +65,7 @@ def test_the_older_node_stands_by_and_resumes(each_bench, capfd):
     each_bench.until(lambda: newer.report().fault, 'the report of the newer node')
     assert 'serves instead of /older' in newer.report().summary
     pilots = each_bench.publisher(probe, m.Pilot)
-    pilot = m.Pilot(cycle_id=1, user=1, band=0, frame=0, symbol_re=1.0, symbol_im=0.0)
+    pilot = m.Pilot(cycle_id=1, user=1, band=0, symbols=np.ones(4, complex))
     each_bench.until(lambda: pilots.get_subscription_count() == 2, 'both subscriptions')
     pilots.publish(convert.to_ros(pilot, None))
     each_bench.until(lambda: newer.role.events, 'the pilot')

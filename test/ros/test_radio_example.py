@@ -42,13 +42,14 @@ class Hardware:
         self._scenario, self._rng = scenario, np.random.default_rng(8)
         self.measured, self.carried = {}, []
 
-    def measure(self, band, configuration, pilot):
+    def measure(self, band, configurations, pilot):
         direct = los_gain(self._scenario, np.array([PLACE]), band)[0]
-        symbol = complex(pilot.symbol_re, pilot.symbol_im)
-        elements = element_signals(direct, np.zeros(1), symbol)
-        feeds = feed_signals(self._scenario, band, configuration, elements)
+        feeds = np.array([
+            feed_signals(self._scenario, band, configuration, element_signals(
+                direct, np.zeros(1), symbol))
+            for configuration, symbol in zip(configurations, pilot.symbols, strict=True)])
         feeds += 1e-9 * complex_normal(feeds.shape, self._rng)
-        self.measured[pilot.cycle_id, band, pilot.frame] = feeds
+        self.measured[pilot.cycle_id, band] = feeds
         return feeds
 
     def carry(self, data):
@@ -79,9 +80,7 @@ def test_a_network_with_the_radio_serves_a_user(bench, example, small_files):
     cycle_id = next(state.cycle_id for state in states if state.outcome == 'served')
     signals = next(r.signals for r in received if r.cycle_id == cycle_id)
     # The base station combined the measured signals and added nothing.
-    feeds = np.array([[hardware.measured[cycle_id, band, frame]
-                       for frame in range(scenario.n_frames)]
-                      for band in range(scenario.n_bands)])
+    feeds = np.array([hardware.measured[cycle_id, band] for band in range(scenario.n_bands)])
     np.testing.assert_array_equal(
         signals, combine(codebook.digital, np.swapaxes(feeds, 1, 2), 0.0))
     assert hardware.carried[:2] == [m.Direction.DOWNLINK, m.Direction.UPLINK]
@@ -89,7 +88,7 @@ def test_a_network_with_the_radio_serves_a_user(bench, example, small_files):
 
 @pytest.fixture
 def radio(example, small):
-    return example.Radio(lambda band, configuration, pilot: configuration[:2] * (1 + 0j),
+    return example.Radio(lambda band, configurations, pilot: configurations * (1 + 0j),
                          lambda data: 3.0)
 
 
@@ -99,8 +98,8 @@ def configuration(cycle_id, band=0):
         analog=np.array([[0.1, 0.2], [0.3, 0.4]]))
 
 
-def pilot(cycle_id, frame=0, band=0):
-    return m.Pilot(cycle_id=cycle_id, user=1, band=band, frame=frame, symbol_re=1.0, symbol_im=0.0)
+def pilot(cycle_id, band=0):
+    return m.Pilot(cycle_id=cycle_id, user=1, band=band, symbols=np.ones(2, complex))
 
 
 def answers(radio, event):
@@ -110,12 +109,11 @@ def answers(radio, event):
 
 
 def test_pilots_that_arrive_before_their_configuration_wait_for_it(radio):
-    assert answers(radio, pilot(5, 0)) == []
-    assert answers(radio, pilot(5, 1)) == []
-    sent = answers(radio, configuration(5))
-    assert [(s.cycle_id, s.band, s.frame) for s in sent] == [(5, 0, 0), (5, 0, 1)]
-    np.testing.assert_array_equal(sent[1].signals, [0.3, 0.4])
-    assert answers(radio, pilot(5, 0, band=1)) == []
+    assert answers(radio, pilot(5)) == []
+    sent, = answers(radio, configuration(5))
+    assert (sent.cycle_id, sent.band) == (5, 0)
+    np.testing.assert_array_equal(sent.signals, [[0.1, 0.2], [0.3, 0.4]])
+    assert answers(radio, pilot(5, band=1)) == []
     assert len(answers(radio, configuration(5, 1))) == 1
 
 
@@ -126,8 +124,8 @@ def test_an_old_configuration_does_not_answer_a_new_cycle(radio):
 
 
 def test_the_oldest_unanswered_pilots_are_discarded(radio):
-    for number in range(1000):
-        answers(radio, pilot(7, number))
+    for _ in range(1000):
+        answers(radio, pilot(7))
     assert len(radio._waiting) == 256
 
 

@@ -48,20 +48,19 @@ def start():
 
 
 def feed_signals(**changes):
-    content = dict(cycle_id=1, user=1, band=0, frame=0, signals=np.ones((8, 3), complex))
+    content = dict(cycle_id=1, user=1, band=0, signals=np.ones((4, 8, 3), complex))
     return m.FeedSignals(**(content | changes))
 
 
-NAN = np.where(np.arange(24).reshape(8, 3) == 5, math.nan, 1.0 + 0j)
+NAN = np.where(np.arange(96).reshape(4, 8, 3) == 5, math.nan, 1.0 + 0j)
 
 
 @pytest.mark.parametrize(('changes', 'text'), [
     ({'signals': NAN}, 'FeedSignals.signals: not finite'),
-    ({'signals': np.full((8, 3), complex(0, math.inf))}, 'FeedSignals.signals: not finite'),
+    ({'signals': np.full((4, 8, 3), complex(0, math.inf))}, 'FeedSignals.signals: not finite'),
     ({'signals': np.ones((3, 8), complex)},
-     'FeedSignals.signals: shape [3, 8], expected [N_SB = 8, K = 3]'),
+     'FeedSignals.signals: shape [3, 8], expected [F = 4, N_SB = 8, K = 3]'),
     ({'band': 2}, 'FeedSignals.band: 2, expected 0 to 1'),
-    ({'frame': 4}, 'FeedSignals.frame: 4, expected 0 to 3'),
 ])
 def test_a_malformed_message_is_dropped_counted_and_logged_once(
         each_bench, start, capfd, changes, text):
@@ -105,7 +104,7 @@ def test_many_malformed_messages_do_not_fill_the_log(bench, start, probe, capfd)
 
 
 def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capfd):
-    bad = m.FeedSignals(cycle_id=1, user=1, band=0, frame=0, signals=NAN)
+    bad = m.FeedSignals(cycle_id=1, user=1, band=0, signals=NAN)
     good = feed_signals(user=2)
     role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)],
                     sends=[m.FeedSignals])

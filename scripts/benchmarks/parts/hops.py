@@ -15,8 +15,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.run import run
 
-# Messages of a cycle in order. Those that are sent in parallel count once: the pilots of a band,
-# and the commands of all bands.
+# Messages of a cycle in order. The commands of all bands are sent in parallel and count once.
 BEFORE = ('beacon', 'ack', 'rhs/command', 'rhs/configuration')
 PER_BAND = ('pilot_request', 'pilot', 'feed_signals')
 AFTER = ('received_signals', 'position_estimate', 'beam', 'rhs/configuration',
@@ -37,9 +36,8 @@ def ping_pong(scenario: Scenario, composed: bool = False) -> np.ndarray:
     composed
         Whether both nodes run in this process, rather than one in another process.
     """
-    feeds = np.ones((scenario.n_subbands, scenario.n_feeds), complex)
-    message = convert.to_ros(m.FeedSignals(cycle_id=1, user=1, band=0, frame=0, signals=feeds),
-        None)
+    feeds = np.ones((scenario.n_frames, scenario.n_subbands, scenario.n_feeds), complex)
+    message = convert.to_ros(m.FeedSignals(cycle_id=1, user=1, band=0, signals=feeds), None)
     times_s: list[float] = []
     node = Node('ping')
     publisher = node.create_publisher(FeedSignals, 'benchmark/ping', qos.EXCHANGE)
