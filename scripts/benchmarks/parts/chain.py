@@ -100,8 +100,7 @@ class Cycle:
         for sent_s, message in self.sent:
             step = _step(message)
             if step is not None and (step not in last or sent_s > last[step][0]):
-                last[step] = sent_s, _SENDERS[type(message)] if not isinstance(
-                    message, m.Data) else _sender_of(message)
+                last[step] = sent_s, _sender_of(message)
         ordered = sorted((sent_s, step, sender) for step, (sent_s, sender) in last.items())
         return [Link(step, sender, sent_s - before_s)
                 for (before_s, _, _), (sent_s, step, sender) in zip(
@@ -114,10 +113,13 @@ _SENDERS = {
     m.PositionEstimate: 'positioner', m.Beam: 'transmission', m.ProtocolState: 'bs'}
 
 
-def _sender_of(data: m.Data) -> str:
-    if data.stage is m.Stage.DELIVERED:
-        return 'channel'
-    return 'bs' if data.direction is m.Direction.DOWNLINK else 'user'
+def _sender_of(message: m.Message) -> str:
+    match message:
+        case m.Data(stage=m.Stage.DELIVERED):
+            return 'channel'
+        case m.Data():
+            return 'bs' if message.direction is m.Direction.DOWNLINK else 'user'
+    return _SENDERS[type(message)]
 
 
 def _step(message: m.Message) -> str | None:
