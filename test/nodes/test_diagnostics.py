@@ -1,5 +1,6 @@
 """The diagnostics of every node of a running network."""
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
 from rhs_isac_ros.protocol import messages as m
@@ -35,6 +36,7 @@ def test_every_node_reports_phase_cycles_drops_and_codebook(processes, make_watc
 
     # Malformed messages are counted where they are dropped.
     publisher = watch.publisher(m.Pilot)
-    publisher.publish(convert.ros_type(m.Pilot)(cycle_id=1, user=1, band=99))
+    publisher.publish(convert.to_ros(
+        m.Pilot(cycle_id=1, user=1, band=99, symbols=np.ones(4, complex)), None))
     watch.until(lambda: ('dropped.malformed', '1') in {
         (pair.key, pair.value) for pair in reported['channel'].values}, 'the count', [network])
