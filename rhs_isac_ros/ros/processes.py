@@ -153,6 +153,18 @@ class Processes:
                 result[name] = int(pages) * page
         return result
 
+    def cpu_s(self) -> dict[str, float]:
+        """Return the CPU time of the running processes by name [s]."""
+        ticks_hz = os.sysconf('SC_CLK_TCK')
+        result = {}
+        for name, process in self._running.items():
+            if process.poll() is None:
+                text = Path(f'/proc/{process.pid}/stat').read_text(encoding='utf-8')
+                # User and system time; the name of the program, in parentheses, may have spaces.
+                user, system = text.rpartition(')')[2].split()[11:13]
+                result[name] = (int(user) + int(system)) / ticks_hz
+        return result
+
     def _spawn(self, name: str, mode: str) -> None:
         with open(self._logs / f'{name}.log', mode) as log:
             self._running[name] = subprocess.Popen(

@@ -74,7 +74,7 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
     rclpy.init(args=[])
     try:
         before_s = ping_pong(scenario, composed)
-        chains = run_cycles(scenario, users, cycles, composed)[WARM_UP:]
+        chains, cpu_s = run_cycles(scenario, users, cycles, composed)
         after_s = ping_pong(scenario, composed)
     finally:
         rclpy.try_shutdown()
@@ -92,6 +92,7 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
         'cycle_ms': 1e3 * cycle_s, 'cycle_p99_ms': 1e3 * np.percentile(cycles_s, 99),
         'ratio': cycle_s / floor_s, 'compute_ms': 1e3 * compute_s,
         'messages_ratio': (cycle_s - compute_s) / floor_s,
+        'cpu_ms': 1e3 * cpu_s,
         'cycle_p10_ms': 1e3 * quick_s, 'hop_p10_us': 1e6 * quick_hop_s,
         'ratio_p10': quick_s / (n_hops * quick_hop_s),
         'phases_ms': {phase.name.lower(): value for phase, value in zip(
@@ -101,8 +102,9 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
     }
 
 
-def run_cycles(scenario: Scenario, users: int, cycles: int, composed: bool) -> list[Cycle]:
-    """Run the network and return its cycles."""
+def run_cycles(
+        scenario: Scenario, users: int, cycles: int, composed: bool) -> tuple[list[Cycle], float]:
+    """Run the network and return its cycles, and the CPU time of all nodes for each [s]."""
     observer, executor = ChainObserver(), EventsExecutor()
     executor.add_node(observer)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
@@ -113,17 +115,20 @@ def run_cycles(scenario: Scenario, users: int, cycles: int, composed: bool) -> l
             else:
                 start_network(
                     processes, users, 0, None, default_codebook_file(), scenario, REST_S)
-            served, end_s = 0, time.monotonic() + TIMEOUT_S
+            served, end_s, before_s = 0, time.monotonic() + TIMEOUT_S, 0.0
             while observer.served < WARM_UP + cycles:
                 executor.spin_once(timeout_sec=0.5)
                 if observer.served != served:
+                    if observer.served == WARM_UP:
+                        before_s = sum(processes.cpu_s().values())
                     served, end_s = observer.served, time.monotonic() + TIMEOUT_S
                 if processes.ended() or time.monotonic() > end_s:
                     name = next(iter(processes.ended()), 'network' if composed else 'bs')
                     raise RuntimeError(f'{served} cycles; log of {name}:\n{processes.log(name)}')
+            cpu_s = (sum(processes.cpu_s().values()) - before_s) / cycles
     executor.shutdown()
     observer.destroy_node()
-    return observer.cycles()
+    return observer.cycles()[WARM_UP:], cpu_s
 
 
 def beam_times_s(scenario: Scenario, estimates: list[m.PositionEstimate]) -> np.ndarray:
@@ -165,6 +170,7 @@ def report(figures: dict, layout: str) -> None:
           f'{figures["ratio_p10"]:.2f}')
     print(f'computing {figures["compute_ms"]:7.2f} ms  estimate and beam')
     print(f'ratio     {figures["messages_ratio"]:7.2f}     without computing')
+    print(f'CPU time  {figures["cpu_ms"]:7.2f} ms  of all nodes, for each cycle and its pause')
     for phase, value in figures['phases_ms'].items():
         print(f'  {phase:12s}{value:7.2f} ms')
     print('time since the previous message was sent: median, beyond a bare hop, percentiles')

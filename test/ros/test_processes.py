@@ -111,3 +111,15 @@ def test_cores_and_memory_limit_the_number_of_processes(
     monkeypatch.setattr(processes, '_MEMORY_FILE', tmp_path / 'meminfo')
     monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: set(range(cores)))
     assert processes.max_processes() == expected
+
+
+def test_cpu_time_and_memory_are_those_of_the_running_processes(tmp_path):
+    with processes.Processes(tmp_path, {'ROS_LOG_DIR': str(tmp_path)}) as children:
+        children.start('rhs_controller')
+        (child,) = children._running.values()
+        while not (before_s := children.cpu_s()['rhs_controller']):
+            assert child.poll() is None
+        assert 0 < before_s <= children.cpu_s()['rhs_controller']
+        assert children.memory_bytes()['rhs_controller'] > 1e6
+        children.kill('rhs_controller')
+        assert children.cpu_s() == children.memory_bytes() == {}
