@@ -4,9 +4,9 @@ Problem: a cycle is a chain of messages, each sent in response to the previous o
 computations of the nodes in between. How much time does the network add to bare rclpy? The floor
 is the same number of hops, measured in the same run and with the same executor as ping-pong of a
 bare publisher and subscription: between two processes for a network whose nodes are processes, and
-between two nodes of one process for a network in one process. The computations are those of the
-estimator, as it reports them, and of the beam, measured alone on the estimates of the run. The
-10th percentile is less sensitive than the median to other programs on the machine.
+between two nodes of one process for a network in one process. The messages alone are those that
+need no estimate and no beam, compared with as many hops. The 10th percentile is less sensitive
+than the median to other programs on the machine.
 """
 
 import argparse
@@ -25,7 +25,6 @@ from rclpy.experimental import EventsExecutor
 
 from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.link import choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int
 from rhs_isac_ros.model.files import write_whole
@@ -37,6 +36,8 @@ from rhs_isac_ros.tools.demo import check_users, start_network
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
+# Links of the chain that consist of computations.
+COMPUTED = ('position_estimate', 'beam')
 # Cycles that are not evaluated.
 WARM_UP = 10
 # Maximum time between two served cycles.
@@ -81,17 +82,19 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
     hops_s = np.concatenate([before_s, after_s]) / 2
     hop_s, n_hops = float(np.median(hops_s)), hops_of(scenario)
     cycles_s = np.array([chain.duration_s for chain in chains])
-    estimates = [chain.all(m.PositionEstimate)[0] for chain in chains]
-    compute_s = float(np.median([estimate.latency_s for estimate in estimates])
-                      + np.median(beam_times_s(scenario, estimates)))
-    cycle_s, floor_s = float(np.median(cycles_s)), n_hops * hop_s
+    messages_s = np.array([sum(link.elapsed_s for link in chain.links()
+                               if link.name not in COMPUTED) for chain in chains])
+    n_messages = n_hops - len(COMPUTED)
     quick_s, quick_hop_s = np.percentile(cycles_s, 10), np.percentile(hops_s, 10)
+    cycle_s, floor_s = float(np.median(cycles_s)), n_hops * hop_s
     return {
         'users': users, 'cycles': len(chains), 'hops': n_hops, 'hop_us': 1e6 * hop_s,
         'hop_p99_us': 1e6 * np.percentile(hops_s, 99), 'floor_ms': 1e3 * floor_s,
         'cycle_ms': 1e3 * cycle_s, 'cycle_p99_ms': 1e3 * np.percentile(cycles_s, 99),
-        'ratio': cycle_s / floor_s, 'compute_ms': 1e3 * compute_s,
-        'messages_ratio': (cycle_s - compute_s) / floor_s,
+        'ratio': cycle_s / floor_s, 'messages': n_messages,
+        'messages_ms': 1e3 * np.median(messages_s),
+        'messages_ratio': np.median(messages_s) / (n_messages * hop_s),
+        'messages_ratio_p10': np.percentile(messages_s, 10) / (n_messages * quick_hop_s),
         'cpu_ms': 1e3 * cpu_s,
         'cycle_p10_ms': 1e3 * quick_s, 'hop_p10_us': 1e6 * quick_hop_s,
         'ratio_p10': quick_s / (n_hops * quick_hop_s),
@@ -131,17 +134,6 @@ def run_cycles(
     return observer.cycles()[WARM_UP:], cpu_s
 
 
-def beam_times_s(scenario: Scenario, estimates: list[m.PositionEstimate]) -> np.ndarray:
-    """Measure the choice of the beam for the estimates of a run, float64 [N] [s]."""
-    times_s = []
-    for estimate in estimates:
-        begin_s = time.perf_counter()
-        choose_beam(scenario, estimate.position, estimate.covariance_m2,
-                    range(scenario.n_bands), None)
-        times_s.append(time.perf_counter() - begin_s)
-    return np.array(times_s)
-
-
 def links(chains: list[Cycle], hop_s: float) -> list[dict]:
     """Return percentiles of the time between each message of the chain and the previous one."""
     times_s: dict[tuple[str, str], list[float]] = {}
@@ -168,8 +160,10 @@ def report(figures: dict, layout: str) -> None:
           f'{figures["hop_p99_us"]:.0f} us')
     print(f'ratio     {figures["ratio"]:7.2f}     of the medians; of the 10th percentiles '
           f'{figures["ratio_p10"]:.2f}')
-    print(f'computing {figures["compute_ms"]:7.2f} ms  estimate and beam')
-    print(f'ratio     {figures["messages_ratio"]:7.2f}     without computing')
+    print(f'messages  {figures["messages_ms"]:7.2f} ms  {figures["messages"]} hops, those without '
+          'estimate and beam')
+    print(f'ratio     {figures["messages_ratio"]:7.2f}     of the medians; of the 10th '
+          f'percentiles {figures["messages_ratio_p10"]:.2f}')
     print(f'CPU time  {figures["cpu_ms"]:7.2f} ms  of all nodes, for each cycle and its pause')
     for phase, value in figures['phases_ms'].items():
         print(f'  {phase:12s}{value:7.2f} ms')
