@@ -55,6 +55,14 @@ class _Run(NamedTuple):
 
 
 class _Field(NamedTuple):
+    """A field of a message, and the range of its items on the wire.
+
+    Attributes
+    ----------
+    encode, decode
+        As in `_Type`, or None for a single item; `decode` alone converts an enumeration.
+    """
+
     name: str
     first: int
     last: int
