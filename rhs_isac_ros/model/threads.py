@@ -136,8 +136,10 @@ def map_blocks(
     also applies here. The function must not change data that other blocks use.
     """
     with one_blas_thread:
+        if len(blocks) < 2 or getattr(_worker, 'busy', False):
+            return [function(block) for block in blocks]
         n_threads = min(one_blas_thread.allowed(), _n_cores(), len(blocks))
-        if n_threads < 2 or getattr(_worker, 'busy', False):
+        if n_threads < 2:
             return [function(block) for block in blocks]
         with ThreadPoolExecutor(n_threads, initializer=_mark_worker) as pool:
             return list(pool.map(one_blas_thread(function), blocks))

@@ -7,7 +7,7 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
-from rhs_isac_ros.positioning.separation import separate_each
+from rhs_isac_ros.positioning.separation import separate, separate_each
 from rhs_isac_ros.positioning.table import MIN_CURVATURE, TemplateTable
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
@@ -107,6 +107,11 @@ def _choose(phases: np.ndarray, modes: Modes, points: np.ndarray,
     Takes the phase of each mode, int [M], ascending; returns indices in the same order of phases.
     """
     value = modes.roi_log_likelihood
+    if phases[0] == phases[-1]:
+        order = np.argsort(-value)
+        order = order[value[order] >= value[order[0]] - margin]
+        kept: np.ndarray = order[separate(points[order] / _MIN_SEPARATION, MAX_MODES)]
+        return kept
     order = np.lexsort((-value, phases))
     first = np.searchsorted(phases, phases)
     # Modes of one phase are adjacent before and after sorting.

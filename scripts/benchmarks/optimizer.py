@@ -5,7 +5,8 @@ of the value and its gradient cost, compared with automatic differentiation of t
 and with the matrix products that are unavoidable? (b) How long does each method take to reach an
 average bound of 0.0415 m^2 on held-out positions? (c) How do time and memory grow with the numbers
 of positions, elements and bands? (d) How much faster is the objective ambiguity on samples of its
-pairs than with all pairs in each step?
+pairs than with all pairs in each step? (e) What do surfaces with up to 4096 elements and four
+bands need? Part (e) takes several minutes and is not run by default.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from parts.ambiguity_speed import ambiguity_speed
-from parts.optimizer_growth import GROWTH, POSITIONS, growth, side_by_side
+from parts.optimizer_growth import GROWTH, POSITIONS, growth, side_by_side, surfaces
 from peers.jax_crlb import JaxAverageCrlb
 from scipy.optimize import minimize
 
@@ -57,7 +58,7 @@ def main() -> None:
                         help='number of cores and threads')
     parser.add_argument('--limit', type=positive_float, default=120.0,
                         help='time limit per method in (b) [s]')
-    parser.add_argument('--parts', type=parts, default='abcd', help='parts to run')
+    parser.add_argument('--parts', type=parts, default='abcd', help='letters of abcde')
     parser.add_argument('--json', type=output_file, help='JSON file for the results')
     parser.add_argument('--picture', type=picture_file, help='file for the picture')
     options = parser.parse_args()
@@ -69,7 +70,7 @@ def main() -> None:
     figures: dict = {'threads': options.threads}
     for part, measure in (
             ('a', gradient), ('b', lambda: target(options.limit)), ('c', growth),
-            ('d', ambiguity_speed)):
+            ('d', ambiguity_speed), ('e', surfaces)):
         if part in options.parts:
             figures |= measure()
     if options.json:
@@ -80,8 +81,8 @@ def main() -> None:
 
 def parts(text: str) -> str:
     """Parse the letters of the parts, for argparse."""
-    if not text or set(text) - set('abcd'):
-        raise argparse.ArgumentTypeError(f'{text!r}, expected letters of abcd')
+    if not text or set(text) - set('abcde'):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected letters of abcde')
     return text
 
 

@@ -1,4 +1,4 @@
-"""Part (c) of the benchmark of the optimizer: time and memory by the size of the problem.
+"""Parts (c) and (e) of the benchmark of the optimizer: time and memory by the size of the problem.
 
 As a script, it measures the sizes in its argument, a JSON object, on the cores assigned to it.
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros.bounds import AverageCrlb
-from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.codebook import optimize, random_codebook
 from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
 from rhs_isac_ros.codebook.sampling import monte_carlo
 from rhs_isac_ros.model import Scenario, streams
@@ -24,6 +24,9 @@ POSITIONS = 1200
 GROWTH = {'N_sam': (100, 300, 1000, 3000, 10000), 'N_E': (100, 256, 484, 1024),
           'N_B': (1, 2, 4, 8)}
 LARGE = {'N_sam': POSITIONS, 'N_E': 1024, 'N_B': 4}
+# Numbers of elements of part (e), and steps of its optimisation.
+SURFACES = (64, 256, 1024, 4096)
+STEPS = 10
 
 
 def growth() -> dict:
@@ -56,6 +59,23 @@ def growth() -> dict:
             'large_peak_mib': rows[large]['peak_mib']}
 
 
+def surfaces() -> dict:
+    """Run part (e), each size in a new process so that its peak memory can be measured."""
+    print(f'(e) large surfaces: optimize(max_steps={STEPS}), four bands, default positions\n')
+    print('| N_E | set-up, CPU [s] | step, CPU [s] | peak [MiB] |\n|---|---|---|---|')
+    rows = {n: measure({'N_E': n, 'N_B': 4, 'steps': STEPS}) for n in SURFACES}
+    for n, row in rows.items():
+        print(f'| {n} | {row["setup_s"]:.2f} | {row["step_s"]:.3f} | {row["peak_mib"]:.0f} |')
+    powers = {}
+    for name in ('setup_s', 'step_s', 'peak_mib'):
+        values = np.log([row[name] for row in rows.values()])
+        powers[name] = (np.diff(values) / np.diff(np.log(SURFACES))).tolist()
+    print('\nexponent of N_E from one size to the next: ' + '; '.join(
+        f'{name} ' + ', '.join(f'{power:.2f}' for power in values)
+        for name, values in powers.items()) + '\n')
+    return {'surfaces': rows, 'surfaces_exponents': powers}
+
+
 def measure(sizes: dict[str, int]) -> dict:
     """Measure one size in a new process."""
     done = subprocess.run(
@@ -66,9 +86,7 @@ def measure(sizes: dict[str, int]) -> dict:
 
 def grow(sizes: dict[str, int]) -> dict:
     """Measure set-up time, evaluation time, and peak memory of this process."""
-    scenario = Scenario(
-        center_frequencies_hz=tuple(2e9 + 0.5e9 * (i + 1) for i in range(sizes['N_B'])),
-        elements_per_side=round(sizes['N_E']**0.5))
+    scenario = scenario_of(sizes)
     positions = monte_carlo(scenario, sizes['N_sam'], streams.generator(0, streams.SAMPLES))
     codebook = random_codebook(scenario, streams.generator(0, streams.START))
     begin = time.perf_counter()
@@ -76,10 +94,33 @@ def grow(sizes: dict[str, int]) -> dict:
     setup_s = time.perf_counter() - begin
     average(codebook)
     seconds = side_by_side({'evaluation': lambda: average(codebook)}, 15)['evaluation']
+    return {'setup_s': setup_s, 'evaluation_ms': 1e3 * seconds, 'peak_mib': peak_mib(),
+            'ranks': average.rows.ranks}
+
+
+def optimize_surface(sizes: dict[str, int]) -> dict:
+    """Measure an optimisation of few steps, and the peak memory of this process."""
+    scenario = scenario_of(sizes)
+    times_s: list[float] = []
+    begin = time.process_time()
+    optimize(scenario, max_steps=sizes['steps'],
+             progress=lambda entry: times_s.append(time.process_time() - begin))
+    return {'setup_s': times_s[0], 'step_s': float(np.median(np.diff(times_s))),
+            'peak_mib': peak_mib()}
+
+
+def scenario_of(sizes: dict[str, int]) -> Scenario:
+    """Return a scenario with these numbers of elements and bands."""
+    return Scenario(
+        center_frequencies_hz=tuple(2e9 + 0.5e9 * (i + 1) for i in range(sizes['N_B'])),
+        elements_per_side=round(sizes['N_E']**0.5))
+
+
+def peak_mib() -> float:
+    """Return the peak memory of this process [MiB]."""
     # getrusage would include the peak of the process that this one was forked from.
     peak = re.search(r'VmHWM:\s*(\d+) kB', Path('/proc/self/status').read_text(encoding='ascii'))
-    return {'setup_s': setup_s, 'evaluation_ms': 1e3 * seconds, 'peak_mib': int(peak[1]) / 1024,
-            'ranks': average.rows.ranks}
+    return int(peak[1]) / 1024
 
 
 def side_by_side(contenders: dict[str, Callable], rounds: int = 25) -> dict[str, float]:
@@ -94,4 +135,5 @@ def side_by_side(contenders: dict[str, Callable], rounds: int = 25) -> dict[str,
 
 
 if __name__ == '__main__':
-    print(json.dumps(grow(json.loads(sys.argv[1]))))
+    chosen = json.loads(sys.argv[1])
+    print(json.dumps(optimize_surface(chosen) if 'steps' in chosen else grow(chosen)))
