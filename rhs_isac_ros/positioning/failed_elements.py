@@ -24,7 +24,12 @@ _N_USUAL = 2
 # Points of the table and their margin, besides the modes, and sites to search from otherwise.
 _MAX_POINTS = 64
 _POINT_MARGIN = 30.0
-_N_SITES = 24
+_N_SITES = 64
+# Shares of further failures that order the sets, and numbers of sets of the same size to extend,
+# in a first search and in those that follow while the most probable set is large: almost all sets
+# that the first search finds instead of the true one are large.
+_SEARCHES = ((0.3, 8), (1.0, 16), (0.1, 16))
+_LARGE_SET = 3
 # Largest number of further searches, each under the most probable set, and their points.
 _MAX_SEARCHES = 2
 _N_PEAKS = 16
@@ -76,19 +81,27 @@ class FailedElements:
         The most likely comes first. Likelihoods are relative to those of the search, as from
         `ElementErrorModel.refine`. Signals are complex128 [N_B, N_SB F].
         """
+        search = self._search(modes, received)
+        return self._converge(search.values, search.sites, received)
+
+    def _search(self, modes: Modes, received: np.ndarray) -> FailureSearch:
+        """Search for probable sets at the modes and elsewhere."""
         order = np.argsort(-modes.roi_log_likelihood)
         search = FailureSearch(self._model, received, _MARGIN, self._usual_residual)
         keys = search.add(modes.roi_points[order])
-        if search.is_explained:
-            search.grow(keys[:_N_USUAL], partial=False)
+        if search.explains(keys):
+            search.grow(keys[:_N_USUAL])
         else:
             whitened = self._search_model.whiten(received[None])[0]
             keys = [((), index) for index in range(len(search.sites))]
             keys += search.add(self._table.modes(whitened, _MAX_POINTS, _POINT_MARGIN))
-            search.grow(keys[:_N_SITES], partial=True)
-            self._search_again(search, whitened)
+            for remainder, n_extended in _SEARCHES:
+                search.grow(keys[:_N_SITES], remainder, n_extended)
+                self._search_again(search, whitened)
+                if len(search.best[0]) < _LARGE_SET:
+                    break
         search.try_neighbours(search.best)
-        return self._converge(search.values, search.sites, received)
+        return search
 
     def _search_again(self, search: FailureSearch, whitened: np.ndarray) -> None:
         """Add sites that are probable under a set, which the average over sets may miss."""
@@ -96,7 +109,7 @@ class FailedElements:
             failed, _ = search.best
             points = self._table.peaks_under(
                 whitened, self._model.search_factor(failed), _N_PEAKS)
-            search.grow(search.add(points, failed)[:_N_GROWN], partial=False)
+            search.grow(search.add(points, failed)[:_N_GROWN])
             if search.best[0] == failed:
                 break
 

@@ -26,8 +26,6 @@ _SIGNS = np.array([-1.0, 1.0, 1.0, 1.0])[:, None, None]
 # Number of surfaces to keep, and of those with the covariances of all further failures.
 _MAX_SURFACES = 256
 _MAX_FURTHER = 8
-# Share of elements that may have failed besides those of a set, relative to the declared share.
-_REMAINDER = 0.3
 
 
 class Surface(NamedTuple):
@@ -125,11 +123,9 @@ class FailureModel:
         self._intact = Surface((), np.matmul(self._model.radiation, self._spatial),
                                self._model.covariance())
         self._surfaces: dict[tuple[int, ...], Surface] = {}
-        self._remainder = _REMAINDER * error_covariance(
+        self._error = error_covariance(
             dataclasses.replace(scenario, element_error_rms=0.0), codebook)
-        self._further: dict[tuple[tuple[int, ...], bool], Further] = {}
-        for partial in (False, True):
-            self._of_further((), partial)
+        self._further: dict[tuple[tuple[int, ...], float], Further] = {}
         share = scenario.failed_element_share
         self._log_odds = float(np.log(share / (1 - share)))
 
@@ -172,14 +168,14 @@ class FailureModel:
         return _weigh(len(surface.failed) * self._log_odds - _log_determinant(roots).sum(),
                       products[None])
 
-    def weigh_further(self, surface: Surface, site: Site, partial: bool = False) -> np.ndarray:
+    def weigh_further(self, surface: Surface, site: Site, remainder: float = 0.0) -> np.ndarray:
         """Compute the values of `weigh` if one more element fails, float64 [N_E].
 
-        If the set is `partial`, a few further elements may have failed. They add to the
-        covariance, so that elements which explain a part of the signals have a higher value
-        than elements which imitate the sum.
+        Besides, further elements may have failed, the declared share times `remainder` of them.
+        They add to the covariance, so that elements which explain a part of the signals have a
+        higher value than elements which imitate the sum.
         """
-        further = self._of_further(surface.failed, partial)
+        further = self._of_further(surface.failed, remainder)
         columns, spread = self._at(surface, site)
         # For each band and element: residual and derivatives, then the spread of all failures.
         parts = np.concatenate([
@@ -221,19 +217,18 @@ class FailureModel:
         return (site.columns + site.changes[failed].sum(axis=0),
                 np.moveaxis(site.spread[failed], 0, 2))
 
-    def _of_further(self, failed: tuple[int, ...], partial: bool) -> Further:
-        if (failed, partial) not in self._further:
+    def _of_further(self, failed: tuple[int, ...], remainder: float) -> Further:
+        if (failed, remainder) not in self._further:
             surface = self.surface(failed)
             covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
-            if partial:
-                covariance += self._remainder[:, None]
+            covariance += remainder * self._error[:, None]
             roots = np.linalg.cholesky(covariance)
             if len(self._further) >= _MAX_FURTHER:
                 # Those of the intact surface remain.
                 del self._further[next(key for key in self._further if key[0])]
-            self._further[failed, partial] = Further(
+            self._further[failed, remainder] = Further(
                 np.linalg.inv(roots), _log_determinant(roots).sum(axis=0))
-        return self._further[failed, partial]
+        return self._further[failed, remainder]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
         """Change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""

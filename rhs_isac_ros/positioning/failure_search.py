@@ -7,8 +7,7 @@ import numpy as np
 
 from rhs_isac_ros.positioning.failure_model import FailureModel, Site
 
-# Hypotheses to extend, in total, of each set, and of each site.
-_N_EXTENDED = 8
+# Hypotheses to extend, of each set and of each site.
 _MAX_PER_SET = 3
 _MAX_PER_SITE = 4
 # Of the extended sets, those to weigh exactly.
@@ -50,17 +49,16 @@ class FailureSearch:
         self._usual_residual = usual_residual
         self.sites: list[Site] = []
         self.values: dict[Key, float] = {}
-        self._smallest_residual = np.inf
+        self._residuals: dict[Key, float] = {}
 
     @property
     def best(self) -> Key:
         """The most probable hypothesis."""
         return max(self.values, key=lambda key: self.values[key])
 
-    @property
-    def is_explained(self) -> bool:
+    def explains(self, keys: list[Key]) -> bool:
         """Whether a hypothesis has no more residual energy than usual."""
-        return self._smallest_residual <= self._usual_residual
+        return any(self._residuals[key] <= self._usual_residual for key in keys)
 
     def add(self, points: np.ndarray, failed: tuple[int, ...] = ()) -> list[Key]:
         """Add sites at points, float64 [P, 3], with a set; the most probable come first."""
@@ -68,15 +66,26 @@ class FailureSearch:
         self.sites += [self._model.site(point, self._received) for point in points]
         return self._weigh((failed, index) for index in range(first, len(self.sites)))
 
-    def grow(self, parents: list[Key], partial: bool) -> None:
-        """Add failures to hypotheses as long as the result is probable."""
+    def grow(self, parents: list[Key], remainder: float = 0.0, n_extended: int = 8) -> None:
+        """Add failures to hypotheses as long as the result is probable.
+
+        Parameters
+        ----------
+        remainder
+            Share of further failures that orders the sets, as in `FailureModel.weigh_further`.
+        n_extended
+            Number of sets of the same size to extend.
+        """
+        # Earlier growth does not count: it may have ended with a set that is less probable.
+        found = self._weigh(parents)
         for _ in range(_MAX_FAILURES):
-            ranked = self._weigh_children(parents, partial)
-            best = self.values[self.best]
+            ranked = self._weigh_children(parents, remainder)
             exact = self._weigh(ranked[:_N_EXACT])
-            if self.values[exact[0]] < best - self._margin and self.is_explained:
+            limit = max(self.values[key] for key in found) - self._margin
+            if self.values[exact[0]] < limit and self.explains(found):
                 break
-            parents = _diverse(ranked)
+            found += exact
+            parents = _diverse(ranked, n_extended)
 
     def try_neighbours(self, key: Key) -> None:
         """Weigh the sets with one element more, less, or exchanged."""
@@ -84,7 +93,7 @@ class FailureSearch:
         smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
         self._weigh((one, index) for one in smaller)
         for parent in (failed, *smaller):
-            self._weigh(self._weigh_children([(parent, index)], partial=False)[:_N_EXACT])
+            self._weigh(self._weigh_children([(parent, index)])[:_N_EXACT])
 
     def _weigh(self, keys: Iterable[Key]) -> list[Key]:
         """Weigh hypotheses, and return them, the most probable first."""
@@ -94,30 +103,29 @@ class FailureSearch:
                 failed, index = key
                 weighed = self._model.weigh(self._model.surface(failed), self.sites[index])
                 self.values[key] = float(weighed.value[0])
-                self._smallest_residual = min(
-                    self._smallest_residual, float(weighed.residual[0]))
+                self._residuals[key] = float(weighed.residual[0])
         return sorted(keys, key=lambda key: -self.values[key])
 
-    def _weigh_children(self, parents: list[Key], partial: bool) -> list[Key]:
+    def _weigh_children(self, parents: list[Key], remainder: float = 0.0) -> list[Key]:
         """Return the sets with one more element, the most probable first."""
         children: dict[Key, float] = {}
         # The covariances of a set are computed once.
         for failed, index in sorted(parents):
             further = self._model.weigh_further(
-                self._model.surface(failed), self.sites[index], partial)
+                self._model.surface(failed), self.sites[index], remainder)
             for element, value in enumerate(further.tolist()):
                 if element not in failed:
                     children[tuple(sorted((*failed, element))), index] = value
         return sorted(children, key=lambda key: -children[key])
 
 
-def _diverse(ranked: list[Key]) -> list[Key]:
+def _diverse(ranked: list[Key], n_extended: int) -> list[Key]:
     """Choose the first hypotheses to extend, few of each set and of each site."""
     chosen: list[Key] = []
     for failed, index in ranked:
         if (sum(other == failed for other, _ in chosen) < _MAX_PER_SET
                 and sum(other == index for _, other in chosen) < _MAX_PER_SITE):
             chosen.append((failed, index))
-        if len(chosen) == _N_EXTENDED:
+        if len(chosen) == n_extended:
             break
     return chosen

@@ -11,10 +11,12 @@ errors. The last column is the share of windows in which the monitor of the resi
 windows are random draws of phases. The predicted error is that of fixes that are not possibly from
 outside of the region.
 
+The time is the median of the CPU time of an estimate, on one core.
+
 With --reference N, the first N positions of each declared row are compared with the exhaustive
 posterior of the declared model, paired. Element errors have their covariance at every point there.
-Failed elements have no such sum, because drawn surfaces do not fit the signals; their row is
-compared with the posterior that knows the surface, so that the ratio is an upper limit.
+Failed elements have no such sum: the reference of their row is the posterior if the true set and
+position are among the hypotheses of the search, so that the ratio is an upper limit.
 """
 
 import os
@@ -26,6 +28,7 @@ import argparse
 import copy
 import dataclasses
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +40,13 @@ from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import reduction, share_percent
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.imperfections import SurfaceImperfection, draw_deviations
-from rhs_isac_ros.positioning import Estimate, exhaustive_posterior, make_estimator
+from rhs_isac_ros.positioning import (
+    Estimate,
+    Estimator,
+    exhaustive_posterior,
+    make_estimator,
+)
+from rhs_isac_ros.positioning.exhaustive_failures import posterior_with_truth
 from rhs_isac_ros.positioning.residual_monitor import WINDOW, ResidualMonitor
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
@@ -85,7 +94,7 @@ def main() -> None:
         help='only rows whose name contains the text; may be repeated')
     add('--reference', type=int, default=0, metavar='N',
         help='compare the first N positions with the exhaustive posterior; 0 to omit')
-    add('--log2-points', type=positive_int, default=21,
+    add('--log2-points', type=positive_int, default=19,
         help='binary logarithm of the number of points of that posterior')
     add('--windows', type=positive_int, default=200,
         help='number of windows to which the monitor of the residuals is applied')
@@ -93,21 +102,28 @@ def main() -> None:
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}, estimator {options.estimator}\n')
     print('| signals from | scenario | no fix [%] | MSE [m^2] | predicted | in the 95 % region '
-          '[%] | median residual | warning | warned [%] |\n|---|---|---|---|---|---|---|---|---|')
+          '[%] | median residual | warning | warned [%] | time [ms] |\n'
+          '|---|---|---|---|---|---|---|---|---|---|')
     base = Scenario.from_yaml(options.config) if options.config else Scenario()
     codebook = Codebook.load(options.codebook)
-    rows = [inside_rows(name, base, codebook, changes, options)
-            for name, changes in DEVIATIONS.items() if wanted(name, options)]
-    if wanted(FOUR_BANDS, options):
-        four = Scenario(center_frequencies_hz=FOUR_BANDS_HZ)
-        random = random_codebook(four, streams.generator(options.seed, streams.START))
-        rows.append(inside_rows(
-            FOUR_BANDS, four, random, {'band_phase_std_rad': UNIFORM_RAD}, options))
-    rows.append(outside_rows(base, codebook, options))
-    if options.json:
-        options.json.write_text(
-            json.dumps([row for group in rows for row in group], indent=1) + '\n',
-            encoding='utf-8')
+    four = Scenario(center_frequencies_hz=FOUR_BANDS_HZ)
+    cases = [(name, base, codebook, changes) for name, changes in DEVIATIONS.items()]
+    cases.append((FOUR_BANDS, four, random_codebook(
+        four, streams.generator(options.seed, streams.START)),
+        {'band_phase_std_rad': UNIFORM_RAD}))
+    rows = []
+    for name, silent, its_codebook, changes in cases:
+        if wanted(name, options):
+            rows += inside_rows(name, silent, its_codebook, changes, options)
+            save(rows, options.json)
+    rows += outside_rows(base, codebook, options)
+    save(rows, options.json)
+
+
+def save(rows: list[dict[str, Any]], path: Path | None) -> None:
+    """Write the rows so far: all of them take long."""
+    if path:
+        path.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
 
 
 def wanted(name: str, options: argparse.Namespace) -> bool:
@@ -126,11 +142,13 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
             continue
         estimator = make_estimator(
             options.estimator, scenario, codebook, reject_outside=True)
-        estimate = estimator.estimate(received)
-        row = {'signals': name, 'scenario': kind, **figures(estimate, positions, options.windows)}
+        estimate, time_ms = estimate_timed(estimator, received)
+        row = {'signals': name, 'scenario': kind, **figures(estimate, positions, options.windows),
+               'time_ms': time_ms}
         if options.reference and kind == 'declared':
             n = options.reference
-            reference = reference_means(scenario, codebook, received[:n], surfaces[:n], options)
+            reference = reference_means(
+                scenario, codebook, positions[:n], received[:n], surfaces[:n], options)
             row |= ratio_to_reference(reference, estimate, positions[:n])
         rows.append(report(row))
     return rows
@@ -150,11 +168,24 @@ def outside_rows(scenario: Scenario, codebook: Codebook,
     for name, positions in places.items():
         if wanted(name, options):
             received = model.sample(positions, rng)
+            estimate, time_ms = estimate_timed(estimator, received)
             rows.append(report({
                 'signals': name, 'scenario': 'silent',
-                **figures(estimator.estimate(received), positions,
-                          options.windows)}))
+                **figures(estimate, positions, options.windows), 'time_ms': time_ms}))
     return rows
+
+
+def estimate_timed(estimator: Estimator, received: np.ndarray) -> tuple[Estimate, float]:
+    """Estimate positions one by one; also return the median CPU time of an estimate [ms]."""
+    estimates, times_s = [], []
+    for signals in received:
+        start_s = time.process_time()
+        estimates.append(estimator.estimate(signals))
+        times_s.append(time.process_time() - start_s)
+    fields = [np.stack([getattr(one, name) for one in estimates])
+              for name in ('mean', 'covariance', 'residual', 'expected_residual')]
+    reasons = tuple(str(one.reason) for one in estimates)
+    return Estimate(fields[0], fields[1], reasons, *fields[2:]), 1e3 * float(np.median(times_s))
 
 
 def draw(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
@@ -175,16 +206,13 @@ def draw(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
 
 
 def reference_means(
-        scenario: Scenario, codebook: Codebook, received: np.ndarray,
+        scenario: Scenario, codebook: Codebook, positions: np.ndarray, received: np.ndarray,
         surfaces: list[SurfaceImperfection | None], options: argparse.Namespace) -> np.ndarray:
-    """Compute the means of the exhaustive posterior, float64 [N, 3] [m]."""
-    if not scenario.failed_element_share:
-        return exhaustive_posterior(scenario, codebook, received, options.log2_points).mean
-    groups = range(0, len(received), PER_SURFACE)
-    return np.concatenate([
-        exhaustive_posterior(scenario, codebook, received[start:start + PER_SURFACE],
-                             options.log2_points, surface=surfaces[start]).mean
-        for start in groups])
+    """Compute the means of the reference, float64 [N, 3] [m]."""
+    known = [surface for surface in surfaces if surface]
+    if scenario.failed_element_share:
+        return posterior_with_truth(scenario, codebook, received, known, positions).mean
+    return exhaustive_posterior(scenario, codebook, received, options.log2_points).mean
 
 
 def shell(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -288,10 +316,10 @@ def report(row: dict[str, Any]) -> dict[str, Any]:
     print(f'| {row["signals"]} | {row["scenario"]} | {interval(row["no_fix_share"], 1)} | '
           f'{interval(row["mse_m2"], 2)} | {number(row["predicted_mse_m2"], 2)} | '
           f'{interval(row["covered_share"], 1)} | {number(row["median_residual"], 0)} | '
-          f'{warning} | {interval(row["warned_share"], 0)} |', flush=True)
+          f'{warning} | {interval(row["warned_share"], 0)} | {row["time_ms"]:.1f} |', flush=True)
     if 'mse_to_reference' in row:
         print(f'|  | ratio to the posterior | | {interval(row["mse_to_reference"], 3)} '
-              '| | | | | |', flush=True)
+              '| | | | | | |', flush=True)
     return row
 
 
