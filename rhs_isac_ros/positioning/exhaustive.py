@@ -20,11 +20,11 @@ _BLOCK = 4096
 def exhaustive_posterior(
         scenario: Scenario, codebook: Codebook, received: np.ndarray, log2_points: int = 22,
         progress: Callable[[float], None] | None = None, *,
-        surface: SurfaceImperfection | None = None) -> Estimate:
+        surface: SurfaceImperfection | None = None, seed: int = 0) -> Estimate:
     """Compute mean and covariance of the posterior from points all over the region of interest.
 
-    The prior is uniform on the region. All phases share the 2^log2_points points of a scrambled
-    Sobol sequence; the default number takes minutes. `progress` is called with the completed
+    The prior is uniform on the region. All phases share the 2^log2_points points of a Sobol
+    sequence, scrambled with the seed; the default number takes minutes. `progress` is called with the completed
     share of the points. Signals are complex128 [N, N_B, N_SB F] for an estimate of N positions.
 
     Gains, phases and offsets that the scenario declares as unknown are integrated out at every
@@ -50,7 +50,7 @@ def exhaustive_posterior(
     # Sums of the weights, of the weighted coordinates and of their products. Weights are relative
     # to the highest likelihood so far.
     highest, sums = np.full(n, -np.inf), np.zeros((n, 13))
-    sequence, total = qmc.Sobol(3, seed=0), 2**log2_points
+    sequence, total = qmc.Sobol(3, seed=seed), 2**log2_points
     for done in range(0, total, _BLOCK):
         points = (sequence.random(min(_BLOCK, total - done)) - 0.5) * (high - low)
         log_likelihood = log_likelihood_at(points + center)

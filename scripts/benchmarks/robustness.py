@@ -95,7 +95,7 @@ def main() -> None:
     add('--reference', type=int, default=0, metavar='N',
         help='compare the first N positions with the exhaustive posterior; 0 to omit')
     add('--log2-points', type=positive_int, default=19,
-        help='binary logarithm of the number of points of that posterior')
+        help='binary logarithm of the number of points of that posterior, of which there are two')
     add('--windows', type=positive_int, default=200,
         help='number of windows to which the monitor of the residuals is applied')
     add('--json', type=Path, help='JSON file for the results')
@@ -208,11 +208,14 @@ def draw(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
 def reference_means(
         scenario: Scenario, codebook: Codebook, positions: np.ndarray, received: np.ndarray,
         surfaces: list[SurfaceImperfection | None], options: argparse.Namespace) -> np.ndarray:
-    """Compute the means of the reference, float64 [N, 3] [m]."""
+    """Compute the means of the reference from two sets of points, float64 [2, N, 3] [m]."""
     known = [surface for surface in surfaces if surface]
     if scenario.failed_element_share:
-        return posterior_with_truth(scenario, codebook, received, known, positions).mean
-    return exhaustive_posterior(scenario, codebook, received, options.log2_points).mean
+        return np.tile(
+            posterior_with_truth(scenario, codebook, received, known, positions).mean, (2, 1, 1))
+    return np.stack([
+        exhaustive_posterior(scenario, codebook, received, options.log2_points, seed=seed).mean
+        for seed in range(2)])
 
 
 def shell(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -292,11 +295,15 @@ def mean_interval(samples: np.ndarray) -> tuple[float, float, float] | None:
 
 def ratio_to_reference(
         reference: np.ndarray, estimate: Estimate, positions: np.ndarray) -> dict[str, Any]:
-    """Compare the squared errors of fixes with those of the exhaustive posterior."""
+    """Compare the squared errors of fixes with those of the exhaustive posterior.
+
+    The mean of finitely many points has an additional error. It is independent between the two
+    sets of points, so that the product of their errors has the expectation without it.
+    """
     n = len(positions)
     fix = estimate.fix[:n]
-    own, best = (np.sum((means[:n] - positions)[fix]**2, axis=1)
-                 for means in (estimate.mean, reference))
+    own = np.sum((estimate.mean[:n] - positions)[fix]**2, axis=1)
+    best = np.sum(np.prod(reference - positions, axis=0)[fix], axis=1)
     value, low, high = reduction(own, best, lambda samples: samples.mean(axis=-1))
     return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100),
             'reference_positions': n}
