@@ -24,8 +24,9 @@ def exhaustive_posterior(
     """Compute mean and covariance of the posterior from points all over the region of interest.
 
     The prior is uniform on the region. All phases share the 2^log2_points points of a Sobol
-    sequence, scrambled with the seed; the default number takes minutes. `progress` is called with the completed
-    share of the points. Signals are complex128 [N, N_B, N_SB F] for an estimate of N positions.
+    sequence, scrambled with the seed; the default number takes minutes. `progress` is called with
+    the completed share of the points. Signals are complex128 [N, N_B, N_SB F] for an estimate of
+    N positions.
 
     Gains, phases and offsets that the scenario declares as unknown are integrated out at every
     point; see `NuisanceLikelihood`. Element errors are treated as Gaussian, with their covariance

@@ -9,7 +9,7 @@ from scipy.stats import norm, qmc
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.imperfections import draw_surface
 from rhs_isac_ros.model.nuisance import nuisance_parameters, nuisance_patterns
-from rhs_isac_ros.positioning import exhaustive_posterior
+from rhs_isac_ros.positioning import exhaustive_errors, exhaustive_posterior
 
 SCENARIO = Scenario(n_subbands=2, n_frames=3, elements_per_side=4, angular_spread_deg=5.0,
                     roi_center_m=(4, 0, 0), roi_size_m=(1, 1, 0.5))
@@ -96,6 +96,17 @@ def test_element_errors_have_the_covariance_at_every_point(codebook):
     mean, covariance = model.mean(grid()), model.covariance_at(grid())
     for phase, signals in enumerate(received):
         check(estimate, phase, log_density(signals, mean, covariance))
+
+
+def test_drawn_points_keep_the_moments(codebook, monkeypatch):
+    """Most points are not drawn, and the sums keep their expectation."""
+    scenario, received = draw(codebook, element_error_rms=0.05)
+    exact = exhaustive_posterior(scenario, codebook, received, 12)
+    monkeypatch.setattr(exhaustive_errors, '_N_EXACT', 400)
+    drawn = exhaustive_posterior(scenario, codebook, received, 12)
+    np.testing.assert_allclose(drawn.mean, exact.mean, atol=0.03)
+    np.testing.assert_allclose(drawn.covariance, exact.covariance, atol=0.01)
+    assert not np.array_equal(drawn.mean, exact.mean)
 
 
 def test_errors_of_a_known_surface_are_part_of_the_model(codebook):
