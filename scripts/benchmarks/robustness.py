@@ -33,21 +33,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.posterior_ratio import ratio_to_reference, reference_means
+from parts.warning_windows import warnings
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.experiments import positive_int
-from rhs_isac_ros.experiments.resampling import reduction, share_percent
+from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.imperfections import SurfaceImperfection, draw_deviations
-from rhs_isac_ros.positioning import (
-    Estimate,
-    Estimator,
-    exhaustive_posterior,
-    make_estimator,
-)
-from rhs_isac_ros.positioning.exhaustive_failures import posterior_with_truth
-from rhs_isac_ros.positioning.residual_monitor import WINDOW, ResidualMonitor
+from rhs_isac_ros.positioning import Estimate, Estimator, make_estimator
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
 # Squared Mahalanobis radius of the 95 % region.
@@ -148,7 +143,8 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
         if options.reference and kind == 'declared':
             n = options.reference
             reference = reference_means(
-                scenario, codebook, positions[:n], received[:n], surfaces[:n], options)
+                scenario, codebook, positions[:n], received[:n], surfaces[:n],
+                options.log2_points)
             row |= ratio_to_reference(reference, estimate, positions[:n])
         rows.append(report(row))
     return rows
@@ -205,19 +201,6 @@ def draw(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
     return np.concatenate(positions)[:n], np.concatenate(received)[:n], surfaces[:n]
 
 
-def reference_means(
-        scenario: Scenario, codebook: Codebook, positions: np.ndarray, received: np.ndarray,
-        surfaces: list[SurfaceImperfection | None], options: argparse.Namespace) -> np.ndarray:
-    """Compute the means of the reference from two sets of points, float64 [2, N, 3] [m]."""
-    known = [surface for surface in surfaces if surface]
-    if scenario.failed_element_share:
-        return np.tile(
-            posterior_with_truth(scenario, codebook, received, known, positions).mean, (2, 1, 1))
-    return np.stack([
-        exhaustive_posterior(scenario, codebook, received, options.log2_points, seed=seed).mean
-        for seed in range(2)])
-
-
 def shell(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw positions uniformly around the region, in front of the surface, [n, 3] [m]."""
     low, high = scenario.roi_bounds_m
@@ -258,32 +241,6 @@ def figures(estimate: Estimate, positions: np.ndarray, n_windows: int) -> dict[s
     }
 
 
-def warnings(estimate: Estimate, n_windows: int) -> dict[str, Any]:
-    """Apply the monitor of the positioner to the phases in order, and to random windows of them.
-
-    Returns
-    -------
-    dict
-        ``warns_after``, the number of phases until the first warning, None without one; and
-        ``warned_share``, the share of windows with a warning [%].
-    """
-    residuals = np.stack([estimate.residual, estimate.expected_residual], axis=1)
-    order = np.random.default_rng(0).integers(len(residuals), size=(n_windows, WINDOW))
-    n_warned = sum(first_warning(residuals[window]) is not None for window in order)
-    return {'warns_after': first_warning(residuals),
-            'warned_share': share_percent(n_warned, n_windows)}
-
-
-def first_warning(residuals: np.ndarray) -> int | None:
-    """Return the number of phases until the monitor warns; None if it does not."""
-    monitor = ResidualMonitor()
-    for count, (energy, expected) in enumerate(residuals.tolist(), 1):
-        monitor.add(energy, expected)
-        if monitor.drifts:
-            return count
-    return None
-
-
 def mean_interval(samples: np.ndarray) -> tuple[float, float, float] | None:
     """Return a mean with its 95 % interval by the percentile bootstrap."""
     if not len(samples):
@@ -291,22 +248,6 @@ def mean_interval(samples: np.ndarray) -> tuple[float, float, float] | None:
     picks = np.random.default_rng(0).integers(len(samples), size=(RESAMPLES, len(samples)))
     low, high = np.percentile(samples[picks].mean(axis=1), (2.5, 97.5))
     return float(samples.mean()), float(low), float(high)
-
-
-def ratio_to_reference(
-        reference: np.ndarray, estimate: Estimate, positions: np.ndarray) -> dict[str, Any]:
-    """Compare the squared errors of fixes with those of the exhaustive posterior.
-
-    The mean of finitely many points has an additional error. It is independent between the two
-    sets of points, so that the product of their errors has the expectation without it.
-    """
-    n = len(positions)
-    fix = estimate.fix[:n]
-    own = np.sum((estimate.mean[:n] - positions)[fix]**2, axis=1)
-    best = np.sum(np.prod(reference - positions, axis=0)[fix], axis=1)
-    value, low, high = reduction(own, best, lambda samples: samples.mean(axis=-1))
-    return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100),
-            'reference_positions': n}
 
 
 def report(row: dict[str, Any]) -> dict[str, Any]:

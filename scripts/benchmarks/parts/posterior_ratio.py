@@ -1,0 +1,41 @@
+"""The ratio of the mean squared error of an estimator to that of the exhaustive posterior."""
+
+from typing import Any
+
+import numpy as np
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.imperfections import SurfaceImperfection
+from rhs_isac_ros.positioning import Estimate, exhaustive_posterior
+from rhs_isac_ros.positioning.exhaustive_failures import posterior_with_truth
+
+
+def reference_means(
+        scenario: Scenario, codebook: Codebook, positions: np.ndarray, received: np.ndarray,
+        surfaces: list[SurfaceImperfection | None], log2_points: int) -> np.ndarray:
+    """Compute the means of the reference from two sets of points, float64 [2, N, 3] [m]."""
+    known = [surface for surface in surfaces if surface]
+    if scenario.failed_element_share:
+        return np.tile(
+            posterior_with_truth(scenario, codebook, received, known, positions).mean, (2, 1, 1))
+    return np.stack([
+        exhaustive_posterior(scenario, codebook, received, log2_points, seed=seed).mean
+        for seed in range(2)])
+
+
+def ratio_to_reference(
+        reference: np.ndarray, estimate: Estimate, positions: np.ndarray) -> dict[str, Any]:
+    """Compare the squared errors of fixes with those of the exhaustive posterior.
+
+    The mean of finitely many points has an additional error. It is independent between the two
+    sets of points, so that the product of their errors has the expectation without it.
+    """
+    n = len(positions)
+    fix = estimate.fix[:n]
+    own = np.sum((estimate.mean[:n] - positions)[fix]**2, axis=1)
+    best = np.sum(np.prod(reference - positions, axis=0)[fix], axis=1)
+    value, low, high = reduction(own, best, lambda samples: samples.mean(axis=-1))
+    return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100),
+            'reference_positions': n}
