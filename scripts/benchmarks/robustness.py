@@ -83,6 +83,8 @@ def main() -> None:
     add('--positions', type=positive_int, default=600, help='number of positions of each row')
     add('--seed', type=int, default=1, help='seed of all random numbers')
     add('--estimator', choices=['bayes', 'ml'], default='bayes', help='estimator')
+    add('--inside', action='store_true',
+        help='estimate without reject_outside, as if no user were outside of the region')
     add('--config', type=Path, help='scenario file; Table I if omitted')
     add('--codebook', type=Path, default=DEFAULT_CODEBOOK, help='codebook file')
     add('--only', action='append', default=[], metavar='TEXT',
@@ -135,8 +137,7 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
     for kind, scenario in (('silent', silent), ('declared', declared)):
         if kind == 'silent' and not changes:
             continue
-        estimator = make_estimator(
-            options.estimator, scenario, codebook, reject_outside=True)
+        estimator = estimator_for(scenario, codebook, options)
         estimate, time_ms = estimate_timed(estimator, received)
         row = {'signals': name, 'scenario': kind, **figures(estimate, positions, options.windows),
                'time_ms': time_ms}
@@ -153,8 +154,7 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
 def outside_rows(scenario: Scenario, codebook: Codebook,
                  options: argparse.Namespace) -> list[dict[str, Any]]:
     """Measure users outside of the region."""
-    estimator = make_estimator(
-            options.estimator, scenario, codebook, reject_outside=True)
+    estimator = estimator_for(scenario, codebook, options)
     rng = streams.generator(options.seed, streams.HELD_OUT)
     model, rows = MeasurementModel(scenario, codebook), []
     places = {f'a user at {name}': np.tile(place, (options.positions, 1))
@@ -169,6 +169,13 @@ def outside_rows(scenario: Scenario, codebook: Codebook,
                 'signals': name, 'scenario': 'silent',
                 **figures(estimate, positions, options.windows), 'time_ms': time_ms}))
     return rows
+
+
+def estimator_for(
+        scenario: Scenario, codebook: Codebook, options: argparse.Namespace) -> Estimator:
+    """Make the estimator of a row."""
+    return make_estimator(
+        options.estimator, scenario, codebook, reject_outside=not options.inside)
 
 
 def estimate_timed(estimator: Estimator, received: np.ndarray) -> tuple[Estimate, float]:
