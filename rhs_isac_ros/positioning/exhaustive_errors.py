@@ -14,7 +14,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 # Expected number of points at which the likelihood of a phase is evaluated. They are drawn with a
 # probability that follows from an approximation, raised to a power so that points which it
 # misjudges are drawn, too.
-_N_EXACT = 1500
+_N_EXACT = 600
 _POWER = 0.6
 # The approximation: the covariance in intervals of the range, each averaged over some points.
 _N_INTERVALS = 8

@@ -57,11 +57,11 @@ UNIFORM_RAD = 2 * np.pi
 # The deviations: changes of the scenario that declare each of them.
 DEVIATIONS: dict[str, dict[str, Any]] = {
     'none': {},
-    'user power off by 1 dB rms': {'user_gain_std_db': 1.0},
-    'user power off by 3 dB rms': {'user_gain_std_db': 3.0},
     '1 % of elements stuck': {'failed_element_share': 0.01},
     'element coefficients off by 1 % rms': {'element_error_rms': 0.01},
     'element coefficients off by 3 % rms': {'element_error_rms': 0.03},
+    'user power off by 1 dB rms': {'user_gain_std_db': 1.0},
+    'user power off by 3 dB rms': {'user_gain_std_db': 3.0},
     'refractive index 2.11 for 2.10': {'refractive_index': 2.11},
     'delay spread 0.1 us for 0.5': {'delay_spread_s': 0.1e-6},
     'angular spread 15 deg for 10': {'angular_spread_deg': 15.0},
@@ -91,7 +91,7 @@ def main() -> None:
         help='only rows whose name contains the text; may be repeated')
     add('--reference', type=int, default=0, metavar='N',
         help='compare the first N positions with the exhaustive posterior; 0 to omit')
-    add('--log2-points', type=positive_int, default=19,
+    add('--log2-points', type=positive_int, default=18,
         help='binary logarithm of the number of points of that posterior, of which there are two')
     add('--windows', type=positive_int, default=200,
         help='number of windows to which the monitor of the residuals is applied')
