@@ -29,8 +29,11 @@ _ENERGY_LEVELS = (2.0, 3.0, 4.0)
 # Plans with a codebook, and the positions and steps of their optimisations.
 _CANDIDATES = 6
 _SHORT_POSITIONS, _SHORT_STEPS = 64, 200
-# Candidates with a full optimisation.
-_FINALISTS = 3
+# Candidates with a full optimisation, and the largest ratio of their errors to the lowest one.
+_FINALISTS, _MAX_RATIO = 3, 1.25
+# A later candidate replaces the best one if its error is lower by this factor: two standard errors
+# of the global bound.
+_BETTER = 0.95
 # Phases of the global bound after a short optimisation, and after a full one.
 _SHORT_PHASES, _PHASES = 1024, 4096
 # Positions at which energies and errors are averaged, and quantiles that represent the energies.
@@ -98,6 +101,9 @@ def best_of(
         report: Callable[[Candidate], None] | None = None) -> BandPlan:
     """Optimise codebooks for the first candidates, and return the plan with the lowest error.
 
+    Of plans whose errors hardly differ, the first one is returned. Candidates with much larger
+    errors than the first one are left out.
+
     Parameters
     ----------
     candidates
@@ -110,6 +116,8 @@ def best_of(
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
+        if candidate.error_m2 > _MAX_RATIO * candidates[0].error_m2:
+            break
         plan = with_bands(scenario, candidate.frequencies_hz)
         result = search(plan)
         interrupted = result.reason == INTERRUPTED
@@ -119,7 +127,7 @@ def best_of(
                  expected_error(plan, result.codebook, seed, _PHASES))
         if report:
             report(dataclasses.replace(candidate, error_m2=error))
-        if best is None or error < best.error_m2:
+        if best is None or error < _BETTER * best.error_m2:
             best = BandPlan(plan, result, tuple(candidates), error)
         if interrupted:
             break

@@ -7,13 +7,16 @@ import types
 
 import numpy as np
 import pytest
+from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fields import check
-from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 
 SCENARIO = Scenario()
@@ -240,6 +243,45 @@ def test_a_user_that_crashes_in_its_cycle_is_served_after_its_restart(network, j
             break
     assert (interrupted, 3) in {(end.cycle_id, end.user) for end in watch.given_up}
     watch.until_served(2, user=3, processes=[join(3)])
+
+
+def set_prior(watch, prior):
+    client = AsyncParameterClient(watch.node, 'positioner')
+    response = watch.call(client, lambda client: client.set_parameters(
+        [Parameter('prior', value=prior)]))
+    assert response.results[0].successful
+
+
+def test_users_that_leave_and_return_elsewhere_are_tracked(network, join, processes):
+    watch, tracks = network.watch, {1: [], 3: []}
+    subscriptions = [watch.node.create_subscription(
+        Odometry, topics.ODOMETRY.format(user=user), of_user.append, qos.EXCHANGE)
+        for user, of_user in tracks.items()]
+
+    def follows(user, place, since=0):
+        """Return whether the latest tracks are at a place, with a velocity that is known."""
+        latest = tracks[user][since:][-3:]
+        points = [track.pose.pose.position for track in latest]
+        return len(latest) == 3 and all(
+            math.dist((point.x, point.y, point.z), place) < 2.0 for point in points) and all(
+            sum(track.twist.covariance[:21:7]) < 0.9 for track in latest)
+    set_prior(watch, 'track')
+    stays = join(1)
+    watch.until(lambda: follows(1, POSITIONS[1]), 'the track of user 1', [stays])
+    for place in (POSITIONS[3], POSITIONS[2]):
+        guest = processes.start('user', name='user_3', user_id=3, position_m=list(place))
+        before = len(tracks[3])
+        watch.until(lambda since=before, place=place: follows(3, place, since),
+                    'the track of user 3', [guest])
+        guest.signal(signal.SIGINT)
+        assert guest.wait() == 0, guest.log
+    # The other user keeps its track.
+    before = len(tracks[1])
+    watch.until(lambda: len(tracks[1]) > before, 'the track of user 1', [stays])
+    assert follows(1, POSITIONS[1])
+    set_prior(watch, 'region')
+    for subscription in subscriptions:
+        watch.node.destroy_subscription(subscription)
 
 
 @pytest.mark.parametrize('names', [
