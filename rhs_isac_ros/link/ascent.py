@@ -37,7 +37,10 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Configurations, float64 [N_B, n, N_E], each entry in [0, 1], and their capacities
         [nat/symbol] summed over the sub-bands, float64 [N_B, n].
     """
-    point = _Point.at(link, analog)
+    # Power received from each element for unit radiation, float64 [N_B, 1, N_SB, N_E].
+    spread = np.abs(link.los)**2 + np.diagonal(link.spatial, axis1=-2, axis2=-1)[:, None]
+    spread = spread[:, None]
+    point = _Point.at(link, spread, analog)
     # Whether the corner remains to be tried.
     is_new = np.ones(point.rate.shape, bool)
     for _ in range(_MAX_ROUNDS):
@@ -46,14 +49,14 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         done = ~to_corner & (gain <= _MIN_GAIN * point.rate)
         if done.all():
             break
-        other = _Point.at(link, np.where(
+        other = _Point.at(link, spread, np.where(
             done[..., None], point.analog,
             np.where(to_corner[..., None], point.corner, by_element)))
         is_new = other.rate - point.rate > _MIN_GAIN * point.rate
         # An element that does not increase the capacity after all ends the ascent.
         if not (is_new | to_corner).any():
             break
-        point = other if is_new.all() else other.where(is_new, point)
+        point = other if (is_new | done).all() else other.where(is_new, point)
     return point.analog, point.rate
 
 
@@ -84,7 +87,7 @@ class _Point:
     curvature: np.ndarray
 
     @classmethod
-    def at(cls, link: BandLink, analog: np.ndarray) -> '_Point':
+    def at(cls, link: BandLink, spread: np.ndarray, analog: np.ndarray) -> '_Point':
         configured, scattered, direct = link.feeds(analog)
         gains, directions = np.linalg.eigh(link.correlations(configured, scattered, direct))
         # The configuration may pass no signal; only rounding makes the gain negative.
@@ -98,8 +101,7 @@ class _Point:
         towards = received * link.los[:, None]
         towards += np.conj(np.matmul(digital, scattered)[..., 0, :])
         slope = 2 * (weights * towards).real
-        spread = np.abs(link.los)**2 + np.diagonal(link.spatial, axis1=-2, axis2=-1)[:, None]
-        curvature = (weights.real**2 + weights.imag**2) * spread[:, None]
+        curvature = (weights.real**2 + weights.imag**2) * spread
         ascending = np.sum(slope / (1 + snr)[..., None], axis=-2) > 0
         corner = np.where(link.fixed, 1.0, ascending)
         return cls(analog, np.log1p(snr).sum(axis=-1), corner, snr, slope, curvature)
@@ -113,7 +115,8 @@ class _Point:
         snr = self.snr[..., None] + steps * (self.slope + steps * self.curvature)
         low, high = np.log1p(np.maximum(snr, 0)).sum(axis=-2)
         rates = np.maximum(low, high)
-        place = (*np.ogrid[:len(rates), :rates.shape[1]], rates.argmax(axis=-1))
+        n_bands, n_starts, _ = rates.shape
+        place = np.arange(n_bands)[:, None], np.arange(n_starts), rates.argmax(axis=-1)
         better = self.analog.copy()
         better[place] = high[place] > low[place]
         gain: np.ndarray = rates[place] - self.rate

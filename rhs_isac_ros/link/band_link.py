@@ -9,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.link.water_filling import water_filling
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
-from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.los import los_gain_at
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -57,12 +57,11 @@ class BandLink:
         ValueError
             If the position is not a finite [3] array.
         """
-        place = np.asarray(position, dtype=float)[None]
         onboard, spatial, fixed = arrays(scenario, surface)
         if isinstance(bands, int):
-            los = los_gain(scenario, place, bands)[0]
+            (los,) = los_gain_at(scenario, position, [bands])
         else:
-            los = np.concatenate([los_gain(scenario, place, band) for band in bands])
+            los = los_gain_at(scenario, position, bands)
         index = band_index(bands)
         return cls(onboard[index], los, spatial[index], scenario.noise_power_w,
                    scenario.max_power_w, fixed)

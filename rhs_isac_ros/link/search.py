@@ -104,12 +104,11 @@ def candidate_configurations(
         _direct_configurations(tables, direct), tables.scattered[index],
         _matched(tables, direct)], axis=1)
     # A first selection needs the strongest modes only.
-    strongest = np.ascontiguousarray(paths[..., :1 + _N_STRONGEST])
-    analog = _Waves.at(strongest, analog).best(_N_KEPT[0]).analog
-    waves = _Waves.at(paths, analog)
+    gains = np.ascontiguousarray(paths[..., :1 + _N_STRONGEST])
+    waves = _Waves.at(gains, analog).best(_N_KEPT[0])
     for n_kept in _N_KEPT[1:]:
-        waves = _Waves.at(paths, waves.corner(paths, tables.fixed), waves.on_board)
-        waves = waves[_best(waves.rate, n_kept)]
+        waves = _Waves.at(paths, waves.corner(gains, tables.fixed), waves.on_board)
+        waves, gains = waves[_best(waves.rate, n_kept)], paths
     return waves.best(n).analog.astype(float)
 
 
@@ -246,8 +245,9 @@ class _Waves:
         order = np.argsort(-self.rate, axis=1)
         ranked = self.rate[np.arange(len(order))[:, None], order]
         repeated = ranked[:, :-1] - ranked[:, 1:] <= _MIN_DIFFERENCE * ranked[:, :-1]
-        ranked[:, 1:][repeated] = -1
-        distinct = np.argsort(-ranked, axis=1, kind='stable')[:, :n]
+        is_repeated = np.zeros(order.shape, np.int8)
+        is_repeated[:, 1:] = repeated
+        distinct = np.argsort(is_repeated, axis=1, kind='stable')[:, :n]
         bands = np.arange(len(order))[:, None]
         return self[bands, order[bands, distinct]]
 

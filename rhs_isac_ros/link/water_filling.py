@@ -2,6 +2,9 @@
 
 import numpy as np
 
+# Gains above this have finite reciprocals.
+_MIN_GAIN = 1e-300
+
 
 def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
@@ -13,6 +16,13 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     n = gains.shape[-1]
     if n == 1:
         return np.full(gains.shape, power_w)
+    if gains.min() > _MIN_GAIN:
+        floors = 1 / gains
+        level = (power_w + floors.sum(axis=-1, keepdims=True)) / n
+        if (level > floors).all():
+            # Every channel is above its floor, as usual.
+            filled: np.ndarray = level - floors
+            return filled
     # Without any gain, all levels and floors are infinite.
     with np.errstate(divide='ignore', over='ignore', invalid='ignore'):
         floors = 1 / np.maximum(gains, 0)

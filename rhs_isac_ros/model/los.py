@@ -24,6 +24,18 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
     return _gain(scenario, distances, band, _amplitude(scenario, offsets))
 
 
+def los_gain_at(scenario: Scenario, position: np.ndarray, bands: Sequence[int]) -> np.ndarray:
+    """Compute `los_gain` at one position, float64 [3] [m], in some bands.
+
+    The bands share the distances. Returns complex128 [n, N_SB, N_E].
+    """
+    offsets, distances = _separation(scenario, np.asarray(position)[None])
+    frequencies = subband_frequencies_hz(scenario)[list(bands), :, None]
+    gain: np.ndarray = np.exp((-2j * np.pi / SPEED_OF_LIGHT_MPS) * (frequencies * distances))
+    gain *= _amplitude(scenario, offsets) / distances / frequencies
+    return gain
+
+
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
     """Sum the gains of `los_gain` over the elements in some bands, complex128 [n, N, N_SB].

@@ -35,6 +35,8 @@ from rhs_isac_ros.model.surface import matched_configuration
 SPREADS_M = (0.01, 0.1, 0.3, 1.0, 3.0)
 # Covariance of the estimates for which times are measured [m^2].
 COVARIANCE_M2 = np.diag([0.9, 0.2, 0.12])**2
+# Positions between which the calls alternate.
+BLOCK = 10
 # Ascents of the long optimisation that are refined element by element.
 REFINED = 5
 
@@ -77,7 +79,7 @@ def main() -> None:
 def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarray) -> None:
     """Print the CPU times of the choice of a beam and of its parts, and those of a plain search.
 
-    The calls alternate, so that the load of the machine affects all of them.
+    The calls alternate every few positions, so that the load of the machine affects all of them.
     """
     def plain(position: np.ndarray) -> None:
         for band in bands:
@@ -93,11 +95,12 @@ def compare_times(scenario: Scenario, bands: Sequence[int], positions: np.ndarra
     times_s = {name: [] for name in calls}
     for call in calls.values():
         call(positions[0])
-    for position in positions:
+    for start in range(0, len(positions), BLOCK):
         for name, call in calls.items():
-            begin_s = time.process_time()
-            call(position)
-            times_s[name].append(time.process_time() - begin_s)
+            for position in positions[start:start + BLOCK]:
+                begin_s = time.process_time()
+                call(position)
+                times_s[name].append(time.process_time() - begin_s)
     print(f'CPU time for {len(bands)} bands')
     for name, values in times_s.items():
         print(f'  {name:22}   {1e3 * np.median(values):.2f} ms median, '

@@ -84,11 +84,11 @@ def ascend(link: BandLink, analog: np.ndarray) -> np.ndarray:
         snr, direct, diffuse = received(analog)
         rate = np.log1p(snr).sum()
         slope = 2 * (weights * (np.conj(direct)[:, None] * link.los + np.conj(diffuse))).real
-        corner = (1 / (1 + snr) @ slope > 0).astype(float)
+        corner = np.where(link.fixed, 1.0, 1 / (1 + snr) @ slope > 0)
         if np.log1p(received(corner)[0]).sum() - rate > MIN_GAIN * rate:
             analog = corner
             continue
-        steps = np.stack([-analog, 1 - analog])[:, None]
+        steps = np.stack([-analog, 1 - analog])[:, None] * ~link.fixed
         changed = snr[:, None] + steps * slope + steps**2 * np.abs(weights)**2 * spread
         rates = np.log1p(np.maximum(changed, 0)).sum(axis=1)
         end, element = np.unravel_index(rates.argmax(), rates.shape)
