@@ -53,9 +53,9 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
           surface: SurfaceEstimate | None = None) -> Beam:
     """Find a beam that maximises Eq. (10) for a user at a position, float64 [3] [m].
 
-    A search from many starts proposes configurations. The best few of these configurations and
-    the matched filter are then improved together with the digital part. The beam is therefore
-    never worse than the matched filter. It has the power P_max over all sub-bands. The same
+    A search from many starts and the matched filter proposes configurations. The best few of them
+    are then improved together with the digital part. Amplitudes of the beam are 0 or 1, which
+    every number of amplitude levels includes. It has the power P_max over all sub-bands. The same
     position always gives the same beam. Bands are counted from 0. A calibrated surface applies
     its own coefficients to the configuration of the beam.
 
@@ -139,7 +139,7 @@ def capacity_report(
 
     The latter is chosen from `bands` for `surface`, as in `choose_beam`. The search for a beam
     ends slightly below the maximum, so that the loss with an accurate estimate may be negative,
-    by a few hundredths of a per cent at most.
+    typically by less than a tenth of a per cent.
 
     Raises
     ------

@@ -16,9 +16,10 @@ from rhs_isac_ros.link import (
     expected_capacity,
     steer,
 )
+from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.surface import matched_configuration, onboard_matrix
+from rhs_isac_ros.model.surface import matched_configuration, on_levels, onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 POSITION = np.array([9.0, 1.5, -0.4])
@@ -67,6 +68,23 @@ def test_beams_are_never_worse_than_the_matched_filter(table1, positions, refere
         gained.append(rate(scenario, steer(scenario, position, band), position) / start - 1)
     assert min(gained) >= -1e-12
     assert max(gained) > 0.001
+
+
+@pytest.mark.parametrize('levels', [0, 2, 3])
+def test_amplitudes_are_among_any_number_of_levels(small, levels):
+    scenario = dataclasses.replace(small.scenario, amplitude_levels=levels)
+    for position in scenario.sample_positions(5, np.random.default_rng(6)):
+        analog = steer(scenario, position).analog
+        assert set(analog) <= {0.0, 1.0}
+        np.testing.assert_array_equal(on_levels(scenario, analog), analog)
+
+
+def test_the_beams_of_all_bands_are_those_of_each_one(table1, positions):
+    for position in positions:
+        for band, beam in enumerate(steer_bands(table1.scenario, position, range(2))):
+            alone = steer(table1.scenario, position, band)
+            np.testing.assert_array_equal(beam.analog, alone.analog)
+            np.testing.assert_array_equal(beam.digital, alone.digital)
 
 
 def test_a_beam_of_a_small_surface_is_close_to_the_optimum(small, reference_link):
