@@ -18,7 +18,7 @@ NODES = (
     'visualizer',
 )
 # The terminal tools that have no counterpart in `ros2`.
-TOOLS = ('calibrate', 'record', 'replay', 'snapshot', 'watch')
+TOOLS = ('calibrate', 'record', 'replay', 'snapshot', 'view', 'watch')
 
 setup(
     name=NAME,
@@ -51,9 +51,11 @@ setup(
         'genetic': ['pymoo'],
         'recording': ['mcap'],
         'watch': ['rich'],
+        # See requirements-view.txt.
+        'view': ['rerun-sdk==0.22.1', 'pyarrow<26'],
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
-            'pymoo', 'mcap', 'rich'],
+            'pymoo', 'mcap', 'rich', 'rerun-sdk==0.22.1', 'pyarrow<26'],
         'docs': ['sphinx'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'rosbags'],
     },

@@ -29,6 +29,7 @@ EXECUTABLES = {
     'snapshot': 'tools',
     'transmission': 'nodes',
     'user': 'nodes',
+    'view': 'tools',
     'visualizer': 'nodes',
     'watch': 'tools',
 }

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / 'scripts'
-NAMES = ('watch', 'record', 'replay', 'calibrate', 'snapshot', 'topic', 'param')
+NAMES = ('watch', 'record', 'replay', 'calibrate', 'snapshot', 'view', 'topic', 'param')
 
 
 @pytest.mark.parametrize('name', NAMES)

@@ -1,0 +1,108 @@
+"""The charts of a network over its cycles: errors, capacity, latencies and losses."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
+from rhs_isac_ros.monitoring.entities import Entry, Number, Series
+from rhs_isac_ros.monitoring.scene_shapes import user_colour
+from rhs_isac_ros.protocol import messages as m
+
+# Title of each chart by the path that its series begin with.
+TITLES: Mapping[str, str] = {
+    'error': 'Position error [m]',
+    'capacity': 'Capacity [Mbit/s]',
+    'loss': 'Loss of capacity by the position error [%]',
+    'latency': 'Latency [ms]',
+    'drops': 'Dropped messages and given-up cycles',
+}
+_MEGA = 1e6
+_MILLI = 1e-3
+_RED, _WHITE, _GREEN, _BLUE, _ORANGE = (
+    (0.95, 0.3, 0.3), (0.95, 0.95, 0.95), (0.35, 0.8, 0.4), (0.4, 0.6, 1.0), (1.0, 0.65, 0.2))
+_PHASE_COLOURS = dict(zip(m.Phase, (_BLUE, _GREEN, _ORANGE, _RED), strict=True))
+
+
+class Sample(NamedTuple):
+    """A value on a path, and the style of its series."""
+
+    path: str
+    value: float
+    style: Series
+
+
+class Charts:
+    """Computes the samples of the charts.
+
+    Attributes
+    ----------
+    bounds_m
+        Root of the global bound [m] by the id of the codebook, as far as it is known.
+    """
+
+    def __init__(self) -> None:
+        self.bounds_m: dict[str, float] = {}
+        self._styles: dict[str, Series] = {}
+        self._square_m2 = 0.0
+        self._n_fixes = self._n_given_up = 0
+        self._n_dropped: dict[str, int] = {}
+
+    def add(self, cycle: int, samples: Iterator[Sample]) -> list[Entry]:
+        """Return samples as entries of a cycle; the first of a series comes with its style.
+
+        Values that are not finite are left out.
+        """
+        entries = []
+        for path, value, style in samples:
+            if not math.isfinite(value):
+                continue
+            if path not in self._styles:
+                self._styles[path] = style
+                entries.append(Entry(0, path, style))
+            entries.append(Entry(cycle, path, Number(float(value))))
+        return entries
+
+    def dropped(self, node: str, count: int) -> Iterator[Sample]:
+        """Yield the number of messages that a node dropped since its start, and that of all."""
+        self._n_dropped[node] = count
+        yield Sample('drops/all', sum(self._n_dropped.values()), Series('all nodes', _WHITE))
+        name = node.rpartition('/')[2]
+        if count or f'drops/{name}' in self._styles:
+            # Python's hash of a string differs between processes.
+            yield Sample(f'drops/{name}', count, Series(name, user_colour(sum(name.encode()))))
+
+    def given_up(self) -> Iterator[Sample]:
+        """Count a cycle that was given up, and yield their number."""
+        self._n_given_up += 1
+        yield Sample('drops/given_up', self._n_given_up, Series('cycles given up', _RED))
+
+    def of_cycle(self, cycle: CompleteCycle) -> Iterator[Sample]:
+        """Yield the samples of a complete cycle."""
+        yield from self._errors(cycle)
+        capacity = cycle.capacity
+        for name, value, colour in (
+                ('perfect', capacity.perfect_bps, _WHITE),
+                ('actual', capacity.actual_bps, _GREEN),
+                ('expected', capacity.expected_bps, _BLUE)):
+            yield Sample(f'capacity/{name}', value / _MEGA, Series(name, colour))
+        yield Sample('loss/percent', capacity.loss_percent, Series('loss', _ORANGE, dots=True))
+        for phase, duration_s in cycle.durations_s().items():
+            name = phase.name.lower()
+            yield Sample(f'latency/{name}', duration_s / _MILLI,
+                         Series(name, _PHASE_COLOURS[phase]))
+        yield Sample('latency/estimator', cycle.estimate.latency_s / _MILLI,
+                     Series('estimator', _WHITE))
+
+    def _errors(self, cycle: CompleteCycle) -> Iterator[Sample]:
+        estimate = cycle.estimate
+        self._square_m2 += cycle.error_m**2
+        self._n_fixes += 1
+        yield Sample(f'error/user_{cycle.user}', cycle.error_m,
+                     Series(f'user {cycle.user}', user_colour(cycle.user), dots=True))
+        yield Sample('error/root_mean_square', math.sqrt(self._square_m2 / self._n_fixes),
+                     Series('root mean square so far', _RED))
+        yield Sample('error/crlb', math.sqrt(max(estimate.crlb_m2, 0.0)),
+                     Series('sqrt(CRLB)', _GREEN))
+        yield Sample('error/global_bound', self.bounds_m.get(estimate.codebook_id, math.nan),
+                     Series('global bound', _WHITE))

@@ -1,0 +1,79 @@
+"""The entries of a view of a recording."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.entities import Entry
+from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
+from rhs_isac_ros.positioning import TrackEstimate
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, diagnostics, topics
+from rhs_isac_ros.ros.recording import RecordingError, read
+from rhs_isac_ros.tools.republish import topic_prefix
+from rhs_isac_ros.tools.view_posteriors import Posteriors
+
+
+def entries(
+        path: Path, namespace: str, scenario: Scenario, posteriors: Posteriors,
+        track: bool = False, max_cycles: int = 0) -> Iterator[Entry]:
+    """Yield the entries of a recording.
+
+    Parameters
+    ----------
+    namespace
+        Namespace of the network.
+    posteriors
+        Receives the recorded codebooks.
+    track
+        Whether to track the users.
+    max_cycles
+        Number of cycles to read; 0: all.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a recording, has no messages in the namespace, or contains a malformed
+        message.
+    CodebookError
+        If a recorded codebook is invalid or does not fit the scenario.
+    """
+    prefix = topic_prefix(namespace)
+    view = NetworkView(scenario)
+    for _, message, _ in read(path, [f'{prefix}{topics.CODEBOOK}']):
+        codebook = convert.codebook_from_ros(message)
+        if codebook.id not in posteriors.codebooks:
+            posteriors.add(codebook)
+            view.set_bound(codebook.id, posteriors.bound_m2(codebook))
+    yield from view.begin()
+    kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
+    reports = f'{prefix}{topics.DIAGNOSTICS}'
+    for topic, found, time_s in read(path, [*kinds, reports]):
+        if topic == reports:
+            for node, report in diagnostics.from_ros(found):
+                yield from view.add_report(node, report)
+            continue
+        try:
+            message = convert.from_ros(kinds[topic], found)
+            m.check(message, scenario.sizes)
+        except m.MessageError as error:
+            raise RecordingError(f'{path}: {topic}: {error}') from None
+        yield from view.add(message, time_s)
+        if max_cycles and view.n_cycles > max_cycles:
+            break
+        if isinstance(message, m.ReceivedSignals):
+            yield from view.add_modes(message, posteriors.modes(message))
+            if track:
+                yield from _track(view, posteriors, message, time_s)
+    if not view.n_cycles:
+        raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
+
+
+def _track(
+        view: NetworkView, posteriors: Posteriors, received: m.ReceivedSignals,
+        now_s: float) -> list[Entry]:
+    estimate = posteriors.track(received, now_s)
+    if not isinstance(estimate, TrackEstimate) or not estimate.fix:
+        return []
+    return view.add_track(received.cycle_id, TrackPoint(
+        received.user, estimate.mean, estimate.covariance, estimate.velocity))

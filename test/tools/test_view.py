@@ -1,0 +1,188 @@
+"""``scripts/view`` on a network in another process and on its recording, and in a browser."""
+
+import io
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import headless_browser
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring import network_view
+from rhs_isac_ros.monitoring.scene_shapes import user_colour
+from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros.recording import Recorder, read
+from rhs_isac_ros.tools.view import main
+from rhs_isac_ros.tools.view_node import ViewNode
+from rhs_isac_ros.tools.view_posteriors import Posteriors
+
+CONFIG = Path(__file__).parents[2] / 'config'
+SCRIPT = CONFIG.parent / 'scripts' / 'view'
+CYCLES = 4
+TIMEOUT_S = 120.0
+# Dots of the charts have this size at least.
+MIN_PIXELS = 20
+
+
+def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'rerun', None)
+    assert main([]) == 1
+    assert capsys.readouterr() == ('', (
+        'view: error: view needs rerun, which is not installed '
+        "(pip install 'rhs_isac_ros[view]')\n"))
+
+
+@pytest.mark.parametrize(('arguments', 'reason'), [
+    (['--save', 'view.txt'], "argument --save: 'view.txt', expected a name that ends with .rrd"),
+    (['--track'], 'arguments --track and --namespace: expected together with a recording'),
+    (['--port', '65535'], 'argument --port: '),
+    (['missing.mcap'], 'argument file: ')])
+def test_an_invalid_argument_is_named(arguments, reason, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert reason in capsys.readouterr().err
+
+
+@pytest.fixture(scope='module')
+def rerun():
+    return pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/_view)')
+
+
+@pytest.fixture(scope='module')
+def recording(rerun, shared_session, tmp_path_factory):
+    """A recording of some cycles of two users."""
+    pytest.importorskip('mcap', reason='mcap is not installed')
+    path = tmp_path_factory.mktemp('recording') / 'run.mcap'
+    recorder = Recorder(path, Scenario.from_yaml(CONFIG / 'quick.yaml'))
+    observer = CycleObserver(recorder)
+    shared_session._executor.add_node(observer)
+    assert shared_session.spin_until(lambda: len(observer.log.complete) >= CYCLES, TIMEOUT_S)
+    shared_session._executor.remove_node(observer)
+    observer.destroy_node()
+    recorder.close()
+    return path
+
+
+@pytest.fixture
+def paths(rerun):
+    """Function that returns the paths in a file, each with the number of its cycles."""
+    def of(file):
+        view = rerun.dataframe.load_recording(file).view(index='cycle', contents='/**')
+        table = view.select().read_all()
+        counts = {}
+        for name in table.column_names:
+            path = name.partition(':')[0].lstrip('/')
+            filled = sum(bool(value) for value in table[name].to_pylist()) if ':' in name else 0
+            counts[path] = max(filled, counts.get(path, 0))
+        return counts
+    return of
+
+
+def test_a_running_network_is_shown(shared_session):
+    """Including the modes and the bound, which the view computes itself, in the background."""
+    found = {}
+
+    def write(entries):
+        found.update((entry.path, entry.entity) for entry in entries)
+    scenario = Scenario.from_yaml(CONFIG / 'quick.yaml')
+    node = ViewNode(scenario, Posteriors(scenario), write)
+    shared_session._executor.add_node(node)
+    expected = {
+        f'{network_view.MODES}/found', 'error/global_bound', 'capacity/actual', 'drops/all',
+        network_view.LOG, network_view.POSITIONING, network_view.TRANSMISSION, *(
+            f'{network_view.WORLD}/{part}' for part in (
+                'region', 'board', 'beam', 'user_1/truth', 'user_2/estimate/ellipsoid',
+                'user_1/modes'))}
+    try:
+        assert shared_session.spin_until(lambda: expected <= found.keys(), TIMEOUT_S), (
+            expected - found.keys())
+    finally:
+        shared_session._executor.remove_node(node)
+        node.destroy_node()
+    assert not node.mismatch
+
+
+def test_the_cycles_of_a_running_network_are_written(
+        rerun, built_scripts, shared_session, paths, tmp_path):
+    done = subprocess.run(
+        [SCRIPT, '--config', CONFIG / 'quick.yaml', '--save', 'live.rrd', '--cycles', '5'],
+        cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'live.rrd\n', '')
+    assert [path.name for path in tmp_path.iterdir()] == ['live.rrd']
+    shown = paths(tmp_path / 'live.rrd')
+    assert shown[network_view.LOG] >= 4
+    assert {path.partition('/')[0] for path in shown} >= {'error', 'capacity', 'latency'}
+
+
+def test_a_recording_is_shown_with_tracks_and_modes(recording, paths, tmp_path, capsys):
+    file = tmp_path / 'view.rrd'
+    assert main([str(recording), '--track', '--save', str(file)]) == 0
+    assert capsys.readouterr() == (f'{file}\n', '')
+    shown = paths(file)
+    n_signals = sum(1 for _ in read(recording, ['/received_signals']))
+    assert shown[f'{network_view.MODES}/found'] == n_signals
+    assert shown['error/global_bound'] == CYCLES
+    # A track begins with the second position.
+    assert sum(shown.get(f'{network_view.WORLD}/user_{user}/track', 0)
+               for user in (1, 2)) >= CYCLES - 2
+
+
+def test_a_recording_without_the_namespace_is_an_error(recording, tmp_path, capsys):
+    assert main([str(recording), '--namespace', '/lab', '--save', str(tmp_path / 'v.rrd')]) == 2
+    assert 'no cycle in the namespace /lab' in capsys.readouterr().err
+
+
+def is_free(port):
+    with socket.socket() as probe:
+        try:
+            probe.bind(('', port))
+        except OSError:
+            return False
+    return True
+
+
+@pytest.fixture
+def served(recording, built_scripts):
+    """Address of a view of the recording, on free ports; a signal ends it."""
+    port = next(port for port in range(9100, 9900, 2) if is_free(port) and is_free(port + 1))
+    with subprocess.Popen([SCRIPT, recording, '--port', str(port)], stdout=subprocess.PIPE,
+                          text=True, env={**os.environ, 'PYTHONUNBUFFERED': '1'}) as process:
+        try:
+            yield process.stdout.readline().strip()
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(TIMEOUT_S) == 0
+
+
+def pixels(png):
+    from matplotlib.image import imread
+
+    return np.rint(255 * imread(io.BytesIO(png))[..., :3]).astype(np.uint8)
+
+
+def test_a_browser_shows_the_users_in_their_colours(served):
+    """The dots of the charts have the colour of their user, which no empty viewer contains."""
+    if headless_browser.executable() is None:
+        pytest.skip('no Chromium is installed (apt install chromium)')
+    assert re.fullmatch(r'http://localhost:\d+/\?url=ws://localhost:\d+', served)
+    colours = [np.rint(255 * np.array(user_colour(user))).astype(np.uint8) for user in (1, 2)]
+    with headless_browser.Browser(1000, 640) as browser:
+        browser.open(served)
+        end_s = time.monotonic() + TIMEOUT_S
+        while True:
+            picture = pixels(browser.picture())
+            counts = [int((picture == colour).all(axis=-1).sum()) for colour in colours]
+            if min(counts) >= MIN_PIXELS:
+                break
+            assert time.monotonic() < end_s, f'pixels in the colours of the users: {counts}'
+    # The scene is on the left; it is not of one colour either.
+    left = picture[:, :picture.shape[1] // 2].reshape(-1, 3)
+    assert len(np.unique(left, axis=0)) > 100
