@@ -96,18 +96,23 @@ def run_network(scenario: Scenario, users: int, rounds: int, together: bool) -> 
             wait_until(
                 observer, lambda: {cycle.user for cycle in ended} == {*range(1, users + 1)},
                 'a cycle of each user')
-            first = len(ended)
+            first, before_s = len(ended), sum(processes.cpu_s().values())
             wait_until(observer, lambda: len(ended) >= first + cycles, f'{cycles} cycles')
+            cpu_s = sum(processes.cpu_s().values()) - before_s
     observer.destroy_node()
     ends = ended[first:first + cycles]
     served = [end for end in ends if end.outcome == 'served']
     ended_s = np.array([end.ended_s for end in served])
-    longest, longest_s = longest_wait([end.user for end in served], ended_s)
+    # A cycle that is given up is a turn of its user, too.
+    longest, longest_s = longest_wait(
+        [end.user for end in ends], np.array([end.ended_s for end in ends]))
     return {
         'users': users, 'together': together, 'cycles': len(ends),
         'given_up': len(ends) - len(served),
         'rate_hz': (len(served) - 1) / (ended_s[-1] - ended_s[0]),
         'cycle_ms': 1e3 * np.median([end.ended_s - end.began_s for end in served]),
+        # Other programs hardly affect it, unlike the rate.
+        'cpu_ms': 1e3 * cpu_s / len(ends),
         'longest_wait_cycles': longest, 'longest_wait_s': longest_s, 'fair': longest <= users,
     }
 
@@ -118,8 +123,9 @@ def describe(run: dict) -> str:
     ratio = f' ({run["rate_ratio"]:.2f} of that of few)' if 'rate_ratio' in run else ''
     fair = 'at most one round' if run['fair'] else 'MORE THAN ONE ROUND'
     return (f'{run["users"]:4d} users {where}: {run["rate_hz"]:.2f} cycles/s{ratio}, cycle '
-            f'{run["cycle_ms"]:.1f} ms, {run["given_up"]} given up; longest wait '
-            f'{run["longest_wait_cycles"]} cycles, {run["longest_wait_s"]:.2f} s: {fair}')
+            f'{run["cycle_ms"]:.1f} ms, CPU time {run["cpu_ms"]:.1f} ms, {run["given_up"]} given '
+            f'up; longest wait {run["longest_wait_cycles"]} cycles, {run["longest_wait_s"]:.2f} '
+            f's: {fair}')
 
 
 def wait_until(observer: NetworkObserver, done: Callable[[], bool], goal: str) -> None:
@@ -129,7 +135,7 @@ def wait_until(observer: NetworkObserver, done: Callable[[], bool], goal: str) -
 
 
 def longest_wait(order: list[int], ended_s: np.ndarray) -> tuple[int, float]:
-    """Return the longest wait of any user between two of its cycles, in cycles and in seconds."""
+    """Return the longest wait of any user between two of its turns, in cycles and in seconds."""
     last: dict[int, int] = {}
     longest, longest_s = 0, 0.0
     for index, user in enumerate(order):

@@ -36,8 +36,9 @@ _OTHERS = {
     topics.DIAGNOSTICS: (DiagnosticArray, qos.EXCHANGE),
     topics.MARKERS: (MarkerArray, qos.EXCHANGE),
 }
-# Topics without messages in a correct network with one codebook and without a visualizer.
-_UNUSED = {topics.NAMES[m.NoFix], topics.MARKERS}
+# Topics without messages in a correct network with one codebook, a node for each user and no
+# visualizer.
+_UNUSED = {topics.NAMES[m.NoFix], topics.NAMES[m.GroundTruths], topics.MARKERS}
 
 
 @dataclasses.dataclass(frozen=True)
