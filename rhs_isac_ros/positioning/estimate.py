@@ -65,7 +65,8 @@ class Estimator(Protocol):
         """Estimate positions from received signals; `SignalError` if they cannot be used.
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
-        sub-band-major; the estimate has a leading dimension N if the signals have one.
+        sub-band-major; the estimate has a leading dimension N if the signals have one. It may
+        differ from those of single phases by rounding.
         """
         ...
 

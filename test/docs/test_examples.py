@@ -65,7 +65,8 @@ def test_the_estimator_locates_users():
         assert estimate.mean.shape == (50, 3)
         assert np.linalg.eigvalsh(estimate.covariance).min() > 0
         errors[name] = np.mean(np.sum((estimate.mean - positions)**2, axis=1))
-        np.testing.assert_array_equal(estimator.estimate(received[0]).mean, estimate.mean[0])
+        np.testing.assert_allclose(
+            estimator.estimate(received[0]).mean, estimate.mean[0], rtol=1e-9)
     # The centre of the region has a mean squared error of 0.25 m^2.
     assert errors['grid'] < 0.1
     assert errors['grid'] < 2 * errors['bayes']
