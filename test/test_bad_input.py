@@ -23,7 +23,7 @@ CALLS = [
     ('tools.demo', ['--users', '0'], 'argument --users: 0, expected at least 1'),
     ('tools.demo', ['--users', '-3'], 'argument --users: -3, expected at least 1'),
     ('tools.demo', ['--users', 'many'], "argument --users: 'many', expected an integer"),
-    ('tools.demo', ['--users', '100000'], 'users:=100000'),
+    ('tools.demo', ['--users', '100000'], 'argument --users: 100000, expected at most 4096'),
     ('tools.demo', ['--cycles', '1e3'], "argument --cycles: '1e3', expected an integer"),
     ('tools.demo', ['--cycles', str(10**30)], 'expected at most 1000000000'),
     ('tools.demo', ['--seed', '2147483648'], 'expected at most 2147483647'),

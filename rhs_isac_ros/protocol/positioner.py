@@ -37,9 +37,7 @@ from rhs_isac_ros.protocol.residual_watch import ResidualWatch
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
 from rhs_isac_ros.protocol.tracks import Tracks
-
-# Maximum number of users without a fix to keep track of.
-_MAX_USERS = 1024
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
 
 class _Job(NamedTuple):
@@ -248,7 +246,7 @@ class Positioner(PlainRole):
         self._without_fix.move_to_end(received.user)
         if is_known:
             return [sent]
-        if len(self._without_fix) > _MAX_USERS:
+        if len(self._without_fix) > MAX_USERS:
             self._without_fix.popitem(last=False)
         text = f'cycle {received.cycle_id}: no fix of user {received.user}: {reason}'
         return [sent, LogMessage(text, warning=True)]

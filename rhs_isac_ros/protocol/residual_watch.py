@@ -5,9 +5,8 @@ import collections
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.positioning.residual_monitor import ResidualMonitor
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
-# Maximum number of users with a monitor of their own; beyond it, the least recent are forgotten.
-_MAX_USERS = 1024
 # Maximum number of users in a text.
 _MAX_SHOWN = 8
 # Number of residuals in the mean of a user, which bounds the memory.
@@ -34,7 +33,8 @@ class ResidualWatch:
             self._codebook_id = codebook_id
         own = self._users.setdefault(user, ResidualMonitor(_USER_WINDOW))
         self._users.move_to_end(user)
-        if len(self._users) > _MAX_USERS:
+        # Beyond the limit, the least recent user is forgotten.
+        if len(self._users) > MAX_USERS:
             self._users.popitem(last=False)
         for monitor in (self._all, own):
             monitor.add(float(estimate.residual), float(estimate.expected_residual))

@@ -22,6 +22,7 @@ from rhs_isac_ros.model.arguments import (
     ArgumentParser,
     check_distinct,
     input_file,
+    integer,
     output_file,
     picture_file,
     positive_int,
@@ -30,6 +31,7 @@ from rhs_isac_ros.model.arguments import (
 from rhs_isac_ros.monitoring.cycle_log import CycleLog
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import (
@@ -257,7 +259,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='demo', description='Start a network, every node as a process, and report on its '
         'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--users', type=positive_int, default=2, help='number of users')
+    parser.add_argument('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=20, help='cycles to wait for')
     add_network_options(parser)
     parser.add_argument('--prior', choices=PRIORS, default=REGION,
