@@ -14,7 +14,6 @@ from typing import Any
 from ament_index_python.packages import get_package_prefix
 
 from rhs_isac_ros.executables import PARENT_ID
-from rhs_isac_ros.ros.fork import Fork
 
 # Maximum number of users with nodes of their own, unless more are requested; more share one node,
 # because every beacon and every cycle wakes each node of a user.
@@ -87,18 +86,14 @@ class Processes:
     command_prefix
         Callable that takes the name of a node and returns a prefix of its command, such as
         ``ip netns exec lab``.
-    fork
-        Whether to fork this process instead of starting Python anew; see `Fork` for the
-        condition. `restart` starts Python anew.
     """
 
     def __init__(
             self, logs: Path, environment: Mapping[str, str],
-            command_prefix: Callable[[str], Sequence[str]] = lambda name: (),
-            fork: bool = False) -> None:
-        self._logs, self._command_prefix, self._fork = logs, command_prefix, fork
+            command_prefix: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
+        self._logs, self._command_prefix = logs, command_prefix
         self._environment = {**os.environ, **environment, PARENT_ID: str(os.getpid())}
-        self._running: dict[str, subprocess.Popen[bytes] | Fork] = {}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._commands: dict[str, list[str]] = {}
 
     def start(
@@ -126,12 +121,7 @@ class Processes:
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']
         self._commands[name] = command
-        if self._fork:
-            with open(self._logs / f'{name}.log', 'wb') as log:
-                self._running[name] = Fork(
-                    executable, command[1:], log, self._environment)
-        else:
-            self._spawn(name, 'wb')
+        self._spawn(name, 'wb')
 
     def kill(self, name: str) -> None:
         """End the process of a node with SIGKILL, as a crash would."""

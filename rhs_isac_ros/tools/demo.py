@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     log = CycleLog()
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         # The log of the cycles is complete when the processes are about to end.
-        with Processes(Path(logs), {'ROS_LOG_DIR': logs}, fork=True) as processes:
+        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             problem = ''
             with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
                 start_network(

@@ -19,37 +19,11 @@ PARENT = """
 import signal, sys
 from pathlib import Path
 from rhs_isac_ros.ros.processes import Processes
-with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]},
-               fork=sys.argv[2] == 'fork') as children:
+with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]}) as children:
     children.start('visualizer')
     children.start('rhs_controller')
     print(*(child.pid for child in children._running.values()), flush=True)
     signal.pause()
-"""
-# A parent that forks two executables and prints what becomes of them.
-FORKS = """
-import signal, subprocess, sys
-from pathlib import Path
-from rhs_isac_ros.ros.processes import Processes
-print('buffered')
-with Processes(Path(sys.argv[1]), {'ROS_LOG_DIR': sys.argv[1]}, fork=True) as children:
-    children.start('bs', retries=-1)
-    children.start('channel')
-    bs, channel = children._running.values()
-    print(bs.wait(60.0), children.ended(), 'error: retries' in children.log('bs'),
-          'buffered' in children.log('bs'))
-    try:
-        channel.wait(0.0)
-    except subprocess.TimeoutExpired:
-        print('running', channel.poll())
-    while 'serving' not in children.log('channel'):
-        assert channel.poll() is None, children.log('channel')
-    children.interrupt()
-    print(channel.wait(60.0))
-    children.restart('channel')
-    children.kill('channel')
-    children.start('optimizer')
-    children.kill('optimizer')
 """
 
 
@@ -60,24 +34,14 @@ def until_ended(descriptors):
         os.close(descriptor)
 
 
-@pytest.mark.parametrize('start', ['fork', 'anew'])
-def test_no_child_survives_a_parent_that_is_killed(tmp_path, start):
+def test_no_child_survives_a_parent_that_is_killed(tmp_path):
     """The parent dies while its children start."""
-    with subprocess.Popen([sys.executable, '-c', PARENT, tmp_path, start],
-                          stdout=subprocess.PIPE, text=True) as parent:
+    with subprocess.Popen([sys.executable, '-c', PARENT, tmp_path], stdout=subprocess.PIPE,
+                          text=True) as parent:
         children = [os.pidfd_open(int(pid)) for pid in parent.stdout.readline().split()]
         assert len(children) == 2
         parent.send_signal(signal.SIGKILL)
         until_ended(children)
-
-
-def test_a_fork_behaves_like_a_process_that_was_started_anew(tmp_path):
-    done = subprocess.run([sys.executable, '-c', FORKS, tmp_path], capture_output=True,
-                          text=True, timeout=TIMEOUT_S, check=False)
-    assert done.stderr == ''
-    assert done.stdout.splitlines() == [
-        'buffered', "2 {'bs': 2} True False", 'running None', '0']
-    assert done.returncode == 0
 
 
 def test_no_node_survives_a_demonstration_that_is_killed(tmp_path):
