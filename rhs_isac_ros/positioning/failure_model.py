@@ -23,9 +23,8 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _STEP_LIMITS = np.array([0.02, 0.03, 0.03])
 # The residual decreases with the amplitudes; the derivative is that of the mean.
 _SIGNS = np.array([-1.0, 1.0, 1.0, 1.0])[:, None, None]
-# Number of surfaces to keep, and of those with the covariances of all further failures.
+# Number of surfaces to keep.
 _MAX_SURFACES = 256
-_MAX_FURTHER = 8
 
 
 class Surface(NamedTuple):
@@ -223,9 +222,8 @@ class FailureModel:
             covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
             covariance += remainder * self._error[:, None]
             roots = np.linalg.cholesky(covariance)
-            if len(self._further) >= _MAX_FURTHER:
-                # Those of the intact surface remain.
-                del self._further[next(key for key in self._further if key[0])]
+            # Those of the intact surface serve all phases; each takes a few megabytes.
+            self._further = {key: kept for key, kept in self._further.items() if not key[0]}
             self._further[failed, remainder] = Further(
                 np.linalg.inv(roots), _log_determinant(roots).sum(axis=0))
         return self._further[failed, remainder]
