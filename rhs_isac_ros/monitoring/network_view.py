@@ -46,7 +46,13 @@ class TrackPoint:
 
 
 class NetworkView:
-    """Converts the messages of a network to entries, in the order in which they arrive."""
+    """Converts the messages of a network to entries, in the order in which they arrive.
+
+    Attributes
+    ----------
+    n_ended
+        Number of cycles that were received completely or were given up.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -54,7 +60,7 @@ class NetworkView:
         self._log = CycleLog()
         self._charts = Charts()
         self._cycles: NewestDict[int, int] = NewestDict(_MAX_CYCLES)
-        self._n_cycles = 0
+        self._n_cycles = self.n_ended = 0
         self._users: set[int] = set()
         self._tracks: dict[int, collections.deque[np.ndarray]] = {}
         self._configurations: dict[int, np.ndarray] = {}
@@ -167,6 +173,7 @@ class NetworkView:
                 f'error {complete.error_m:.2f} m, '
                 f'loss of capacity {complete.capacity.loss_percent:.1f} %')))
             entries += self._charts.add(cycle, self._charts.of_cycle(complete))
+        self.n_ended += len(self._log.given_up) + len(self._log.complete)
         self._log.clear()
         return entries
 

@@ -18,9 +18,11 @@ from rhs_isac_ros.model.arguments import (
     input_file,
     integer,
     output_file,
+    positive_float,
     positive_int,
 )
 from rhs_isac_ros.model.optional import MissingLibraryError
+from rhs_isac_ros.positioning import Motion
 from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.recording import RecordingError, read_scenario
 from rhs_isac_ros.ros.run import run
@@ -33,6 +35,7 @@ from rhs_isac_ros.tools.view_recording import entries
 _PROGRAM = 'view'
 _PORT = 9090
 _POLL_S = 0.2
+_SWITCH_INTERVAL_S = 5e-4
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -100,6 +103,8 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
 def _show_live(
         stream: RerunStream, scenario: Scenario, posteriors: Posteriors,
         options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    # With many messages, the background threads would otherwise wait 5 ms for each step.
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     nodes: list[ViewNode] = []
 
     def create() -> list[ViewNode]:
@@ -107,7 +112,7 @@ def _show_live(
         return nodes
 
     def done() -> bool:
-        return bool(options.cycles) and nodes[0].view.n_cycles > options.cycles
+        return bool(options.cycles) and nodes[0].view.n_ended >= options.cycles
     code = run(create, arguments, done)
     if not code:
         _finish(stream, options)
@@ -122,8 +127,8 @@ def _show_recording(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))
     stream.write(itertools.takewhile(lambda _: not signals, entries(
-        options.file, options.namespace or '/', scenario, posteriors, options.track,
-        options.cycles)))
+        options.file, options.namespace or '/', scenario, posteriors,
+        options.track_speed if options.track else None, options.cycles)))
     while not (signals or options.save):
         time.sleep(_POLL_S)
     _finish(stream, options)
@@ -147,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--save', type=_recording_file, metavar='FILE',
                         help='write a file for Rerun, *.rrd, instead of serving the viewer')
     parser.add_argument('--cycles', type=positive_int, default=0, metavar='N',
-                        help='show only the first N cycles')
+                        help='end after N cycles')
     parser.add_argument('--config', type=input_file, metavar='FILE',
                         help="scenario file; by default that of the recording, or the paper's "
                         'Table I')
@@ -162,6 +167,8 @@ def _parser() -> argparse.ArgumentParser:
     recording.add_argument('--namespace', help='namespace of the recorded network (default: /)')
     recording.add_argument('--track', action='store_true',
                            help='track the users, as positioner does with prior:=track')
+    recording.add_argument('--track-speed', type=positive_float, default=Motion.speed_mps,
+                           metavar='MPS', help='typical speed of the users (default: 1 m/s)')
     return parser
 
 

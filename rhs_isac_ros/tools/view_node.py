@@ -1,6 +1,7 @@
 """The node of a view of a running network."""
 
 import functools
+import math
 import time
 from collections.abc import Callable, Iterable
 
@@ -22,12 +23,15 @@ from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
 from rhs_isac_ros.ros.user_topics import MAX_USERS
 from rhs_isac_ros.tools.view_posteriors import Posteriors
 
+# Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
+_BEAM_PERIOD_S = 0.2
+
 
 class ViewNode(Node):
     """Converts the messages of its namespace to entries.
 
-    Modes and bounds are computed in the background; if signals arrive faster, the modes of some
-    are left out.
+    Modes and bounds are computed in the background. If cycles are faster, the modes and the beam
+    of some are left out.
 
     Parameters
     ----------
@@ -54,6 +58,7 @@ class ViewNode(Node):
         self._is_searching = False
         self._waiting: m.ReceivedSignals | None = None
         self._users: set[int] = set()
+        self._beam_s = -math.inf
         write(self.view.begin())
         subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, qos.LATCHED)
         subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.EXCHANGE)
@@ -61,7 +66,12 @@ class ViewNode(Node):
                            exchange=qos.OBSERVATION)
 
     def _on_message(self, message: m.Message) -> None:
-        self._write(self.view.add(message, time.monotonic()))
+        now_s = time.monotonic()
+        if isinstance(message, m.Beam):
+            if now_s < self._beam_s + _BEAM_PERIOD_S:
+                return
+            self._beam_s = now_s
+        self._write(self.view.add(message, now_s))
         match message:
             case m.ReceivedSignals():
                 self._waiting = message

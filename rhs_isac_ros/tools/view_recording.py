@@ -6,7 +6,7 @@ from pathlib import Path
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.entities import Entry
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
-from rhs_isac_ros.positioning import TrackEstimate
+from rhs_isac_ros.positioning import Estimate, TrackEstimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, topics
 from rhs_isac_ros.ros.recording import RecordingError, read
@@ -16,7 +16,7 @@ from rhs_isac_ros.tools.view_posteriors import Posteriors
 
 def entries(
         path: Path, namespace: str, scenario: Scenario, posteriors: Posteriors,
-        track: bool = False, max_cycles: int = 0) -> Iterator[Entry]:
+        track_speed_mps: float | None = None, max_cycles: int = 0) -> Iterator[Entry]:
     """Yield the entries of a recording.
 
     Parameters
@@ -25,10 +25,10 @@ def entries(
         Namespace of the network.
     posteriors
         Receives the recorded codebooks.
-    track
-        Whether to track the users.
+    track_speed_mps
+        Typical speed of the users [m/s], to track them; None: no tracks.
     max_cycles
-        Number of cycles to read; 0: all.
+        Number of cycles after which to end; 0: read all.
 
     Raises
     ------
@@ -59,20 +59,20 @@ def entries(
         except m.MessageError as error:
             raise RecordingError(f'{path}: {topic}: {error}') from None
         yield from view.add(message, time_s)
-        if max_cycles and view.n_cycles > max_cycles:
-            break
         if isinstance(message, m.ReceivedSignals):
             yield from view.add_modes(message, posteriors.modes(message))
-            if track:
-                yield from _track(view, posteriors, message, time_s)
+            if track_speed_mps is not None:
+                yield from _track(view, message, posteriors.track(
+                    message, time_s, track_speed_mps))
+        if max_cycles and view.n_ended >= max_cycles:
+            break
     if not view.n_cycles:
         raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
 
 
 def _track(
-        view: NetworkView, posteriors: Posteriors, received: m.ReceivedSignals,
-        now_s: float) -> list[Entry]:
-    estimate = posteriors.track(received, now_s)
+        view: NetworkView, received: m.ReceivedSignals,
+        estimate: Estimate | None) -> list[Entry]:
     if not isinstance(estimate, TrackEstimate) or not estimate.fix:
         return []
     return view.add_track(received.cycle_id, TrackPoint(
