@@ -31,6 +31,8 @@ _SPREAD_TOLERANCE = 0.15
 # Larger deviations from the expectation count as this many standard deviations, so that no single
 # signal causes a warning.
 _MAX_DEVIATIONS = 6.0
+# The same for the variance, which a few signals that the estimator misjudges should not dominate.
+_MAX_SQUARE = 9.0
 
 
 class ResidualMonitor:
@@ -72,7 +74,8 @@ class ResidualMonitor:
         deviation = (energy - expected) / scale**0.5
         deviation = min(max(deviation, -_MAX_DEVIATIONS), _MAX_DEVIATIONS)
         self._append(_Residual(
-            expected + deviation * scale**0.5, expected, deviation**2, 2 + 6 / scale))
+            expected + deviation * scale**0.5, expected, min(deviation**2, _MAX_SQUARE),
+            2 + 6 / scale))
         if self.drifts:
             latest = list(self._residuals)[-MIN_RETURN:]
             total = _Residual(*np.sum(latest, axis=0).tolist())
