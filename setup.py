@@ -52,10 +52,10 @@ setup(
         'recording': ['mcap'],
         'watch': ['rich'],
         # See requirements-view.txt.
-        'view': ['rerun-sdk==0.22.1', 'pyarrow<26'],
+        'view': ['rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
-            'pymoo', 'mcap', 'rich', 'rerun-sdk==0.22.1', 'pyarrow<26'],
+            'pymoo', 'mcap', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
         'docs': ['sphinx'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'rosbags'],
     },

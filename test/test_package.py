@@ -22,12 +22,12 @@ KEYS = {
 # Libraries without a key, by the name of the import: their requirement in an extra of setup.py.
 PIP_ONLY = {
     'distributed': 'distributed', 'jax': None, 'mcap': 'mcap', 'mcap_ros2': 'mcap-ros2-support',
-    'pymoo': 'pymoo', 'rosbags': 'rosbags', 'stonesoup': None,
+    'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1', 'rosbags': 'rosbags', 'stonesoup': None,
 }
 # Modules of the repository.
 OWN = {
-    'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest', 'in_memory_network',
-    'node_processes', 'system', 'test_installation'}
+    'rhs_isac_ros', 'parts', 'peers', 'sequence', 'conftest', 'headless_browser',
+    'in_memory_network', 'node_processes', 'system', 'test_installation'}
 
 
 @functools.cache

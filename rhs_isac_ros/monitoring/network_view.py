@@ -28,7 +28,7 @@ MODES = 'modes'
 POSITIONING = 'surface/positioning'
 TRANSMISSION = 'surface/transmission'
 LOG = 'log'
-# Users with larger numbers of users before them are not shown: the ids come from messages.
+# Further users are not shown, because the ids come from messages.
 _MAX_USERS = 64
 # Number of latest cycles whose messages may still arrive.
 _MAX_CYCLES = 64
