@@ -59,6 +59,8 @@ class _Failures(FailedElements):
 
 
 class _Estimator(BayesEstimator):
+    """An estimator whose search includes the true hypothesis."""
+
     def __init__(self, scenario: Scenario, codebook: Codebook) -> None:
         super().__init__(scenario, codebook)
         if self._failures is None:

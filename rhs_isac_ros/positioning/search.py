@@ -4,7 +4,6 @@ import abc
 import itertools
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from rhs_isac_ros.positioning.modes import (
     find_modes,
     find_modes_of_each,
 )
+from rhs_isac_ros.positioning.posterior import Doubt, Posterior
 from rhs_isac_ros.positioning.samples import Samples, draw_samples, draw_samples_of_each
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.surroundings import Surroundings
@@ -47,46 +47,6 @@ _GAIN_REACH = 6
 _N_COORDINATES = 3
 # Number of phases that are located together: their arrays fit into the cache.
 _BLOCK = 32
-
-
-class Doubt(NamedTuple):
-    """The possibility that the user is outside of the region of interest.
-
-    Attributes
-    ----------
-    probability
-        Probability that the user is outside.
-    whitened
-        Whitened signals without the offsets of carrier and timing, complex128 [N_B, N_SB F].
-    scale
-        Factor of the signals, from the gain, that is most probable outside.
-    """
-
-    probability: float
-    whitened: np.ndarray
-    scale: float
-
-
-class Posterior(NamedTuple):
-    """The posterior of one positioning phase, for a uniform prior on the region of interest.
-
-    Attributes
-    ----------
-    estimate
-        Its mean and covariance, or the reason why there is no position.
-    modes
-        Its modes; None without a position.
-    whitened
-        Whitened signals, complex128 [N_B, N_SB F].
-    doubt
-        The possibility that the user is outside of the region, which the covariance includes;
-        None if it is negligible, or without a position.
-    """
-
-    estimate: Estimate
-    modes: Modes | None
-    whitened: np.ndarray
-    doubt: Doubt | None
 
 
 class SearchEstimator(abc.ABC):

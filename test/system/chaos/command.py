@@ -29,7 +29,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo import add_network_options, load_files, start_network
+from rhs_isac_ros.tools.process_network import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.chaos.trial import ChaosError, Trial
 from system.observer import NetworkObserver

@@ -24,7 +24,12 @@ from rhs_isac_ros.model.arguments import (
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.resources import discovery_profile_file
-from rhs_isac_ros.tools.demo import add_network_options, check_users, load_files, start_network
+from rhs_isac_ros.tools.process_network import (
+    add_network_options,
+    check_users,
+    load_files,
+    start_network,
+)
 from system.hosts import plan
 from system.hosts.namespaces import Hosts, NamespacesUnavailable, interruptible
 from system.hosts.trial import NetworkBroken, Trial
