@@ -1,8 +1,8 @@
 """The posterior with failed elements if the search cannot miss the true set and position.
 
-A sum over all sets and positions is not tractable. The search for sets, however, may only miss
-hypotheses. With the truth and the sets next to it among them, its posterior is that of the
-declared model, or narrower where it misses others, so that its error is at most that of the model.
+A sum over all sets and positions is not tractable. With the truth and the sets next to it among
+the hypotheses, the mixture differs from that of the estimator by what its search misses. Both
+approximate the amplitudes of stuck elements by a Gaussian.
 """
 
 from collections.abc import Sequence

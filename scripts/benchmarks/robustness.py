@@ -15,8 +15,8 @@ The time is the median of the CPU time of an estimate, on one core.
 
 With --reference N, the first N positions of each declared row are compared with the exhaustive
 posterior of the declared model, paired. Element errors have their covariance at every point there.
-Failed elements have no such sum: the reference of their row is the posterior if the true set and
-position are among the hypotheses of the search, so that the ratio is an upper limit.
+Failed elements have no such sum: the reference of their row is the same mixture with the true set
+and position among its hypotheses, so that the ratio covers only what the search misses.
 """
 
 import os
