@@ -46,9 +46,11 @@ class ElementSums:
         self._has_pattern = isinstance(element, GainPattern) or isinstance(user, GainPattern)
         # T_i, complex128 [N_B, N_SB, N_E, F]; without a pattern, times the constant part of the
         # gain.
-        self._frames = np.ascontiguousarray(np.swapaxes(radiation.reshape(shape), 2, 3))
+        frames = np.ascontiguousarray(np.swapaxes(radiation.reshape(shape), 2, 3))
         if not isinstance(element, GainPattern) and not isinstance(user, GainPattern):
-            self._frames *= (element * user / 2 / self._wavenumbers)[..., None, None]
+            # Not in place: with one frame, the array is that of the caller.
+            frames = frames * (element * user / 2 / self._wavenumbers)[..., None, None]
+        self._frames = frames
         self._elements = element_positions(scenario)
         # Coordinates in which the elements differ from the origin; a plane has two.
         self._axes = np.flatnonzero(self._elements.any(axis=0))

@@ -129,6 +129,15 @@ def test_fast_mean_and_jacobian_equal_the_exact_ones(faded, gains, n):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
+def test_fast_mean_and_jacobian_of_a_single_frame(random_beams):
+    scenario = Scenario(n_frames=1)
+    model = MeasurementModel(scenario, random_beams(scenario, np.random.default_rng(0)))
+    positions = scenario.sample_positions(2, np.random.default_rng(1))
+    mean, jacobian = model.mean_and_jacobian(positions)
+    for actual, expected in ((mean, model.mean(positions)), (jacobian, model.jacobian(positions))):
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize('n_rows', [1, 2, 3])
 def test_mean_derivative_accepts_any_number_of_rows(faded, n_rows):
     scenario, codebook = faded
