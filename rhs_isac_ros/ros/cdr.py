@@ -219,14 +219,16 @@ def _padding(position: int) -> int:
 
 
 _NONE = np.empty(0)
+_REAL, _COMPLEX = np.dtype('<f8'), np.dtype('<c16')
 
 
 def _encode_real(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.array(values.shape, '<u4'), values.ravel()
+    return np.array(values.shape, '<u4'), np.asarray(values, _REAL).ravel()
 
 
 def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
-    flat = values.ravel()
+    # Radios often return complex64.
+    flat = np.asarray(values, _COMPLEX).ravel()
     return np.array(values.shape, '<u4'), flat.real, flat.imag
 
 

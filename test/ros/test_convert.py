@@ -126,6 +126,18 @@ def test_arrays_are_sent_in_c_order_whatever_their_layout(kind):
     assert_same(message, convert.from_ros(kind, sent))
 
 
+@pytest.mark.parametrize(('field', 'dtype', 'expected'), [
+    ('analog', np.float32, float), ('analog', int, float), ('analog', '>f8', float),
+    ('digital', np.complex64, complex), ('digital', float, complex), ('digital', '>c16', complex)])
+def test_arrays_of_other_numbers_are_converted(field, dtype, expected):
+    values = np.arange(12).reshape(3, 4)
+    message = dataclasses.replace(
+        random_message(m.Beam, np.random.default_rng(0)), **{field: values.astype(dtype)})
+    received = getattr(convert.from_bytes(m.Beam, convert.to_bytes(message, 0)), field)
+    assert received.dtype == expected
+    assert np.array_equal(received, values)
+
+
 @pytest.mark.parametrize('kind', KINDS)
 def test_header_has_stamp_and_frame(kind):
     sent = convert.to_ros(random_message(kind, np.random.default_rng(0)), STAMP)
