@@ -57,11 +57,12 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  traceback: TracebackType | None) -> None:
-        self._own.depth -= 1
-        if not self._own.depth:
+        # A child process begins with no callers, even if its parent forked inside a call.
+        depth = getattr(self._own, 'depth', 0)
+        if depth == 1:
             _restore(self._own.saved)
+        self._own.depth = max(depth - 1, 0)
         with self._lock:
-            # A child process begins with no callers, even if its parent forked inside a call.
             self._depth = max(self._depth - 1, 0)
             if not self._depth:
                 _restore(self._saved)

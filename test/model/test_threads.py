@@ -85,6 +85,20 @@ def test_a_forked_process_begins_with_the_setting_of_the_process():
     assert set(numbers()) == {3}
 
 
+@pytest.mark.skipif(not hasattr(os, 'fork'), reason='this system has no fork')
+@pytest.mark.filterwarnings('ignore:.*multi-threaded:DeprecationWarning')
+def test_a_process_forked_in_a_block_can_leave_it():
+    parent, code = os.getpid(), 1
+    try:
+        with one_blas_thread:
+            child = os.fork()
+        code = int(set(numbers()) != {3})
+    finally:
+        if os.getpid() != parent:
+            os._exit(code)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
 def test_blocks_run_side_by_side_with_one_blas_thread_each(monkeypatch):
     monkeypatch.setattr(threads, '_n_cores', lambda: 2)
     # Neither block returns before both have begun.
