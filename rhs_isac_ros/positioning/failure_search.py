@@ -80,6 +80,9 @@ class FailureSearch:
         found = self._weigh(parents)
         for _ in range(_MAX_FAILURES):
             ranked = self._weigh_children(parents, remainder)
+            if not ranked:
+                # All elements have failed.
+                break
             exact = self._weigh(ranked[:_N_EXACT])
             limit = max(self.values[key] for key in found) - self._margin
             if self.values[exact[0]] < limit and self.explains(found):

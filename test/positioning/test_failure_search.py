@@ -66,6 +66,17 @@ def test_without_a_remainder_the_growth_often_ends_with_another_set(codebook, mo
     assert missed > 0
 
 
+def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
+    scenario = dataclasses.replace(
+        SCENARIO, elements_per_side=2, failed_element_share=0.1)
+    codebook = random_beams(scenario, np.random.default_rng(1))
+    model = FailureModel(WhitenedModel(scenario, codebook))
+    strong = 100 * MeasurementModel(scenario, codebook).mean(POSITION[None])[0]
+    search, sites = search_at_the_truth(model, strong)
+    search.grow(sites)
+    assert max(len(failed) for failed, _ in search.values) == 4
+
+
 def test_neighbours_differ_by_one_element(codebook, model):
     search, sites = search_at_the_truth(model, signals(codebook, (3, 17), 0)[1])
     search.try_neighbours(((3, 17), sites[0][1]))
