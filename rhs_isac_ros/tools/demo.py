@@ -89,12 +89,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The log of the cycles is complete when the processes are about to end.
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             problem = ''
-            with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-                start_network(
-                    processes, options.users, options.seed, options.config, codebook_file,
-                    scenario, together=together,
-                    positioner=positioner_parameters(options.prior, scenario))
-                problem = _observe(log, processes, recorder, options.cycles)
+            try:
+                with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+                    start_network(
+                        processes, options.users, options.seed, options.config, codebook_file,
+                        scenario, together=together,
+                        positioner=positioner_parameters(options.prior, scenario))
+                    problem = _observe(log, processes, recorder, options.cycles)
+            finally:
+                # Also if a signal arrives before the observer exists.
+                if recorder is not None:
+                    recorder.close()
             processes.interrupt()
             with contextlib.suppress(KeyboardInterrupt):
                 return _report(log, scenario, options, problem)
@@ -113,8 +118,6 @@ def _observe(
     finally:
         observer.destroy_node()  # type: ignore[no-untyped-call]
         try_shutdown()
-        if recorder is not None:
-            recorder.close()
 
 
 def _parser() -> argparse.ArgumentParser:
