@@ -175,7 +175,7 @@ def picture(summary: Summary) -> bytes:
     for axes, name, label in zip(
             panels, ('crlb_m2', 'normalised'),
             ('(a) CRLB on the samples [m²]',
-             rf'(b) computing time / that of {PROPOSED} with $N_\mathrm{{B}} = {BANDS[0]}$'),
+             rf'(b) CPU time over that of {PROPOSED}, $N_\mathrm{{B}} = {BANDS[0]}$'),
             strict=True):
         for offset, method in zip(np.linspace(-0.12, 0.12, len(METHODS)), METHODS, strict=True):
             means, stds = np.array(

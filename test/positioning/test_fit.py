@@ -108,7 +108,9 @@ def test_valid_signals_are_located_beside_invalid_ones(setting):
     received[[1, 4]] = 0
     estimate = estimator.estimate(received)
     assert estimate.fix.tolist() == [True, False, True, True, False, True]
-    np.testing.assert_array_equal(estimate.mean[estimate.fix], expected.mean[estimate.fix])
+    # Sums over a batch depend on its size in the last digits.
+    np.testing.assert_allclose(
+        estimate.mean[estimate.fix], expected.mean[estimate.fix], rtol=0, atol=1e-9)
     assert [bool(reason) for reason in estimate.reason] == (~estimate.fix).tolist()
     assert np.linalg.norm(estimate.mean - positions, axis=1)[estimate.fix].max() < 0.1
 
