@@ -40,8 +40,11 @@ def entries(
     """
     prefix = topic_prefix(namespace)
     view = NetworkView(scenario)
-    for _, message, _ in read(path, [f'{prefix}{topics.CODEBOOK}']):
-        codebook = convert.codebook_from_ros(message)
+    for topic, found, _ in read(path, [f'{prefix}{topics.CODEBOOK}']):
+        try:
+            codebook = convert.codebook_from_ros(found)
+        except m.MessageError as error:
+            raise RecordingError(f'{path}: {topic}: {error}') from None
         if codebook.id not in posteriors.codebooks:
             posteriors.add(codebook)
             view.set_bound(codebook.id, posteriors.bound_m2(codebook))

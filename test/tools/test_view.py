@@ -13,16 +13,19 @@ from pathlib import Path
 import headless_browser
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 
+import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import network_view
 from rhs_isac_ros.monitoring.scene_shapes import user_colour
 from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.recording import Recorder, read
+from rhs_isac_ros.ros.recording import Recorder, RecordingError, read, schema, type_name
 from rhs_isac_ros.tools.replay import load
 from rhs_isac_ros.tools.view import main
 from rhs_isac_ros.tools.view_node import ViewNode
 from rhs_isac_ros.tools.view_posteriors import Posteriors
+from rhs_isac_ros.tools.view_recording import entries
 
 CONFIG = Path(__file__).parents[2] / 'config'
 SCRIPT = CONFIG.parent / 'scripts' / 'view'
@@ -144,6 +147,19 @@ def test_a_recording_is_shown_with_tracks_and_modes(recording, paths, tmp_path, 
 def test_a_recording_without_the_namespace_is_an_error(recording, tmp_path, capsys):
     assert main([str(recording), '--namespace', '/lab', '--save', str(tmp_path / 'v.rrd')]) == 2
     assert 'no cycle in the namespace /lab' in capsys.readouterr().err
+
+
+def test_a_malformed_codebook_of_a_recording_is_named(tmp_path):
+    pytest.importorskip('mcap', reason='mcap is not installed')
+    path = tmp_path / 'run.mcap'
+    recorder = Recorder(path, Scenario())
+    channel = recorder._writer.register_channel(
+        topic='/codebook', message_encoding='cdr', schema_id=recorder._writer.register_schema(
+            type_name(ros.Codebook), 'ros2msg', schema(ros.Codebook).encode()))
+    recorder._writer_of(channel, 'codebook', None)(serialize_message(ros.Codebook()))
+    recorder.close()
+    with pytest.raises(RecordingError, match='run.mcap: /codebook: Codebook: 0 values, expected'):
+        list(entries(path, '/', Scenario(), Posteriors(Scenario())))
 
 
 def is_free(port):
