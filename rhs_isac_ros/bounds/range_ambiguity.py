@@ -114,7 +114,7 @@ def range_confusion_error_of(
 def _differences(
         model: MeasurementModel, mean: np.ndarray, confused: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened differences from a mean that nothing else explains.
+    """Whitened differences from a mean that remain with the best displacement and phases.
 
     Returns the differences, float64 [n, R], and the costs of the phases, float64 [n].
     """

@@ -138,9 +138,9 @@ def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
 @functools.lru_cache(maxsize=16)
 def arrays(scenario: Scenario, surface: SurfaceEstimate | None
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute what does not depend on the position: `onboard`, `spatial` of all bands, `fixed`.
+    """Compute the arrays that do not depend on the position: `onboard`, `spatial` and `fixed`.
 
-    The arrays are read-only.
+    Those of the first two are of all bands. All are read-only.
     """
     onboard, fixed = onboard_matrix(scenario), np.zeros(scenario.n_elements, bool)
     if surface:

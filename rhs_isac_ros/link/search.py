@@ -37,7 +37,7 @@ _MIN_NORM = 1e-30
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tables:
-    """What the search needs and what does not depend on the position, for all bands.
+    """The arrays of the search that do not depend on the position, for all bands.
 
     Attributes
     ----------

@@ -98,7 +98,7 @@ class RandomWalk:
         return position
 
     def _begin_leg(self) -> None:
-        """Store what is constant on a leg: a node may have many users that walk."""
+        """Compute the velocity and the duration of a leg once: a node may have many users."""
         leg = self._target - self._origin
         length = float(np.linalg.norm(leg))
         self._velocity = leg / length * self._speed_mps

@@ -1,4 +1,4 @@
-"""What a view shows in space, in planes and in charts, independent of the program that draws it.
+"""The contents of a view in space, planes and charts, independent of the program that draws it.
 
 Lengths are in metres; colours are red, green and blue from 0 to 1.
 """
@@ -113,7 +113,7 @@ class Text:
 
 @dataclasses.dataclass(frozen=True)
 class Nothing:
-    """The end of what was shown on a path and on the paths below it."""
+    """Removes the entities of a path and of the paths below it."""
 
 
 Entity: TypeAlias = (

@@ -73,7 +73,7 @@ class NetworkView:
         return self._n_cycles
 
     def begin(self) -> list[Entry]:
-        """Return what is shown at all times."""
+        """Return the entries that are shown at all times."""
         grid, labels = mode_chart.axes()
         return [Entry(0, f'{WORLD}/region', scene.region(self._scenario)),
                 Entry(0, f'{MODES}/grid', grid), Entry(0, f'{MODES}/labels', labels)]

@@ -152,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--save', type=_recording_file, metavar='FILE',
                         help='write a file for Rerun, *.rrd, instead of serving the viewer')
     parser.add_argument('--cycles', type=positive_int, default=0, metavar='N',
-                        help='end after N cycles')
+                        help='show N cycles; the view of a running network then ends')
     parser.add_argument('--config', type=input_file, metavar='FILE',
                         help="scenario file; by default that of the recording, or the paper's "
                         'Table I')

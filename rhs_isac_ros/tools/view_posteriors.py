@@ -1,4 +1,4 @@
-"""What a view computes itself: the modes of the posterior and the global bound."""
+"""The modes of the posterior and the global bound, which no message contains."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ _N_PHASES = 256
 class Posteriors:
     """The posteriors of received signals, for the codebooks that were added.
 
-    Estimates are no messages of their modes: sending these would lengthen every cycle.
+    The messages of the network do not contain the modes: sending them would lengthen every cycle.
 
     Parameters
     ----------
