@@ -66,7 +66,7 @@ class BandPlan:
     """Result of `optimize_band_plan`: the scenario with its bands, and its codebook.
 
     `candidates` are the plans that `choose_bands` compared, the best one first, and `error_m2` is
-    the expected squared error.
+    the expected squared error, NaN if the optimisation of the codebook was interrupted.
     """
 
     scenario: Scenario

@@ -28,6 +28,8 @@ _PROGRAM = 'snapshot'
 # Within this time [s], every user publishes its true position; within twice this time, the
 # surface publishes its configuration.
 _REPORT_PERIOD_S = 0.5
+# Maximum number of users that a message names.
+_MAX_NAMED = 8
 
 
 class SnapshotNode(Node):
@@ -136,8 +138,10 @@ def write_picture(
         return 1
     missing = sorted(user for user, state in scene.users.items() if not state.estimate)
     if missing:
-        print(f'no estimate of user {", ".join(map(str, missing))} within '
-              f'{options.timeout:g} s', file=sys.stderr)
+        n_others = len(missing) - _MAX_NAMED
+        print(f'no estimate of user {", ".join(map(str, missing[:_MAX_NAMED]))}'
+              f'{f" and {n_others} others" if n_others > 0 else ""} within {options.timeout:g} s',
+              file=sys.stderr)
     try:
         draw(scene, scenario, options.output)
     except OSError as error:

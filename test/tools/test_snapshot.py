@@ -5,10 +5,12 @@ import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.scene_state import SceneState
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.snapshot import write_picture
 
 ROOT = Path(__file__).parents[2]
@@ -47,3 +49,14 @@ def test_without_a_network_it_is_an_error(capsys):
     assert out == ''
     assert err.startswith('snapshot: error: no user found within 0.5 s, in the domain ')
     assert not options.output.exists()
+
+
+def test_of_many_users_without_an_estimate_few_are_named(tmp_path, capsys):
+    scene = SceneState()
+    scene.add(m.GroundTruths(
+        cycle_id=0, users=np.arange(1, 21), position=np.full((20, 3), (9.0, 1.0, 0.3)),
+        velocity=np.zeros((20, 3))), 0.0)
+    options = SimpleNamespace(timeout=1.0, output=tmp_path / 'now.png')
+    assert write_picture(scene, '', Scenario(), options) == 0
+    assert capsys.readouterr().err == (
+        'no estimate of user 1, 2, 3, 4, 5, 6, 7, 8 and 12 others within 1 s\n')
