@@ -110,18 +110,25 @@ class UserScheduler:
         return user not in self._missed and len(self._missed) >= MAX_USERS
 
     def register(self, user: int) -> None:
-        """Wait for a user, without counting it among those that answered."""
+        """Wait for a user, without counting it among those that answered.
+
+        A user that was invited to this cycle and has not answered in time loses its turn.
+        Otherwise, the range of a user that is always late would be invited in every cycle, and
+        the users of the other ranges never.
+        """
         # A new user comes after all that wait and before the one served last, so that users that
         # leave and return do not gain turns.
         if user not in self._missed:
             self._served[user] = self._turn, 0
             bisect.insort(self._numbers, user)
+        elif self._policy == 'round_robin' and user in self._awaited:
+            self._served[user] = self._turn, 0
         self._missed[user] = 0
 
     def add_answer(self, user: int) -> None:
         """Register a user as answering in this cycle."""
-        self.register(user)
         self._awaited.discard(user)
+        self.register(user)
         self.answered[user] = None
 
     def remove(self, user: int) -> None:

@@ -294,6 +294,20 @@ def test_no_user_waits_longer_than_a_round(make, present):
         assert max(np.diff([-1, *turns, 3 * n])) <= n
 
 
+def test_a_user_that_is_always_late_does_not_delay_the_users_of_other_ranges(make):
+    scheduler, late, others = make(), 3, [user for user in range(1, 41) if user != 3]
+    for user in (late, *others):
+        scheduler.register(user)
+    served = []
+    for _ in range(3 * len(others)):
+        served += served_in_turn(scheduler, others, 1)
+        # Its acks arrive after the grant.
+        scheduler.register(late)
+    for user in others:
+        turns = [turn for turn, other in enumerate(served) if other == user]
+        assert max(np.diff([-1, *turns, len(served)])) <= len(others) + 1
+
+
 def test_new_users_between_many_are_served_within_two_rounds(make):
     scheduler = make()
     served_in_turn(scheduler, range(2, 202, 2), 100)
