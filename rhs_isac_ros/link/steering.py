@@ -74,6 +74,8 @@ def steer_bands(
 
     This takes hardly longer than a single band.
     """
+    if not len(bands):
+        raise ValueError('bands: none, expected at least one')
     for band in bands:
         if not 0 <= band < scenario.n_bands:
             raise ValueError(f'band: {band}, expected 0 to {scenario.n_bands - 1}')
@@ -119,7 +121,8 @@ def choose_beam(
     Raises
     ------
     ValueError
-        If `mean` or `covariance` has a wrong shape or is not finite, or a band is out of range.
+        If `mean` or `covariance` has a wrong shape or is not finite, there is no band, or a band
+        is out of range.
     """
     covariance = np.zeros((3, 3)) if covariance is None else covariance
     bands = range(scenario.n_bands) if bands is None else bands

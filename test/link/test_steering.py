@@ -243,6 +243,11 @@ def test_choosing_from_a_band_out_of_range_is_an_error(table1, bands):
         choose_beam(table1.scenario, POSITION, np.eye(3), bands)
 
 
+def test_choosing_from_no_band_is_an_error(table1):
+    with pytest.raises(ValueError, match='bands: none, expected at least one'):
+        choose_beam(table1.scenario, POSITION, np.eye(3), [])
+
+
 @pytest.mark.parametrize('band', [0, 1])
 def test_capacities_of_the_outcome_match_the_reference(table1, reference_link, band):
     scenario, link = table1.scenario, reference_link(table1, band)
