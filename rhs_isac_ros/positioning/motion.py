@@ -1,34 +1,47 @@
-"""The movement that a track assumes: velocities that change at random and return to zero."""
+"""The movement that a track assumes: velocities that drift at random, and turns."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 
-from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.mixture import Mixture, concatenate
 from rhs_isac_ros.positioning.polar import jacobian, to_polar, to_positions
+
+# Bounds of the intervals of the time between two phases, as shares of it, in which a turn is
+# distinguished. With one interval, the position after an early turn is too unlikely: the Gaussian
+# has the mean time after a turn.
+_TURN_INTERVALS = (0.0, 0.5, 1.0)
+
+# Components that are lighter than the heaviest by more than this, in log-weight, do not turn.
+_TURN_MARGIN = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """A random velocity, an Ornstein-Uhlenbeck process, the same in all directions.
+    """A random velocity, the same in all directions, with sudden turns.
 
-    Over times that are short against `memory_s`, the velocity is constant up to noise; over long
-    ones, the position is a random walk, so that users that turn, stop and go are covered.
+    Between turns, the velocity is an Ornstein-Uhlenbeck process: over times that are short against
+    `memory_s`, it is constant up to noise. At a turn, which may also be a stop or a start, it is
+    drawn anew. The numbers of turns in separate times are independent.
 
     Parameters
     ----------
     speed_mps
         Root mean square of the speed [m/s].
     memory_s
-        Time over which the velocity loses its memory [s].
+        Time over which the velocity loses its memory without a turn [s].
+    turn_s
+        Mean time between turns [s].
     """
 
     speed_mps: float = 1.0
-    memory_s: float = 1.5
+    memory_s: float = 5.0
+    turn_s: float = 2.0
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ('speed_mps', 'memory_s'):
+        for name in ('speed_mps', 'memory_s', 'turn_s'):
             value = getattr(self, name)
             if not 0 < value < np.inf:
                 raise ValueError(f'{name}: {value}, expected a positive number')
@@ -58,27 +71,59 @@ class Motion:
     def predict(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         """Return the mixture after a time [s].
 
-        Positions and velocities of the means move in straight lines; the covariances neglect
-        the curvature of the coordinates.
+        Every component gives one for a user that has not turned, and one for a user that has
+        turned in each of the `_TURN_INTERVALS`. Means move in straight lines; the covariances
+        neglect the curvature of the coordinates.
         """
+        log_no_turn = -elapsed_s / self.turn_s
+        turn = -np.expm1(log_no_turn)
+        straight = self._straight(mixture, elapsed_s)
+        straight = straight._replace(log_weights=straight.log_weights + log_no_turn)
+        mixture = mixture.select(
+            mixture.log_weights >= mixture.log_weights.max() - _TURN_MARGIN)
+        return concatenate(
+            straight,
+            *(self._turned(
+                mixture._replace(log_weights=mixture.log_weights + np.log(turn * (end - begin))),
+                begin * elapsed_s, end * elapsed_s, elapsed_s)
+              for begin, end in itertools.pairwise(_TURN_INTERVALS)))
+
+    def _straight(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         decay = np.exp(-elapsed_s / self.memory_s)
         reach_s = self.memory_s * (1 - decay)
-        before = mixture.means[:, :3]
-        velocity = np.matmul(jacobian(before), mixture.means[:, 3:, None])
-        points = to_polar(_in_front(to_positions(before) + reach_s * velocity[..., 0]))
-        means = np.empty_like(mixture.means)
-        means[:, :3] = points
-        means[:, 3:] = decay * np.linalg.solve(jacobian(points), velocity)[..., 0]
+        points, velocity = _moved(mixture, reach_s)
+        rates = decay * np.linalg.solve(jacobian(points), velocity[..., None])[..., 0]
+        means = np.concatenate([points, rates], axis=1)
         transition = np.eye(6)
         transition[:3, 3:] += reach_s * np.eye(3)
         transition[3:, 3:] *= decay
-        covariances = transition @ mixture.covariances @ transition.T
-        noise = self._noise(elapsed_s, decay)
-        scale = _isotropic(points)
-        for row in (0, 1):
-            for column in (0, 1):
-                covariances[:, 3 * row:3 * row + 3, 3 * column:3 * column + 3] += (
-                    noise[row, column] * scale)
+        return Mixture(
+            mixture.log_weights, means,
+            transition @ mixture.covariances @ transition.T
+            + np.kron(self._noise(elapsed_s, decay), np.ones((3, 3)))
+            * np.tile(_isotropic(points), (2, 2)))
+
+    def _turned(
+            self, mixture: Mixture, begin_s: float, end_s: float, elapsed_s: float) -> Mixture:
+        """Return the mixture of users that have turned once, at any moment of an interval.
+
+        Mean and covariance are those of a moment that is distributed uniformly; the user moves
+        in a straight line before and after it.
+        """
+        mean_s, variance_s2 = (begin_s + end_s) / 2, (end_s - begin_s)**2 / 12
+        rest_s = elapsed_s - mean_s
+        points, _ = _moved(mixture, mean_s)
+        means = np.concatenate([points, np.zeros_like(points)], axis=1)
+        transition = np.hstack([np.eye(3), mean_s * np.eye(3)])
+        rates, within = mixture.means[:, 3:], mixture.covariances[:, 3:, 3:]
+        turned = self.velocity_variance * _isotropic(points)
+        covariances = np.empty_like(mixture.covariances)
+        covariances[:, :3, :3] = (
+            transition @ mixture.covariances @ transition.T
+            + variance_s2 * (within + rates[:, :, None] * rates[:, None])
+            + (rest_s**2 + variance_s2) * turned)
+        covariances[:, :3, 3:] = covariances[:, 3:, :3] = rest_s * turned
+        covariances[:, 3:, 3:] = turned
         return Mixture(mixture.log_weights, means, covariances)
 
     def _noise(self, elapsed_s: float, decay: float) -> np.ndarray:
@@ -90,6 +135,13 @@ class Motion:
         return variance * np.array([
             [memory_s**2 * drift, memory_s * (1 - decay)**2],
             [memory_s * (1 - decay)**2, 1 - decay**2]])
+
+
+def _moved(mixture: Mixture, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (r, u, v) after a time in a straight line, and velocities, float64 [C, 3]."""
+    points = mixture.means[:, :3]
+    velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])[..., 0]
+    return to_polar(_in_front(to_positions(points) + time_s * velocities)), velocities
 
 
 def _isotropic(points: np.ndarray) -> np.ndarray:

@@ -26,6 +26,11 @@ def cartesian(mixture):
             both @ mixture.covariances @ np.swapaxes(both, 1, 2))
 
 
+def continued(motion, mixture, elapsed_s):
+    """Return the components of users that have not turned."""
+    return motion.predict(mixture, elapsed_s).select(slice(len(mixture.means)))
+
+
 def test_a_mixture_starts_at_rest_with_the_assumed_speed():
     mixture = started(Motion(speed_mps=2.0))
     positions, velocities, covariances = cartesian(mixture)
@@ -40,7 +45,7 @@ def test_means_move_in_straight_lines_and_slow_down():
     velocity = np.array([0.3, -0.8, 0.1])
     by_point = jacobian(mixture.means[:, :3])
     mixture.means[:, 3:] = np.linalg.solve(by_point, velocity[None, :, None])[..., 0]
-    positions, velocities, _ = cartesian(motion.predict(mixture, 0.5))
+    positions, velocities, _ = cartesian(continued(motion, mixture, 0.5))
     decay = np.exp(-0.25)
     np.testing.assert_allclose(velocities, [decay * velocity] * 2, atol=1e-12)
     np.testing.assert_allclose(positions, PLACE + 2.0 * (1 - decay) * velocity, atol=1e-12)
@@ -61,12 +66,49 @@ def test_covariances_are_those_of_the_random_process(elapsed_s):
         np.testing.assert_allclose(block, expected, rtol=0.02, atol=1e-9)
 
 
-def test_two_short_predictions_equal_a_long_one():
+def test_two_short_predictions_without_a_turn_equal_a_long_one():
     motion = Motion()
-    once = motion.predict(started(motion), 0.4)
-    twice = motion.predict(motion.predict(started(motion), 0.1), 0.3)
+    once = continued(motion, started(motion), 0.4)
+    twice = continued(motion, continued(motion, started(motion), 0.1), 0.3)
+    np.testing.assert_allclose(twice.log_weights, once.log_weights)
     np.testing.assert_allclose(twice.means, once.means, atol=1e-9)
     np.testing.assert_allclose(twice.covariances, once.covariances, rtol=1e-6, atol=1e-12)
+
+
+def test_weights_are_those_of_random_turns():
+    motion = Motion(turn_s=2.0)
+    weights = np.exp(motion.predict(started(motion), 1.0).log_weights).reshape(-1, 2)
+    np.testing.assert_allclose(weights.sum(axis=0), [0.3, 0.7])
+    np.testing.assert_allclose(weights[0], np.exp(-0.5) * np.array([0.3, 0.7]))
+    np.testing.assert_allclose(weights[1], weights[2])
+
+
+def test_components_after_a_turn_have_the_moments_of_its_random_moment():
+    """The reference draws the moments and the velocities after them."""
+    motion, elapsed_s, n = Motion(speed_mps=1.2, memory_s=3.0), 0.4, 40_000
+    mixture = started(motion)
+    by_point = jacobian(mixture.means[:, :3])
+    before = np.array([0.3, -0.8, 0.1])
+    mixture.means[:, 3:] = np.linalg.solve(by_point, before[None, :, None])[..., 0]
+    _, _, (covariance, _) = cartesian(mixture)
+    rng = np.random.default_rng(1)
+    for index, bounds in ((2, (0.0, 0.2)), (4, (0.2, 0.4))):
+        position, velocity, (found, *_) = cartesian(
+            motion.predict(mixture, elapsed_s).select(slice(index, None)))
+        start = rng.multivariate_normal([*PLACE[0], *before], covariance, n)
+        turn_s = rng.uniform(*bounds, (n, 1))
+        after = np.sqrt(motion.velocity_variance) * rng.standard_normal((n, 3))
+        drawn = np.hstack([
+            start[:, :3] + turn_s * start[:, 3:] + (elapsed_s - turn_s) * after, after])
+        np.testing.assert_allclose(
+            [*position[0], *velocity[0]], drawn.mean(axis=0), atol=0.02)
+        np.testing.assert_allclose(found, np.cov(drawn.T), rtol=0.04, atol=5e-3)
+
+
+def test_lighter_components_do_not_turn():
+    motion = Motion()
+    mixture = started(motion)._replace(log_weights=np.array([-20.0, 0.0]))
+    assert len(motion.predict(mixture, 0.1).means) == 4
 
 
 def test_users_stay_in_front_of_the_surface():

@@ -1,9 +1,13 @@
 """Tracks of users over successive positioning phases."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import chdtri
 
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import Motion, SignalError, Tracker, make_estimator
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S, independent_share
@@ -85,6 +89,32 @@ def test_errors_and_covariances_of_walks(table1_estimator, sample):
     assert np.mean(np.array(normalised) <= REGION_RADIUS) > 0.8
     # The median of the chi-square distribution with three degrees of freedom is 2.4.
     assert 1 < np.median(normalised) < 5
+
+
+def test_turns_whose_steps_are_the_distance_of_modes():
+    """Modes of the band plan are 0.12 m apart: a user that turns back may seem not to have."""
+    config = Path(__file__).parents[2] / 'config'
+    scenario = dataclasses.replace(
+        Scenario.from_yaml(config / 'bandplan.yaml'), roi_center_m=(9, 0, 0),
+        roi_size_m=(2, 1, 0.5))
+    codebook = Codebook.load(config / 'codebook_bandplan.yaml')
+    estimator = make_estimator('bayes', scenario, codebook)
+    model, rng, normalised = MeasurementModel(scenario, codebook), np.random.default_rng(1), []
+    for _ in range(4):
+        tracker, position = Tracker(estimator), np.array([8.9, -0.2, 0.1])
+        velocity = np.array([0.6, 0.1, 0.0])
+        for step in range(30):
+            if step in (10, 20):
+                velocity = -velocity
+            position = position + PERIOD_S * velocity
+            estimate = tracker.update(
+                step * PERIOD_S, model.sample(position[None], rng)[0])
+            if step >= 5:
+                offset = estimate.mean - position
+                normalised.append(offset @ np.linalg.solve(estimate.covariance, offset))
+    # Tracks without turns have a mean above 18.
+    assert np.mean(normalised) < 12
+    assert np.mean(np.array(normalised) <= REGION_RADIUS) > 0.75
 
 
 def test_a_walk_of_metres_between_phases(tracker, sample):
@@ -242,7 +272,7 @@ def test_correlated_multipath_does_not_narrow_the_covariance(table1_estimator, s
     assert again.n_phases == 1
 
 
-@pytest.mark.parametrize('values', [{'speed_mps': 0.0}, {'memory_s': np.inf}])
+@pytest.mark.parametrize('values', [{'speed_mps': 0.0}, {'memory_s': np.inf}, {'turn_s': -1.0}])
 def test_an_invalid_motion_is_an_error(values):
     with pytest.raises(ValueError, match=f'{next(iter(values))}: .*, expected a positive number'):
         Motion(**values)

@@ -5,6 +5,7 @@ import datetime
 import numpy as np
 from stonesoup.base import Property
 from stonesoup.models.measurement.base import MeasurementModel
+from stonesoup.models.transition.base import TransitionModel
 from stonesoup.models.transition.linear import (
     CombinedLinearGaussianTransitionModel,
     OrnsteinUhlenbeck,
@@ -70,6 +71,44 @@ class Likelihood(MeasurementModel):
         raise NotImplementedError
 
 
+class Turns(TransitionModel):
+    """Straight movement, and one turn at a random moment for some of the particles."""
+
+    straight: TransitionModel = Property(doc='Movement without a turn')
+    motion: Motion = Property(doc='Assumed movement')
+    rng: np.random.Generator = Property(doc='Generator of the turns')
+
+    @property
+    def ndim_state(self):
+        """Number of states."""
+        return 6
+
+    def function(self, state, noise=False, time_interval=None, **kwargs):
+        """Return the states of particles after a time."""
+        before = np.asarray(state.state_vector, float)
+        after = np.array(
+            self.straight.function(state, noise=noise, time_interval=time_interval), float)
+        elapsed_s = time_interval.total_seconds()
+        probability = -np.expm1(-elapsed_s / self.motion.turn_s)
+        turns = self.rng.uniform(size=before.shape[1]) < probability
+        moments_s = self.rng.uniform(0, elapsed_s, turns.sum())
+        velocities = np.sqrt(self.motion.velocity_variance) * self.rng.standard_normal(
+            (3, turns.sum()))
+        after[np.ix_(POSITION, turns)] = (
+            before[np.ix_(POSITION, turns)] + moments_s * before[np.ix_(VELOCITY, turns)]
+            + (elapsed_s - moments_s) * velocities)
+        after[np.ix_(VELOCITY, turns)] = velocities
+        return StateVectors(after)
+
+    def rvs(self, num_samples=1, **kwargs):
+        """Return no noise: it depends on the state."""
+        raise NotImplementedError
+
+    def pdf(self, state1, state2, **kwargs):
+        """Return no density: the filter draws from the model."""
+        raise NotImplementedError
+
+
 class ParticleFilter:
     """A bootstrap filter, started from the posterior of the first cycle."""
 
@@ -82,7 +121,9 @@ class ParticleFilter:
         axis = OrnsteinUhlenbeck(
             noise_diff_coeff=2 * motion.velocity_variance / motion.memory_s,
             damping_coeff=1 / motion.memory_s)
-        self._predictor = ParticlePredictor(CombinedLinearGaussianTransitionModel([axis] * 3))
+        straight = CombinedLinearGaussianTransitionModel([axis] * 3)
+        self._predictor = ParticlePredictor(
+            Turns(straight=straight, motion=motion, rng=self._rng))
         self._likelihood = Likelihood(
             model=estimator.exact_model, bounds=estimator.scenario.roi_bounds_m)
         self._updater = ParticleUpdater(self._likelihood, ESSResampler())
