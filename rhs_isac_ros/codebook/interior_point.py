@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 
 from rhs_isac_ros.codebook.search import Search
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Initial weight of the barrier; the objective is scaled to 1 at the start.
 _BARRIER = 1e-3
@@ -32,6 +33,8 @@ def minimize_interior_point(
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import BFGS, Bounds, OptimizeResult, minimize
 
+    # SciPy multiplies the Hessian matrix with a BLAS of its own.
+    one_blas_thread.find_libraries()
     best = search.value_and_gradient(start)[0], np.array(start)
     scale = best[0]
 

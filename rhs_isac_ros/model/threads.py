@@ -8,13 +8,13 @@ divided into blocks that run side by side (`map_blocks`).
 
 import contextlib
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Protocol, TypeVar
 
+import numpy  # noqa: F401 - loads the BLAS that `one_blas_thread` limits
 from threadpoolctl import ThreadpoolController
 
 _Item = TypeVar('_Item')
@@ -40,14 +40,15 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
     def __init__(self) -> None:
         self._lock, self._own = threading.Lock(), threading.local()
-        self._depth, self._scanned = 0, (False, False)
+        self._depth = 0
         self._shared: list[_Library] = []
         self._per_thread: list[_Library] = []
         self._saved: list[tuple[_Library, int]] = []
+        self.find_libraries()
 
     def __enter__(self) -> None:
         with self._lock:
-            if self._scan() or not self._depth:
+            if not self._depth:
                 self._saved += _limit(self._shared)
             self._depth += 1
         depth = getattr(self._own, 'depth', 0)
@@ -71,8 +72,6 @@ class _OneBlasThread(contextlib.ContextDecorator):
     def allowed(self) -> int:
         """Return the number of threads that BLAS may use outside of this context."""
         with self._lock:
-            if self._scan() and self._depth:
-                self._saved += _limit(self._shared)
             saved = [*self._saved, *getattr(self._own, 'saved', ())]
         numbers = [number for _, number in saved]
         numbers += [library.get_num_threads() or 1
@@ -85,18 +84,22 @@ class _OneBlasThread(contextlib.ContextDecorator):
         _restore(self._saved)
         self._saved = []
 
-    def _scan(self) -> bool:
-        """Find the libraries, again after SciPy has loaded its own; return whether it did so."""
-        loaded = True, 'scipy.linalg' in sys.modules
-        is_new = self._scanned != loaded
-        if is_new:
-            found = ThreadpoolController().select(user_api='blas').lib_controllers
-            self._per_thread = [
-                library for library in found
-                if getattr(library, 'threading_layer', '') == 'openmp']
-            self._shared = [library for library in found if library not in self._per_thread]
-            self._scanned = loaded
-        return is_new
+    def find_libraries(self) -> None:
+        """Find the BLAS libraries that the process has loaded.
+
+        The search holds the lock of the dynamic loader and needs that of the interpreter, so that
+        it would wait forever for a thread that imports an extension module meanwhile. It is
+        therefore part of the import of this module, and repeated only by functions that load
+        the BLAS of another package, which is that of SciPy.
+        """
+        found = ThreadpoolController().select(user_api='blas').lib_controllers
+        per_thread = [library for library in found
+                      if getattr(library, 'threading_layer', '') == 'openmp']
+        with self._lock:
+            self._per_thread = per_thread
+            self._shared = [library for library in found if library not in per_thread]
+            if self._depth:
+                self._saved += _limit(self._shared)
 
 
 def _limit(libraries: Iterable[_Library]) -> list[tuple[_Library, int]]:

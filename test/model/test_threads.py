@@ -10,7 +10,9 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 from rhs_isac_ros.model import Scenario, threads
 from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
-BLAS = ThreadpoolController().select(user_api='blas').lib_controllers
+# Other tests may have loaded the BLAS of SciPy, which most functions do not use.
+BLAS = [library for library in ThreadpoolController().select(user_api='blas').lib_controllers
+        if 'scipy.libs' not in library.filepath]
 TIMEOUT_S = 30
 
 
@@ -37,6 +39,24 @@ def test_only_the_block_has_one_thread():
         assert set(numbers()) == {1}
         with one_blas_thread:
             assert set(numbers()) == {1}
+        assert set(numbers()) == {1}
+    assert set(numbers()) == {3}
+
+
+def test_a_block_does_not_search_for_libraries(monkeypatch):
+    """A search would block if another thread imports an extension module at that time."""
+    monkeypatch.setattr(threads, 'ThreadpoolController', None)
+    with one_blas_thread:
+        assert map_blocks(abs, [-1, -2]) == [1, 2]
+
+
+def test_libraries_that_are_found_in_a_block_are_limited_and_restored():
+    one_blas_thread.find_libraries()
+    with one_blas_thread:
+        for library in BLAS:
+            library.set_num_threads(3)
+            getattr(library, 'clear_controlling_thread', lambda: None)()
+        one_blas_thread.find_libraries()
         assert set(numbers()) == {1}
     assert set(numbers()) == {3}
 
