@@ -137,12 +137,12 @@ class Watch:
         for kind, name in topics.NAMES.items():
             self.node.create_subscription(
                 convert.ros_type(kind), name,
-                lambda message, kind=kind: self._receive(kind, message), qos.EXCHANGE)
+                lambda message, kind=kind: self._receive(kind, message), qos.EXCHANGE, raw=True)
         self.node.create_subscription(
             PoseWithCovarianceStamped, topics.POSITION, self.poses.append, qos.EXCHANGE)
 
-    def _receive(self, kind, message):
-        plain = convert.from_ros(kind, message)
+    def _receive(self, kind, serialized):
+        plain = convert.from_bytes(kind, serialized)
         self.received[kind].append(plain)
         self._of_cycle[kind, getattr(plain, 'cycle_id', None)].append(plain)
         if kind is m.ProtocolState and plain.outcome == 'served':
