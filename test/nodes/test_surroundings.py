@@ -64,9 +64,11 @@ def test_users_outside_get_no_fix_and_deviations_cause_a_warning(network):
     watch.until(lambda: walked_out_and_in(watch), 'fixes, no fix, and fixes again', processes)
     reasons = [message.reason for message in answers(watch) if isinstance(message, m.NoFix)]
     assert sum(reason.startswith(REASON) for reason in reasons) > len(reasons) / 2
+    # The line of an event follows its message.
+    watch.until(lambda: f'user {WALKING} has a position again' in processes[0].log,
+                'the line of the log', processes)
     log = processes[0].log
     assert f'no fix of user {WALKING}: ' in log
-    assert f'user {WALKING} has a position again' in log
     # The other user is not affected, and users outside cause no warning of the residuals.
     assert not [message for message in watch.received[m.NoFix] if message.user == STATIC]
     assert 'do not match the scenario' not in log
