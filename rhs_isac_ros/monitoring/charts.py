@@ -77,8 +77,11 @@ class Charts:
         self._n_given_up += 1
         yield Sample('drops/given_up', self._n_given_up, Series('cycles given up', _RED))
 
-    def of_cycle(self, cycle: CompleteCycle) -> Iterator[Sample]:
-        """Yield the samples of a complete cycle."""
+    def of_cycle(self, cycle: CompleteCycle, with_user: bool = True) -> Iterator[Sample]:
+        """Yield the samples of a complete cycle, with the series of its user if `with_user`."""
+        if with_user:
+            yield Sample(f'error/user_{cycle.user}', cycle.error_m,
+                         Series(f'user {cycle.user}', user_colour(cycle.user), dots=True))
         yield from self._errors(cycle)
         capacity = cycle.capacity
         for name, value, colour in (
@@ -98,8 +101,6 @@ class Charts:
         estimate = cycle.estimate
         self._square_m2 += cycle.error_m**2
         self._n_fixes += 1
-        yield Sample(f'error/user_{cycle.user}', cycle.error_m,
-                     Series(f'user {cycle.user}', user_colour(cycle.user), dots=True))
         yield Sample('error/root_mean_square', math.sqrt(self._square_m2 / self._n_fixes),
                      Series('root mean square so far', _RED))
         yield Sample('error/crlb', math.sqrt(max(estimate.crlb_m2, 0.0)),

@@ -112,12 +112,12 @@ class Text:
 
 
 @dataclasses.dataclass(frozen=True)
-class Nothing:
+class Clear:
     """Removes the entities of a path and of the paths below it."""
 
 
 Entity: TypeAlias = (
-    Points | Ellipsoids | Boxes | Lines | Picture | Series | Number | Text | Nothing)
+    Points | Ellipsoids | Boxes | Lines | Picture | Series | Number | Text | Clear)
 
 
 class Entry(NamedTuple):

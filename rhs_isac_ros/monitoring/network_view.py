@@ -12,7 +12,7 @@ from rhs_isac_ros.monitoring import cycle_log, mode_chart
 from rhs_isac_ros.monitoring import scene_entities as scene
 from rhs_isac_ros.monitoring.charts import Charts
 from rhs_isac_ros.monitoring.cycle_log import CycleLog
-from rhs_isac_ros.monitoring.entities import Entity, Entry, Nothing, Text
+from rhs_isac_ros.monitoring.entities import Clear, Entity, Entry, Text
 from rhs_isac_ros.monitoring.overview import NodeStatus
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.monitoring.scene_state import SceneState
@@ -28,7 +28,7 @@ MODES = 'modes'
 POSITIONING = 'surface/positioning'
 TRANSMISSION = 'surface/transmission'
 LOG = 'log'
-# Further users are not shown, because the ids come from messages.
+# Further users are in the charts of all users only, because the ids come from messages.
 _MAX_USERS = 64
 # Number of latest cycles whose messages may still arrive.
 _MAX_CYCLES = 64
@@ -81,11 +81,11 @@ class NetworkView:
     def add(self, message: m.Message, now_s: float) -> list[Entry]:
         """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s]."""
         cycle = self._count(message.cycle_id)
-        user = getattr(message, 'user', 0)
-        if user and not self._shows(user):
-            return []
         if isinstance(message, cycle_log.RECEIVES):
             self._log.add(message, now_s)
+        user = getattr(message, 'user', 0)
+        if user and not self._shows(user):
+            return self._ended()
         self._scene.add(message, now_s)
         entries = [Entry(cycle, path, entity) for path, entity in self._entities(message)]
         return entries + self._ended()
@@ -102,7 +102,7 @@ class NetworkView:
             return []
         cycle, path = self._count(received.cycle_id), f'{self._path(received.user)}/modes'
         if found is None:
-            return [Entry(cycle, name, Nothing()) for name in (path, f'{MODES}/found')]
+            return [Entry(cycle, name, Clear()) for name in (path, f'{MODES}/found')]
         points, ellipsoids = scene.modes(received.user, found)
         origin = self._origins.get(received.cycle_id, found.probabilities @ found.positions)
         return [Entry(cycle, path, points), Entry(cycle, f'{path}/ellipsoids', ellipsoids),
@@ -153,9 +153,9 @@ class NetworkView:
             case m.NoFix():
                 path = self._path(message.user)
                 for part in (path, MODES):
-                    yield f'{part}/estimate', Nothing()
+                    yield f'{part}/estimate', Clear()
                 for part in (f'{path}/modes', f'{MODES}/found'):
-                    yield part, Nothing()
+                    yield part, Clear()
 
     def _ended(self) -> list[Entry]:
         """Return the results of the cycles that have ended."""
@@ -172,7 +172,8 @@ class NetworkView:
                 f'cycle {complete.cycle_id}, user {complete.user}: '
                 f'error {complete.error_m:.2f} m, '
                 f'loss of capacity {complete.capacity.loss_percent:.1f} %')))
-            entries += self._charts.add(cycle, self._charts.of_cycle(complete))
+            entries += self._charts.add(
+                cycle, self._charts.of_cycle(complete, self._shows(complete.user)))
         self.n_ended += len(self._log.given_up) + len(self._log.complete)
         self._log.clear()
         return entries

@@ -96,6 +96,12 @@ class RerunStream:
         if self._path is not None:
             os.replace(self._partial, self._path)
 
+    def discard(self) -> None:
+        """Remove the incomplete file, or end the service."""
+        self._rerun.disconnect(recording=self._stream)
+        if self._path is not None:
+            self._partial.unlink(missing_ok=True)
+
     @property
     def _partial(self) -> Path:
         assert self._path is not None

@@ -58,17 +58,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.file is None and (options.track or options.namespace):
         parser.error('arguments --track and --namespace: expected together with a recording; '
                      'for a running network, --ros-args -r __ns:=/lab selects the namespace')
-    check_distinct(parser, {'file': options.file, '--config': options.config},
-                   {'--save': options.save})
+    if options.track_speed and not options.track:
+        parser.error('argument --track-speed: expected together with --track')
+    check_distinct(parser, {'file': options.file, '--config': options.config,
+                            '--calibration': options.calibration}, {'--save': options.save})
     try:
         stream = RerunStream()
-        scenario = _scenario(options)
-        surface = load_surface(str(options.calibration), scenario) if options.calibration else None
-        posteriors = Posteriors(scenario, surface)
-        _open(stream, options)
-        if options.file is None:
-            return _show_live(stream, scenario, posteriors, options, [_PROGRAM, *arguments])
-        return _show_recording(stream, scenario, posteriors, options)
+        try:
+            return _show(stream, options, [_PROGRAM, *arguments])
+        finally:
+            # After `close`, there is nothing left to discard.
+            stream.discard()
     except (RecordingError, ScenarioError, CodebookError, CalibrationError, OSError) as error:
         print_error(error, _PROGRAM)
         return 2
@@ -79,6 +79,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 class _PortError(RuntimeError):
     """The viewer cannot be served."""
+
+
+def _show(stream: RerunStream, options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    scenario = _scenario(options)
+    surface = load_surface(str(options.calibration), scenario) if options.calibration else None
+    posteriors = Posteriors(scenario, surface)
+    _open(stream, options)
+    if options.file is None:
+        return _show_live(stream, scenario, posteriors, options, arguments)
+    return _show_recording(stream, scenario, posteriors, options)
 
 
 def _scenario(options: argparse.Namespace) -> Scenario:
@@ -128,7 +138,8 @@ def _show_recording(
         signal.signal(number, lambda number, _: signals.append(number))
     stream.write(itertools.takewhile(lambda _: not signals, entries(
         options.file, options.namespace or '/', scenario, posteriors,
-        options.track_speed if options.track else None, options.cycles)))
+        (options.track_speed or Motion.speed_mps) if options.track else None,
+        options.cycles)))
     while not (signals or options.save):
         time.sleep(_POLL_S)
     _finish(stream, options)
@@ -167,8 +178,9 @@ def _parser() -> argparse.ArgumentParser:
     recording.add_argument('--namespace', help='namespace of the recorded network (default: /)')
     recording.add_argument('--track', action='store_true',
                            help='track the users, as positioner does with prior:=track')
-    recording.add_argument('--track-speed', type=positive_float, default=Motion.speed_mps,
-                           metavar='MPS', help='typical speed of the users (default: 1 m/s)')
+    recording.add_argument('--track-speed', type=positive_float, metavar='MPS',
+                           help='typical speed of the users for --track (default: '
+                           f'{Motion.speed_mps:g} m/s)')
     return parser
 
 

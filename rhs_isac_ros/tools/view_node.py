@@ -50,11 +50,11 @@ class ViewNode(Node):
             self, scenario: Scenario, posteriors: Posteriors,
             write: Callable[[Iterable[Entry]], None]) -> None:
         super().__init__('view', start_parameter_services=False)
-        self.view = NetworkView(scenario)
+        self.view, self._scenario_id = NetworkView(scenario), scenario.id
         self.mismatch = ''
         self._posteriors, self._write = posteriors, write
         self._worker, self._bounds = BackgroundWorker(self), BackgroundWorker(self)
-        self._requested: set[str] = set()
+        self._requested: set[str] = set()  # ids of codebooks that are being prepared
         self._is_searching = False
         self._waiting: m.ReceivedSignals | None = None
         self._users: set[int] = set()
@@ -67,6 +67,11 @@ class ViewNode(Node):
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()
+        if message.scenario_id not in ('', self._scenario_id):
+            self._on_mismatch(m.MessageError(
+                f'{type(message).__name__} of scenario {message.scenario_id}, expected '
+                f'{self._scenario_id}'))
+            return
         if isinstance(message, m.Beam):
             if now_s < self._beam_s + _BEAM_PERIOD_S:
                 return
@@ -95,7 +100,7 @@ class ViewNode(Node):
         except (m.MessageError, CodebookError) as error:
             self._no_modes(error)
             return
-        if codebook.id not in self._requested:
+        if codebook.id not in self._requested | self._posteriors.codebooks.keys():
             self._requested.add(codebook.id)
             self._worker.run(functools.partial(self._add, codebook),
                              functools.partial(self._on_added, codebook))
@@ -108,6 +113,7 @@ class ViewNode(Node):
         return None
 
     def _on_added(self, codebook: Codebook, error: CodebookError | None) -> None:
+        self._requested.discard(codebook.id)
         if error:
             self._no_modes(error)
             return

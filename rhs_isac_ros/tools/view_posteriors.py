@@ -13,14 +13,17 @@ from rhs_isac_ros.positioning import BayesEstimator, Estimate, SignalError
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.positioning.weighted_modes import WeightedModes, weighted_modes
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.tracks import Tracks
 
+# Number of codebooks, each with tables of some megabytes; more are unusual even in a recording.
+_MAX_CODEBOOKS = 32
 # With Table I, the bound on the root mean squared error then has a standard error of 2.4 %.
 _N_PHASES = 256
 
 
 class Posteriors:
-    """The posteriors of received signals, for the codebooks that were added.
+    """The posteriors of received signals, for the latest codebooks that were added.
 
     The messages of the network do not contain the modes: sending them would lengthen every cycle.
 
@@ -35,12 +38,12 @@ class Posteriors:
             table_folder: Path | None = None) -> None:
         self._scenario, self._surface = scenario, surface
         self._table_folder = table_folder or default_folder()
-        self._estimators: dict[str, BayesEstimator] = {}
+        self._estimators: NewestDict[str, BayesEstimator] = NewestDict(_MAX_CODEBOOKS)
         self._tracks = Tracks()
 
     @property
     def codebooks(self) -> Mapping[str, object]:
-        """The codebooks that were added, by id."""
+        """The codebooks that were added, by id, up to 32."""
         return self._estimators
 
     def add(self, codebook: Codebook) -> None:
@@ -52,8 +55,8 @@ class Posteriors:
             If the codebook does not fit the scenario.
         """
         codebook.check(self._scenario)
-        self._estimators[codebook.id] = BayesEstimator(
-            self._scenario, codebook, self._table_folder, surface=self._surface)
+        self._estimators.put(codebook.id, BayesEstimator(
+            self._scenario, codebook, self._table_folder, surface=self._surface))
 
     def bound_m2(self, codebook: Codebook) -> float:
         """Compute the global bound on the mean squared error with a codebook [m^2].

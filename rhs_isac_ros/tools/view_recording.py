@@ -58,6 +58,7 @@ def entries(
             continue
         try:
             message = convert.from_ros(kinds[topic], found)
+            _check_scenario(message, scenario)
             m.check(message, scenario.sizes)
         except m.MessageError as error:
             raise RecordingError(f'{path}: {topic}: {error}') from None
@@ -71,6 +72,12 @@ def entries(
             break
     if not view.n_cycles:
         raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
+
+
+def _check_scenario(message: m.Message, scenario: Scenario) -> None:
+    if message.scenario_id not in ('', scenario.id):
+        raise m.MessageError(
+            f'recorded with scenario {message.scenario_id}, expected {scenario.id}')
 
 
 def _track(

@@ -7,7 +7,7 @@ import pytest
 
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.monitoring import charts, network_view
-from rhs_isac_ros.monitoring.entities import Nothing, Number, Series, Text
+from rhs_isac_ros.monitoring.entities import Clear, Number, Series, Text
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning.weighted_modes import WeightedModes
@@ -132,7 +132,7 @@ def test_signals_without_a_position_end_what_was_shown_of_the_user(watched):
     entries += watched.view.add_modes(received, None)
     path = f'{network_view.WORLD}/user_{received.user}'
     for part in (f'{path}/estimate', f'{path}/modes', f'{network_view.MODES}/found'):
-        assert all(isinstance(entity, Nothing) for _, entity in on(entries, part))
+        assert all(isinstance(entity, Clear) for _, entity in on(entries, part))
         assert on(entries, part)
 
 
@@ -170,6 +170,18 @@ def test_dropped_messages_are_shown_for_all_nodes_and_for_those_with_any(scenari
     values = {entry.path: entry.entity.value for entry in entries
               if isinstance(entry.entity, Number)}
     assert values == {'drops/bs': 4, 'drops/all': 4}
+
+
+def test_cycles_of_further_users_are_in_the_charts_of_all_users(
+        watched, scenario, monkeypatch):
+    monkeypatch.setattr(network_view, '_MAX_USERS', 1)
+    view = NetworkView(scenario)
+    entries = [entry for sent in messages_of(watched.run)
+               for entry in view.add(sent.message, sent.time_s)]
+    assert view.n_ended == N_CYCLES
+    assert len([entity for _, entity in on(entries, 'error/root_mean_square')
+                if isinstance(entity, Number)]) == N_CYCLES
+    assert {path for _, path, _ in entries if path.startswith('error/user_')} == {'error/user_1'}
 
 
 def test_the_number_of_users_is_bounded(scenario):

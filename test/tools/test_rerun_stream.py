@@ -7,10 +7,10 @@ from rhs_isac_ros.model.optional import MissingLibraryError
 from rhs_isac_ros.monitoring import charts, network_view
 from rhs_isac_ros.monitoring.entities import (
     Boxes,
+    Clear,
     Ellipsoids,
     Entry,
     Lines,
-    Nothing,
     Number,
     Picture,
     Points,
@@ -87,7 +87,7 @@ def test_a_picture_keeps_its_pixels(read):
 
 
 def test_nothing_ends_what_was_shown(read):
-    found = read('a', Number(0.5), Nothing(), Number(0.25))
+    found = read('a', Number(0.5), Clear(), Number(0.25))
     assert found['cycle'] == [1, 2, 3]
     assert found['Scalar'] == [[0.5], [], [0.25]]
 
@@ -133,3 +133,11 @@ def test_another_release_is_named_in_one_line(monkeypatch):
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
     with pytest.raises(OSError, match='missing'):
         RerunStream().save(tmp_path / 'missing' / 'view.rrd')
+
+
+def test_a_discarded_file_leaves_nothing(tmp_path):
+    stream = RerunStream()
+    stream.save(tmp_path / 'view.rrd')
+    stream.write([Entry(1, 'a', Number(0.5))])
+    stream.discard()
+    assert not list(tmp_path.iterdir())

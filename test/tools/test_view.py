@@ -1,5 +1,6 @@
 """``scripts/view`` on a network in another process and on its recording, and in a browser."""
 
+import dataclasses
 import io
 import os
 import re
@@ -48,10 +49,13 @@ def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, 
 
 @pytest.mark.parametrize(('arguments', 'reason'), [
     (['--save', 'view.txt'], "argument --save: 'view.txt', expected a name that ends with .rrd"),
+    (['run.mcap', '--track-speed', '2'], 'argument --track-speed: expected together with --track'),
     (['--track'], 'arguments --track and --namespace: expected together with a recording'),
     (['--port', '65535'], 'argument --port: '),
     (['missing.mcap'], 'argument file: ')])
-def test_an_invalid_argument_is_named(arguments, reason, capsys):
+def test_an_invalid_argument_is_named(arguments, reason, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'run.mcap').touch()
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
@@ -119,6 +123,23 @@ def test_a_running_network_is_shown(shared_session, monkeypatch):
     assert not node.mismatch
 
 
+def test_a_network_of_another_scenario_is_not_shown(shared_session):
+    """Even if its messages have the sizes of the expected ones."""
+    scenario = dataclasses.replace(
+        Scenario.from_yaml(CONFIG / 'quick.yaml'), refractive_index=2.0)
+    paths = set()
+    node = ViewNode(scenario, Posteriors(scenario),
+                    lambda entries: paths.update(entry.path for entry in entries))
+    shared_session._executor.add_node(node)
+    try:
+        assert shared_session.spin_until(lambda: node.mismatch, TIMEOUT_S)
+    finally:
+        shared_session._executor.remove_node(node)
+        node.destroy_node()
+    assert f'expected {scenario.id}' in node.mismatch
+    assert 'capacity/actual' not in paths
+
+
 def test_the_cycles_of_a_running_network_are_written(
         rerun, built_scripts, shared_session, paths, tmp_path):
     done = subprocess.run(
@@ -147,6 +168,15 @@ def test_a_recording_is_shown_with_tracks_and_modes(recording, paths, tmp_path, 
 def test_a_recording_without_the_namespace_is_an_error(recording, tmp_path, capsys):
     assert main([str(recording), '--namespace', '/lab', '--save', str(tmp_path / 'v.rrd')]) == 2
     assert 'no cycle in the namespace /lab' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_of_another_scenario_is_named(recording, monkeypatch):
+    monkeypatch.setattr('rhs_isac_ros.tools.view_posteriors._N_PHASES', 4)
+    scenario = dataclasses.replace(
+        Scenario.from_yaml(CONFIG / 'quick.yaml'), refractive_index=2.0)
+    with pytest.raises(RecordingError, match=f'recorded with scenario .*, expected {scenario.id}'):
+        list(entries(recording, '/', scenario, Posteriors(scenario)))
 
 
 def test_a_malformed_codebook_of_a_recording_is_named(tmp_path):
