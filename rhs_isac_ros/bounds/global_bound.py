@@ -24,6 +24,7 @@ from rhs_isac_ros.bounds.fisher import fisher_information_of
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Lattice steps of (r, u, v), in standard deviations of one coordinate with the others known, and
 # the smallest number of steps across the region. With Table I, steps half as large across the
@@ -69,6 +70,7 @@ class GlobalBound(NamedTuple):
     coarseness: float
 
 
+@one_blas_thread
 def global_bound(
         scenario: Scenario, codebook: Beamforming, rng: np.random.Generator,
         n_phases: int = 2048) -> GlobalBound:

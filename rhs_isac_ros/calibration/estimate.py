@@ -20,6 +20,7 @@ from rhs_isac_ros.calibration.mixture import (
 from rhs_isac_ros.calibration.pilots import Pilots, PilotStatistics
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.threads import one_blas_thread
 
 # Prior of scenarios that declare no errors or failures.
 DEFAULT_ERROR_RMS = 0.05
@@ -39,6 +40,7 @@ def prior_of(scenario: Scenario) -> SurfacePrior:
                         scenario.failed_element_share or DEFAULT_FAILED_SHARE)
 
 
+@one_blas_thread
 def estimate_surface(
         scenario: Scenario, pilots: Sequence[Pilots], prior: SurfacePrior | None = None,
         progress: Callable[[int, float], None] | None = None) -> SurfaceEstimate:

@@ -7,6 +7,7 @@ import numpy as np
 
 from rhs_isac_ros.link.capacity import Beam, direct_power_w
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.threads import one_blas_thread
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,6 +46,7 @@ class BeamPattern:
         return int(row), int(column)
 
 
+@one_blas_thread
 def beam_pattern(
         scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
     """Compute the pattern of a beam at a distance from the surface's centre, in the near field.

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.samples import draw_samples
 from rhs_isac_ros.positioning.search import SearchEstimator
 
@@ -26,6 +27,7 @@ class WeightedModes(NamedTuple):
     covariances: np.ndarray
 
 
+@one_blas_thread
 def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
     """Compute the modes of the posterior for the signals of one phase.
 
