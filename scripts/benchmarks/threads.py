@@ -110,7 +110,8 @@ def measure(contenders: list[str], rounds: int) -> dict[str, np.ndarray]:
 def work(kind: str) -> None:
     """Run the tasks whose names arrive on the standard input, and print their times [s]."""
     if kind == 'unlimited':
-        threads.one_blas_thread._scan = lambda: False
+        threads.one_blas_thread.find_libraries = lambda: None
+        threads.one_blas_thread._shared = threads.one_blas_thread._per_thread = []
     functions = tasks()
     for line in sys.stdin:
         function = functions[json.loads(line)]
