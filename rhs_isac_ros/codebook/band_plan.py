@@ -112,7 +112,7 @@ def best_of(
         Optimisation of a codebook. After one that is interrupted, the best plan so far is
         returned.
     report
-        Called with each plan and its error with the codebook.
+        Called with each plan and its error with the codebook, except for an interrupted search.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
@@ -120,17 +120,13 @@ def best_of(
             break
         plan = with_bands(scenario, candidate.frequencies_hz)
         result = search(plan)
-        interrupted = result.reason == INTERRUPTED
-        if interrupted and best:
-            break
-        error = (math.nan if interrupted else
-                 expected_error(plan, result.codebook, seed, _PHASES))
+        if result.reason == INTERRUPTED:
+            return best or BandPlan(plan, result, tuple(candidates), math.nan)
+        error = expected_error(plan, result.codebook, seed, _PHASES)
         if report:
             report(dataclasses.replace(candidate, error_m2=error))
         if best is None or error < _BETTER * best.error_m2:
             best = BandPlan(plan, result, tuple(candidates), error)
-        if interrupted:
-            break
     if best is None:
         raise ValueError('candidates: none, expected at least one')
     return best

@@ -132,8 +132,12 @@ def test_an_interrupted_search_ends_with_the_best_plan_so_far(small, short):
     results = [optimize(with_bands(small, candidate.frequencies_hz), max_steps=1)
                for candidate in candidates]
     interrupted = [dataclasses.replace(result, reason='interrupted') for result in results]
-    first = best_of(small, candidates, lambda _: interrupted[0])
+    reported = []
+    first = best_of(small, candidates, lambda _: interrupted[0], report=reported.append)
     assert first.result is interrupted[0]
+    assert np.isnan(first.error_m2)
+    # There is no error to report.
+    assert not reported
     outcomes = iter([results[0], interrupted[1]])
     candidates = [dataclasses.replace(candidate, error_m2=1.0) for candidate in candidates]
     assert best_of(small, candidates, lambda _: next(outcomes)).result is results[0]
