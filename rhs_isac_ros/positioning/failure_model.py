@@ -68,8 +68,8 @@ class Site(NamedTuple):
     spread: np.ndarray
 
 
-class Further(NamedTuple):
-    """A surface of which one more element has failed, for every element.
+class Extensions(NamedTuple):
+    """A set with one more failed element, for every element.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class FailureModel:
         self._surfaces: dict[tuple[int, ...], Surface] = {}
         self._error = error_covariance(
             dataclasses.replace(scenario, element_error_rms=0.0), codebook)
-        self._further: dict[tuple[tuple[int, ...], float], Further] = {}
+        self._extensions: dict[tuple[tuple[int, ...], float], Extensions] = {}
         share = scenario.failed_element_share
         self._log_odds = float(np.log(share / (1 - share)))
 
@@ -167,14 +167,14 @@ class FailureModel:
         return _weigh(len(surface.failed) * self._log_odds - _log_determinant(roots).sum(),
                       products[None])
 
-    def weigh_further(self, surface: Surface, site: Site, remainder: float = 0.0) -> np.ndarray:
+    def weigh_extensions(self, surface: Surface, site: Site, remainder: float = 0.0) -> np.ndarray:
         """Compute the values of `weigh` if one more element fails, float64 [N_E].
 
         Besides, further elements may have failed, the declared share times `remainder` of them.
         They add to the covariance, so that elements which explain a part of the signals have a
         higher value than elements which imitate the sum.
         """
-        further = self._of_further(surface.failed, remainder)
+        extended = self._extensions_of(surface.failed, remainder)
         columns, spread = self._at(surface, site)
         # For each band and element: residual and derivatives, then the spread of all failures.
         parts = np.concatenate([
@@ -182,7 +182,7 @@ class FailureModel:
             np.broadcast_to(np.swapaxes(spread, 1, 2)[:, None], (
                 len(spread), len(site.spread), spread.shape[2], spread.shape[1])),
             np.swapaxes(site.spread, 0, 1)[:, :, None]], axis=2)
-        white = np.matmul(parts, np.swapaxes(further.whitener, 2, 3))
+        white = np.matmul(parts, np.swapaxes(extended.whitener, 2, 3))
         columns, spread = white[:, :, :4], white[:, :, 4:]
         # The spread is a change of low rank: Woodbury's identity.
         adjoint = np.conj(np.swapaxes(columns, 2, 3))
@@ -192,7 +192,7 @@ class FailureModel:
         products = (np.matmul(columns, adjoint).real - np.matmul(
             np.conj(np.swapaxes(explained, 2, 3)), explained).real).sum(axis=0)
         n_failed = len(surface.failed) + 1
-        volume = further.volume + _log_determinant(roots).sum(axis=0)
+        volume = extended.volume + _log_determinant(roots).sum(axis=0)
         return _weigh(n_failed * self._log_odds - volume, products).value
 
     def search_factor(self, failed: tuple[int, ...]) -> np.ndarray:
@@ -216,17 +216,17 @@ class FailureModel:
         return (site.columns + site.changes[failed].sum(axis=0),
                 np.moveaxis(site.spread[failed], 0, 2))
 
-    def _of_further(self, failed: tuple[int, ...], remainder: float) -> Further:
-        if (failed, remainder) not in self._further:
+    def _extensions_of(self, failed: tuple[int, ...], remainder: float) -> Extensions:
+        if (failed, remainder) not in self._extensions:
             surface = self.surface(failed)
             covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
             covariance += remainder * self._error[:, None]
             roots = np.linalg.cholesky(covariance)
             # Those of the intact surface serve all phases; each takes a few megabytes.
-            self._further = {key: kept for key, kept in self._further.items() if not key[0]}
-            self._further[failed, remainder] = Further(
+            self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
+            self._extensions[failed, remainder] = Extensions(
                 np.linalg.inv(roots), _log_determinant(roots).sum(axis=0))
-        return self._further[failed, remainder]
+        return self._extensions[failed, remainder]
 
     def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
         """Change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""

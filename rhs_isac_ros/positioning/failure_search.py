@@ -12,8 +12,8 @@ _MAX_PER_SET = 3
 _MAX_PER_SITE = 4
 # Of the extended sets, those to weigh exactly.
 _N_EXACT = 16
-# The largest set.
-_MAX_FAILURES = 6
+# Largest number of elements by which a set grows.
+_MAX_GROWTH = 6
 
 # A set of failed elements and the index of a site.
 Key: TypeAlias = tuple[tuple[int, ...], int]
@@ -22,8 +22,8 @@ Key: TypeAlias = tuple[tuple[int, ...], int]
 class FailureSearch:
     """Adds failed elements to sets, one at a time, at several sites.
 
-    The order of the extended sets follows from a likelihood that admits a few further failures;
-    see `FailureModel.weigh_further`. Without them, the best first element of two would often be
+    The order of the extended sets follows from a likelihood that admits a few more failures; see
+    `FailureModel.weigh_extensions`. Without them, the best first element of two would often be
     one that imitates the sum of both.
 
     Parameters
@@ -72,13 +72,14 @@ class FailureSearch:
         Parameters
         ----------
         remainder
-            Share of further failures that orders the sets, as in `FailureModel.weigh_further`.
+            Share of further failures, relative to the declared one, with which the sets are
+            ordered; see `FailureModel.weigh_extensions`.
         n_extended
             Number of sets of the same size to extend.
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)
-        for _ in range(_MAX_FAILURES):
+        for _ in range(_MAX_GROWTH):
             ranked = self._weigh_children(parents, remainder)
             if not ranked:
                 # All elements have failed.
@@ -114,9 +115,9 @@ class FailureSearch:
         children: dict[Key, float] = {}
         # The covariances of a set are computed once.
         for failed, index in sorted(parents):
-            further = self._model.weigh_further(
+            values = self._model.weigh_extensions(
                 self._model.surface(failed), self.sites[index], remainder)
-            for element, value in enumerate(further.tolist()):
+            for element, value in enumerate(values.tolist()):
                 if element not in failed:
                     children[tuple(sorted((*failed, element))), index] = value
         return sorted(children, key=lambda key: -children[key])

@@ -81,10 +81,10 @@ def test_a_further_failure_is_weighed_as_the_larger_set(codebook):
     received = MeasurementModel(SCENARIO, codebook).sample(POSITION[None], rng)[0]
     model = FailureModel(WhitenedModel(SCENARIO, codebook))
     site = model.site(to_polar(POSITION), received)
-    further = model.weigh_further(model.surface((5, 20)), site)
+    values = model.weigh_extensions(model.surface((5, 20)), site)
     for element in (0, 12, 35):
         surface = model.surface(tuple(sorted((5, 20, element))))
-        assert further[element] == pytest.approx(model.weigh(surface, site).value[0], rel=1e-9)
+        assert values[element] == pytest.approx(model.weigh(surface, site).value[0], rel=1e-9)
 
 
 def test_the_remainder_adds_to_the_covariance(codebook):
@@ -92,12 +92,12 @@ def test_the_remainder_adds_to_the_covariance(codebook):
         POSITION[None], np.random.default_rng(3))[0]
     model = FailureModel(WhitenedModel(SCENARIO, codebook))
     site = model.site(to_polar(POSITION), received)
-    further = model.weigh_further(model.surface((5,)), site, 0.3)
+    values = model.weigh_extensions(model.surface((5,)), site, 0.3)
     remainder = 0.3 * error_covariance(SCENARIO, codebook)
     for element in (0, 35):
         surface = model.surface(tuple(sorted((5, element))))
         larger = surface._replace(covariance=surface.covariance + remainder)
-        assert further[element] == pytest.approx(model.weigh(larger, site).value[0], rel=1e-9)
+        assert values[element] == pytest.approx(model.weigh(larger, site).value[0], rel=1e-9)
 
 
 def test_the_second_search_follows_the_covariance_of_a_set(codebook):
