@@ -79,6 +79,11 @@ class Codec:
         Class of the messages.
     types
         Types by field, as in ``get_fields_and_field_types`` of the ROS type.
+
+    Raises
+    ------
+    TypeError
+        If the type of a field is not supported.
     """
 
     def __init__(self, kind: type[Message], types: dict[str, str]) -> None:
@@ -96,15 +101,24 @@ class Codec:
                 one = _TYPES[text]
                 wire += one.wire
                 fields.append(_Field(name, first, len(wire), one.encode, one.decode))
-            else:
+            elif text in _SCALARS:
                 wire.append(_SCALARS[text])
                 fields.append(_Field(name, first, first + 1, None, enums.get(name)))
+            else:
+                raise TypeError(f'{kind.__name__}.{name}: {text}, expected one of '
+                                f'{[*_SCALARS, *_TYPES]}')
         self._fields, self._runs = tuple(fields), tuple(_runs(wire))
 
     def encode(
             self, message: Message, frame: str, stamp_ns: int, sender: int, scenario_id: str
     ) -> bytes:
-        """Return the bytes of a message; the arguments replace its own values."""
+        """Return the bytes of a message; the arguments replace its own values.
+
+        Raises
+        ------
+        MessageError
+            If a string has no UTF-8 encoding.
+        """
         items: list[Any] = [*divmod(stamp_ns, _NANOSECONDS), frame]
         for name, _, _, encode, _ in self._fields:
             value = getattr(message, name)
@@ -126,7 +140,7 @@ class Codec:
                 break
             content = items[last]
             if tail == 's':
-                content = content.encode() + b'\0'
+                content = self._encode_string(content, last) + b'\0'
                 pieces += layout.pack(*items[first:last], len(content)), content
             else:
                 pieces.append(layout.pack(*items[first:last], len(content)))
@@ -136,6 +150,15 @@ class Codec:
             position += len(content)
             first = last + 1
         return b''.join(pieces)
+
+    def _encode_string(self, text: str, position: int) -> bytes:
+        try:
+            return text.encode()
+        except UnicodeEncodeError as error:
+            name = next(
+                (field.name for field in self._fields if field.first == position), 'header')
+            raise MessageError(f'{self._kind.__name__}.{name}: {text!r}, expected valid Unicode: '
+                               f'{error.reason}') from None
 
     def decode(self, data: bytes) -> Message:
         """Return the message of bytes that begin with `HEADER`; arrays do not share their memory.

@@ -61,6 +61,11 @@ def to_bytes(
         Time for the header [ns].
     identity
         Sender and id of the scenario; by default those of the message.
+
+    Raises
+    ------
+    MessageError
+        If a string has no UTF-8 encoding.
     """
     sender, scenario_id = identity or (message.sender, message.scenario_id)
     return _CODECS[type(message)].encode(message, MAP_FRAME, stamp_ns, sender, scenario_id)
@@ -74,8 +79,16 @@ def from_ros(kind: type[Message], message: Any) -> Message:
     MessageError
         If an array does not fill its shape, or an enumeration field is not one of its
         constants.
+    RuntimeError
+        If rclpy does not serialize messages as `cdr` decodes them.
     """
-    return _CODECS[kind].decode(serialize_message(message))
+    serialized = serialize_message(message)
+    # The options that follow the identifier do not change the encoding.
+    if serialized[:2] != cdr.HEADER[:2]:
+        raise RuntimeError(f'{kind.__name__}: serialized by rclpy with the representation '
+                           f'{serialized[:2].hex()}, expected {cdr.HEADER[:2].hex()}: '
+                           'CDR version 1, little endian')
+    return _CODECS[kind].decode(serialized)
 
 
 def from_bytes(kind: type[Message], serialized: bytes) -> Message:

@@ -200,14 +200,14 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """
         if self._stands_by:
             return False
+        stamp_ns = self.get_clock().now().nanoseconds
         try:
             m.check(message, self._sizes)
+            content = convert.to_bytes(message, stamp_ns, self._identity)
         except m.MessageError as error:
             self._log_error('not sent', error)
             return False
-        stamp_ns = self.get_clock().now().nanoseconds
-        self._role_publishers[type(message)].publish(
-            convert.to_bytes(message, stamp_ns, self._identity))
+        self._role_publishers[type(message)].publish(content)
         return True
 
     def execute(self, action: Action) -> None:

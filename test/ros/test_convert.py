@@ -17,7 +17,7 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fields import MessageError, check
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import cdr, convert, topics
 
 SIZES = Scenario().sizes
 STAMP = Time(sec=12, nanosec=345)
@@ -182,6 +182,31 @@ def test_every_enumeration_is_in_a_ros_type():
     assert {kind for kind in vars(m).values()
             if isinstance(kind, type) and issubclass(kind, enum.IntEnum)
             and kind is not enum.IntEnum} == set(listed)
+
+
+@pytest.mark.parametrize(('kind', 'field'), [
+    (m.NoFix, 'reason'), (m.NoFix, 'codebook_id'), (m.NoFix, 'scenario_id'),
+    (m.PositionEstimate, 'estimator')])
+def test_a_string_without_an_encoding_is_rejected(kind, field):
+    message = dataclasses.replace(
+        random_message(kind, np.random.default_rng(0)), **{field: 'a\ud800b'})
+    with pytest.raises(MessageError, match=(
+            rf"^{kind.__name__}\.{field}: 'a\\ud800b', expected valid Unicode: surrogates")):
+        convert.to_bytes(message, 0)
+
+
+def test_a_type_of_a_field_without_a_codec_is_named():
+    types = ros.Ack.get_fields_and_field_types() | {'user': 'float'}
+    with pytest.raises(TypeError, match=r"^Ack\.user: float, expected one of \['uint8', "):
+        cdr.Codec(m.Ack, types)
+
+
+def test_an_encoding_of_rclpy_that_is_not_decoded_is_named(monkeypatch):
+    message = convert.to_ros(m.Ack(cycle_id=3, user=7), STAMP)
+    monkeypatch.setattr(
+        convert, 'serialize_message', lambda sent: b'\0\0' + serialize_message(sent)[2:])
+    with pytest.raises(RuntimeError, match='^Ack: serialized by rclpy .* 0000, expected 0001: '):
+        convert.from_ros(m.Ack, message)
 
 
 REAL = 'Beam.analog'

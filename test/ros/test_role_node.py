@@ -105,9 +105,11 @@ def test_many_malformed_messages_do_not_fill_the_log(bench, start, probe, capfd)
 
 def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capfd):
     bad = m.FeedSignals(cycle_id=1, user=1, band=0, signals=NAN)
+    surrogate = m.NoFix(cycle_id=1, user=1, codebook_id='', reason='\ud800')
     good = feed_signals(user=2)
-    role = Scripted(lambda role, event, now_s: [Send(bad), Send(bad), Send(good)],
-                    sends=[m.FeedSignals])
+    role = Scripted(
+        lambda role, event, now_s: [Send(bad), Send(bad), Send(surrogate), Send(good)],
+        sends=[m.FeedSignals, m.NoFix])
     node = start(each_bench, role)
     received = each_bench.collect(each_bench.add(Node, 'probe'), m.FeedSignals)
     node.dispatch(m.Ack(cycle_id=1, user=1))
@@ -115,6 +117,7 @@ def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capf
     assert [message.user for message in received] == [2]
     log = capfd.readouterr().err
     assert log.count('not sent: FeedSignals.signals: not finite') == 1
+    assert log.count("not sent: NoFix.reason: '\\ud800', expected valid Unicode") == 1
     assert '[ERROR]' in log
 
 
