@@ -1,14 +1,18 @@
 """A node that replaces ``channel`` and drives hardware."""
 
-import collections
 import dataclasses
+import itertools
 import sys
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Send
+from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
+
+# Maximum number of configurations and of unanswered pilots kept; older cycles have ended.
+_MAX_PENDING = 256
 
 
 class Radio(PlainRole):
@@ -26,41 +30,36 @@ class Radio(PlainRole):
     def __init__(self, measure, carry):
         super().__init__()
         self._measure, self._carry = measure, carry
-        self._cycle_id = 0
-        self._applied = {}
-        self._waiting = collections.deque(maxlen=256)
+        # Configurations by cycle and band: messages of different topics arrive in any order.
+        self._applied = NewestDict(_MAX_PENDING)
+        # Pilots without a configuration, in order, by serial number.
+        self._waiting = NewestDict(_MAX_PENDING)
+        self._serial = itertools.count()
 
     def handle(self, event, now_s):
         """Process a message and return the messages to send."""
         match event:
             case m.RhsConfiguration(mode=m.Mode.POSITIONING):
-                if event.cycle_id != self._cycle_id:
-                    self._cycle_id, self._applied = event.cycle_id, {}
-                self._applied[event.band] = event.analog
+                self._applied.put((event.cycle_id, event.band), event.analog)
             case m.Pilot():
-                self._waiting.append(event)
+                self._waiting.put(next(self._serial), event)
             case m.Data(stage=m.Stage.OFFERED):
                 bits = self._carry(event)
                 return [Send(dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits))]
         return self._answer()
 
     def _answer(self):
-        """Answer the pilots whose configuration has arrived.
-
-        Messages of different topics may arrive in any order.
-        """
+        """Answer the pilots whose configurations have arrived."""
         answers = []
-        for _ in range(len(self._waiting)):
-            pilot = self._waiting.popleft()
-            if pilot.cycle_id == self._cycle_id and pilot.band in self._applied:
-                feeds = self._measure(pilot.band, self._applied[pilot.band], pilot)
-                answers.append(Send(m.FeedSignals(
-                    cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender,
-                    band=pilot.band, signals=feeds)))
-            else:
-                # The queue is bounded, so the oldest pilots, those of unfinished cycles, are
-                # discarded.
-                self._waiting.append(pilot)
+        for serial, pilot in list(self._waiting.items()):
+            applied = self._applied.get((pilot.cycle_id, pilot.band))
+            if applied is None:
+                continue
+            del self._waiting[serial]
+            feeds = self._measure(pilot.band, applied, pilot)
+            answers.append(Send(m.FeedSignals(
+                cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender,
+                band=pilot.band, signals=feeds)))
         return answers
 
 

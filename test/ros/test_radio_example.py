@@ -123,6 +123,13 @@ def test_an_old_configuration_does_not_answer_a_new_cycle(radio):
     assert [s.cycle_id for s in answers(radio, configuration(6))] == [6]
 
 
+def test_a_delayed_configuration_of_an_older_cycle_changes_nothing(radio):
+    answers(radio, configuration(6))
+    answers(radio, configuration(5, 1))
+    assert [s.cycle_id for s in answers(radio, pilot(6))] == [6]
+    assert answers(radio, pilot(6, band=1)) == []
+
+
 def test_the_oldest_unanswered_pilots_are_discarded(radio):
     for _ in range(1000):
         answers(radio, pilot(7))
