@@ -12,7 +12,8 @@ from rhs_isac_ros.positioning.failure_model import FailureModel, Site, Weighed
 from rhs_isac_ros.positioning.failure_search import FailureSearch, Key
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.region import offset_to_roi
-from rhs_isac_ros.positioning.table import TemplateTable, separate
+from rhs_isac_ros.positioning.separation import separate
+from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 # Largest expected number of failures for which sets are searched.

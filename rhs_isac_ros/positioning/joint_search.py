@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.positioning.table import TemplateTable, separate
+from rhs_isac_ros.positioning.separation import separate
+from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.unknowns import Unknowns
 
 # Standard deviation of the bands' phases from which they carry no information about the range.

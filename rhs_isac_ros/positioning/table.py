@@ -11,8 +11,7 @@ import numpy as np
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 from rhs_isac_ros.positioning.polar import to_positions
 from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
-from rhs_isac_ros.positioning.separation import separate as separate
-from rhs_isac_ros.positioning.separation import separate_each
+from rhs_isac_ros.positioning.separation import separate, separate_each
 from rhs_isac_ros.positioning.templates import RANGE_CELL_M, carrier_wavenumbers
 
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
