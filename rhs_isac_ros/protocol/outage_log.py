@@ -1,14 +1,13 @@
 """Log messages about service and its outages, one at the beginning and one at the end of each."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.user_lists import join_users
 
 # The reason that concerns one user; all others concern the whole network.
 _USER_REASON = Outcome.USER_GONE.value
-# Maximum number of users that one message names.
-_MAX_NAMED = 8
 
 
 class OutageLog:
@@ -39,15 +38,12 @@ class OutageLog:
         self._waiting_for = ()
 
     @staticmethod
-    def log_lost_users(users: Iterable[int]) -> list[LogMessage]:
+    def log_lost_users(users: Sequence[int]) -> list[LogMessage]:
         """Return a warning about users that stopped answering beacons, if any."""
-        names = [str(user) for user in users]
-        if not names:
+        if not users:
             return []
-        shown = ', '.join(names[:_MAX_NAMED])
-        others = f' and {len(names) - _MAX_NAMED} others' if len(names) > _MAX_NAMED else ''
-        text = (f'users {shown}{others} no longer answer' if len(names) > 1
-                else f'user {shown} no longer answers')
+        text = (f'users {join_users(users)} no longer answer' if len(users) > 1
+                else f'user {users[0]} no longer answers')
         return [LogMessage(text, warning=True)]
 
     def log_lost_cycle(self, cycle_id: int, user: int, reason: str) -> list[LogMessage]:

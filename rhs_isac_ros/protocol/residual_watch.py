@@ -5,10 +5,9 @@ import collections
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.positioning.residual_monitor import ResidualMonitor
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.user_lists import MAX_NAMED
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
-# Maximum number of users in a text.
-_MAX_SHOWN = 8
 # Number of residuals in the mean of a user, which bounds the memory.
 _USER_WINDOW = 100
 
@@ -75,9 +74,9 @@ class ResidualWatch:
         if not users and not self._all.drifts:
             return ''
         parts = [_deviation('', self._all)] if self._all.drifts else []
-        parts += [_deviation(f'user {user}: ', users[user]) for user in sorted(users)[:_MAX_SHOWN]]
-        if len(users) > _MAX_SHOWN:
-            parts.append(f'{len(users) - _MAX_SHOWN} more users')
+        parts += [_deviation(f'user {user}: ', users[user]) for user in sorted(users)[:MAX_NAMED]]
+        if len(users) > MAX_NAMED:
+            parts.append(f'{len(users) - MAX_NAMED} more users')
         return f'the signals do not match the scenario: {"; ".join(parts)}'
 
 

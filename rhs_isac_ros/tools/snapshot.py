@@ -19,6 +19,7 @@ from rhs_isac_ros.model.arguments import (
 )
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.user_lists import join_users
 from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.subscriptions import subscribe_messages
@@ -28,8 +29,6 @@ _PROGRAM = 'snapshot'
 # Within this time [s], every user publishes its true position; within twice this time, the
 # surface publishes its configuration.
 _REPORT_PERIOD_S = 0.5
-# Maximum number of users that a message names.
-_MAX_NAMED = 8
 
 
 class SnapshotNode(Node):
@@ -138,9 +137,7 @@ def write_picture(
         return 1
     missing = sorted(user for user, state in scene.users.items() if not state.estimate)
     if missing:
-        n_others = len(missing) - _MAX_NAMED
-        print(f'no estimate of user {", ".join(map(str, missing[:_MAX_NAMED]))}'
-              f'{f" and {n_others} others" if n_others > 0 else ""} within {options.timeout:g} s',
+        print(f'no estimate of user {join_users(missing)} within {options.timeout:g} s',
               file=sys.stderr)
     try:
         draw(scene, scenario, options.output)
