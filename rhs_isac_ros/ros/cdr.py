@@ -7,7 +7,6 @@ messages instead: common data representation (CDR), version 1, little endian.
 
 import dataclasses
 import enum
-import math
 import struct
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,27 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rhs_isac_ros.protocol.messages import Message, MessageError
+from rhs_isac_ros.ros.cdr_types import SCALARS, TYPES
 
 # Representation identifier of CDR version 1, little endian, and two bytes of options.
 HEADER = b'\0\1\0\0'
 _NANOSECONDS = 10**9
+_NONE = np.empty(0)
 _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
-
-
-class _Type(NamedTuple):
-    """How a type of ROS is encoded.
-
-    Attributes
-    ----------
-    wire
-        Characters of `struct` for numbers, ``s`` for a string, ``*I`` and ``*d`` for sequences.
-    encode, decode
-        From a value to its items on the wire, and back.
-    """
-
-    wire: tuple[str, ...]
-    encode: Callable[[Any], Sequence[Any]]
-    decode: Callable[[Sequence[Any]], Any]
 
 
 class _Run(NamedTuple):
@@ -60,7 +45,7 @@ class _Field(NamedTuple):
     Attributes
     ----------
     encode, decode
-        As in `_Type`, or None for a single item; `decode` alone converts an enumeration.
+        As in `Type`, or None for a single item; `decode` alone converts an enumeration.
     """
 
     name: str
@@ -97,16 +82,16 @@ class Codec:
             if name == 'header':
                 continue
             first = len(wire)
-            if text in _TYPES:
-                one = _TYPES[text]
+            if text in TYPES:
+                one = TYPES[text]
                 wire += one.wire
                 fields.append(_Field(name, first, len(wire), one.encode, one.decode))
-            elif text in _SCALARS:
-                wire.append(_SCALARS[text])
+            elif text in SCALARS:
+                wire.append(SCALARS[text])
                 fields.append(_Field(name, first, first + 1, None, enums.get(name)))
             else:
                 raise TypeError(f'{kind.__name__}.{name}: {text}, expected one of '
-                                f'{[*_SCALARS, *_TYPES]}')
+                                f'{[*SCALARS, *TYPES]}')
         self._fields, self._runs = tuple(fields), tuple(_runs(wire))
 
     def encode(
@@ -239,65 +224,3 @@ def _layout(numbers: str, start: int) -> struct.Struct:
 def _padding(position: int) -> int:
     """Return the number of bytes before a number of eight bytes."""
     return (len(HEADER) - position) % 8
-
-
-_NONE = np.empty(0)
-_REAL, _COMPLEX = np.dtype('<f8'), np.dtype('<c16')
-
-
-def _encode_real(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.array(values.shape, '<u4'), np.asarray(values, _REAL).ravel()
-
-
-def _encode_complex(values: np.ndarray) -> tuple[np.ndarray, ...]:
-    # Radios often return complex64.
-    flat = np.asarray(values, _COMPLEX).ravel()
-    return np.array(values.shape, '<u4'), flat.real, flat.imag
-
-
-def _decode_real(items: Sequence[np.ndarray]) -> np.ndarray:
-    shape, values = items
-    # The numbers are not aligned in memory, so that computations with them would be slow.
-    return values.astype(float).reshape(_shape(values, shape))
-
-
-def _decode_complex(items: Sequence[np.ndarray]) -> np.ndarray:
-    shape, real, imag = items
-    sizes = _shape(real, shape)
-    _shape(imag, shape)
-    result = np.empty(len(real), complex)
-    result.real, result.imag = real, imag
-    return result.reshape(sizes)
-
-
-def _shape(values: np.ndarray, shape: np.ndarray) -> list[int]:
-    sizes: list[int] = shape.tolist()
-    if len(values) != math.prod(sizes) or not len(values):
-        raise ValueError(
-            f'{len(values)} values, expected shape {sizes} with at least one value')
-    return sizes
-
-
-def _numbers(n: int) -> _Type:
-    return _Type(('d',) * n, lambda values: values.ravel().tolist(), np.array)
-
-
-def _encode_integers(values: np.ndarray) -> tuple[np.ndarray]:
-    return (values.astype('<u4'),)
-
-
-def _decode_integers(items: Sequence[np.ndarray]) -> np.ndarray:
-    return items[0].astype(int)
-
-
-_SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's'}
-_TYPES = {
-    'geometry_msgs/Point': _numbers(3),
-    'geometry_msgs/Vector3': _numbers(3),
-    'double[3]': _numbers(3),
-    'double[4]': _numbers(4),
-    'double[9]': _numbers(9)._replace(decode=lambda items: np.array(items).reshape(3, 3)),
-    'sequence<uint32>': _Type(('*I',), _encode_integers, _decode_integers),
-    'rhs_isac_msgs/RealArray': _Type(('*I', '*d'), _encode_real, _decode_real),
-    'rhs_isac_msgs/ComplexArray': _Type(('*I', '*d', '*d'), _encode_complex, _decode_complex),
-}
