@@ -10,9 +10,9 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import write_picture
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.model.pictures import write_picture
 from rhs_isac_ros.model.surface import radiation_matrix
 
 # Points of the map of the bound along each axis, and of a beam over azimuth.

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from rhs_isac_ros.model.files import PICTURE_FORMATS, check_writable
+from rhs_isac_ros.model.files import check_writable
+from rhs_isac_ros.model.pictures import picture_format
 
 # Highest seed, which is that of the ROS parameter.
 _MAX_SEED = 2**31 - 1
@@ -116,11 +117,10 @@ def output_file(text: str) -> Path:
 
 def picture_file(text: str) -> Path:
     """Parse the path of a picture that can be written, or raise argparse.ArgumentTypeError."""
-    path = Path(text)
-    if path.suffix.lower().removeprefix('.') not in PICTURE_FORMATS:
-        raise argparse.ArgumentTypeError(
-            f'{text!r}, expected a file name that ends in '
-            f'{", ".join("." + name for name in PICTURE_FORMATS)}')
+    try:
+        picture_format(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     return output_file(text)
 
 

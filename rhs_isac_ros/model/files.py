@@ -5,10 +5,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
-
-# Suffixes of pictures.
-PICTURE_FORMATS = ('png', 'pdf', 'svg')
+from typing import BinaryIO
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
@@ -34,20 +31,6 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     except BaseException:
         os.unlink(temporary)
         raise
-
-
-def write_picture(path: str | Path, figure: Any, dpi: int = 120) -> None:
-    """Write a figure of Matplotlib atomically, in the format that the suffix of `path` names.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an existing file is left as it was.
-    ValueError
-        If Matplotlib does not support the format.
-    """
-    kind = Path(path).suffix.lower().removeprefix('.')
-    write_whole(path, lambda stream: figure.savefig(stream, dpi=dpi, format=kind))
 
 
 def check_writable(path: Path) -> None:

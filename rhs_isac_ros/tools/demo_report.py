@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import write_picture
 from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.model.pictures import write_picture
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleRecord
 from rhs_isac_ros.protocol.messages import Phase
 from rhs_isac_ros.tools.ellipses import ellipse_95

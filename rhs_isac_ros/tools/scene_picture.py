@@ -8,8 +8,8 @@ import numpy as np
 
 from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import write_picture
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions, feed_positions
+from rhs_isac_ros.model.pictures import write_picture
 from rhs_isac_ros.monitoring.scene_shapes import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
@@ -17,7 +17,6 @@ from rhs_isac_ros.protocol.messages import Mode
 from rhs_isac_ros.tools.ellipses import ellipse_95
 
 _FIGURE_SIZE_IN = (14.0, 9.6)
-_DPI = 120
 _MARGIN_M = 0.8
 # Height of the row of the legend, apart from the legend, relative to the views.
 _LEGEND_ROW = 0.001
@@ -37,7 +36,7 @@ def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
         If the file cannot be written.
     """
     figure = compose(scene, scenario)
-    write_picture(path, figure, _DPI)
+    write_picture(path, figure)
 
 
 def compose(scene: SceneState, scenario: Scenario) -> Any:

@@ -41,8 +41,9 @@ from rhs_isac_ros.model.arguments import (
     picture_file,
     positive_float,
 )
-from rhs_isac_ros.model.files import write_picture, write_whole
+from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.model.pictures import write_picture
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
 TARGET_M2 = 0.0415
