@@ -9,6 +9,7 @@ from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.experiments.jobs import JobError
 from rhs_isac_ros.model.arguments import ArgumentParser, integer, output_folder
 from rhs_isac_ros.model.optional import MissingLibraryError
+from rhs_isac_ros.model.pictures import PICTURE_FORMATS
 
 # Exit code that shells report after Ctrl-C.
 _INTERRUPTED = 130
@@ -32,7 +33,8 @@ def parse_options(
     Returns
     -------
     argparse.Namespace
-        ``trials``, ``quick``, ``jobs``, ``dask``, ``output``, and the experiment's own options.
+        ``trials``, ``quick``, ``jobs``, ``dask``, ``output``, ``format`` of the pictures, and the
+        experiment's own options.
     """
     parser = ArgumentParser(
         prog=f'scripts/reproduce {name}', description=description,
@@ -52,6 +54,9 @@ def parse_options(
     parser.add_argument('--output', type=output_folder, default=f'results/{name}', metavar='DIR',
                         help='folder of the results (default: %(default)s); jobs that have '
                              'results there are not repeated')
+    parser.add_argument('--format', choices=PICTURE_FORMATS, default=PICTURE_FORMATS[0],
+                        help='format of the picture, and suffix of its name (default: '
+                             '%(default)s); drawing again repeats no job')
     options = parser.parse_args(arguments)
     options.trials = quick_trials if options.quick else options.trials or trials
     return options

@@ -74,6 +74,17 @@ def look(index: int) -> Look:
     return LOOKS[index % len(LOOKS)]
 
 
+def to_paler(colour: str, share: float = 0.6) -> tuple[float, float, float]:
+    """Return a colour mixed with a share of white: red, green and blue from 0 to 1.
+
+    Unlike transparency, it shows nothing of what is below.
+    """
+    from matplotlib.colors import to_rgb
+
+    red, green, blue = (share + (1 - share) * value for value in to_rgb(colour))
+    return red, green, blue
+
+
 @contextlib.contextmanager
 def paper_style(purpose: str = 'drawing') -> Iterator[None]:
     """Draw in the style of the paper inside the block, whatever the user's settings are.
@@ -107,6 +118,26 @@ def new_figure(width_in: float, height_in: float) -> Any:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in))
+
+
+def new_panels(
+        width_in: float, height_in: float, n_rows: int, n_columns: int,
+        **sharing: bool) -> tuple[Any, Any, Any]:
+    """Return a figure, its panels as an array of axes, and axes above them for a legend.
+
+    Parameters
+    ----------
+    sharing
+        Arguments ``sharex`` and ``sharey`` of `matplotlib.gridspec.GridSpecBase.subplots`.
+    """
+    figure = new_figure(width_in, height_in)
+    # The layout adds the height of the legend. A legend of the figure itself gets room from the
+    # layout only since Matplotlib 3.7.
+    grid = figure.add_gridspec(2, 1, height_ratios=(0.001, 1))
+    panels = grid[1].subgridspec(n_rows, n_columns).subplots(squeeze=False, **sharing)
+    above = figure.add_subplot(grid[0])
+    above.axis('off')
+    return figure, panels, above
 
 
 def picture_format(path: str | Path) -> str:

@@ -19,7 +19,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import argparse
 from collections.abc import Sequence
 
-from parts.plan_curves import Changes, Curve, Sizes, add_plan_options, evaluate, read_plans, write
+from parts.plan_curves import Changes, Curve, Sizes, add_plan_options, evaluate, read_plans
+from parts.plan_report import write
 
 from rhs_isac_ros.experiments import parse_options, run_command
 from rhs_isac_ros.model import Scenario
@@ -69,7 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             curves = {name: CURVES[name]}
             entries = evaluate(curves, read_plans(options.plan), sizes, options.output / 'jobs',
                                options.jobs, options.dask)
-            write(name, curves, entries, [], options.output)
+            write(name, curves, entries, [], options.output,
+                  options.format)
 
     return run_command(reproduce)
 

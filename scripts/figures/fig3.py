@@ -23,11 +23,10 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
-import io
 import json
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,12 +46,15 @@ from rhs_isac_ros.experiments import (
 )
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.model.pictures import PAGE_IN, look, new_panels, paper_style, write_picture
 
 BANDS = (1, 2, 4, 8)
 TOTAL_FRAMES = 8
 PROPOSED, RIVALS = 'alternating', ('direct', 'genetic')
 METHODS = (PROPOSED, *RIVALS, 'lbfgs')
+# Names in the picture.
+NAMES = {'alternating': 'alternating (Algorithm 1)', 'direct': 'direct gradient descent',
+         'genetic': 'genetic algorithm', 'lbfgs': 'L-BFGS'}
 SAMPLES, HELD_OUT, HELD_OUT_SEED = 10, 500, 0
 TRIALS, QUICK_TRIALS = 30, 3
 # As many update steps as the paper's method and `direct` perform by default.
@@ -166,36 +168,40 @@ def _verdict(holds: bool) -> str:
     return 'holds' if holds else 'does not hold'
 
 
-def picture(summary: Summary) -> bytes:
-    """Draw both panels as PNG; error bars are standard deviations, as in the paper."""
-    with optional_import('drawing the figure', extra='plot'):
-        from matplotlib.figure import Figure
-    figure = Figure(figsize=(10, 4), layout='constrained')
-    panels = figure.subplots(1, 2)
-    for axes, name, label in zip(
-            panels, ('crlb_m2', 'normalised'),
-            ('(a) CRLB on the samples [m²]',
-             rf'(b) CPU time over that of {PROPOSED}, $N_\mathrm{{B}} = {BANDS[0]}$'),
-            strict=True):
-        for offset, method in zip(np.linspace(-0.12, 0.12, len(METHODS)), METHODS, strict=True):
+@paper_style('drawing the figure')
+def picture(summary: Summary) -> Any:
+    """Draw both panels; error bars are standard deviations, as in the paper."""
+    figure, ((left, right),), above = new_panels(PAGE_IN, 2.9, 1, 2)
+    positions = np.arange(len(BANDS))
+    for axes, name in ((left, 'crlb_m2'), (right, 'normalised')):
+        # Shifted so that the bars do not overlap.
+        for index, (method, shift) in enumerate(
+                zip(METHODS, np.linspace(-0.15, 0.15, len(METHODS)), strict=True)):
             means, stds = np.array(
                 [mean_and_std(summary.of(name, method, n)) for n in BANDS]).T
-            # Shifted so that the bars do not overlap. A single trial has no deviation.
-            axes.errorbar(np.arange(len(BANDS)) + offset, means, np.nan_to_num(stds),
-                          marker='o', capsize=3, label=method)
-        axes.set(xlabel=r'number of bands $N_\mathrm{B}$', ylabel=label, ylim=(0, None))
-        axes.set_xticks(range(len(BANDS)), BANDS)
-    panels[0].legend()
-    stream = io.BytesIO()
-    figure.savefig(stream, format='png', dpi=120)
-    return stream.getvalue()
+            own = look(index)
+            # A single trial has no deviation.
+            axes.errorbar(positions + shift, means, np.nan_to_num(stds), color=own.colour,
+                          marker=own.marker, linestyle=own.line, label=NAMES[method])
+        axes.set_xlabel(r'number of bands $N_\mathrm{B}$, with '
+                        rf'$N_\mathrm{{B}} F = {TOTAL_FRAMES}$ frames')
+        axes.set_xticks(positions, BANDS)
+        axes.grid(axis='y')
+    left.set(ylabel=rf'average CRLB of $N_\mathrm{{sam}} = {SAMPLES}$ samples [m$^2$]',
+             ylim=(0, None), title='(a)')
+    right.set(ylabel=f'CPU time, relative to {PROPOSED}\n'
+                     rf'with $N_\mathrm{{B}} = {BANDS[0]}$', ylim=(0, None), title='(b)')
+    handles, labels = left.get_legend_handles_labels()
+    above.legend(handles, labels, loc='lower center', ncols=len(METHODS),
+                 title=f'mean and standard deviation of {summary.count} trials')
+    return figure
 
 
-def reproduce(trials: int, steps: int | None, n_jobs: int, dask: str | None,
-              output: Path) -> None:
+def reproduce(options: argparse.Namespace) -> None:
     """Run the jobs that have no results yet, print the report and write the files."""
-    jobs = make_jobs(trials, steps)
-    results = run_jobs(trial, jobs, output / 'jobs', n_jobs, dask)
+    trials, output, name = options.trials, options.output, f'fig3.{options.format}'
+    jobs = make_jobs(trials, options.steps)
+    results = run_jobs(trial, jobs, output / 'jobs', options.jobs, options.dask)
     entries = [{**job.arguments, **result} for job, result in zip(jobs, results, strict=True)]
     summary = Summary(entries)
     report = '\n\n'.join([
@@ -203,11 +209,11 @@ def reproduce(trials: int, steps: int | None, n_jobs: int, dask: str | None,
         f'held-out positions. Time is CPU time on one core, normalised to {PROPOSED} with '
         f'N_B = {BANDS[0]}.',
         summary.table(), *summary.claims()])
-    write_whole(output / 'fig3.png', picture(summary))
+    write_picture(output / name, picture(summary))
     write_whole(output / 'fig3.json', json.dumps(
         {'version': __version__, 'trials': entries}, indent=1) + '\n')
-    write_whole(output / 'fig3.md', f'# Fig. 3\n\n![Fig. 3](fig3.png)\n\n{report}\n')
-    print(f'{report}\n\nwritten: {output}/fig3.png, fig3.md and fig3.json')
+    write_whole(output / 'fig3.md', f'# Fig. 3\n\n![Fig. 3]({name})\n\n{report}\n')
+    print(f'{report}\n\nwritten: {output}/{name}, fig3.md and fig3.json')
 
 
 def add_steps(parser: argparse.ArgumentParser) -> None:
@@ -219,8 +225,7 @@ def add_steps(parser: argparse.ArgumentParser) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse_options(__doc__, 'fig3', TRIALS, QUICK_TRIALS, arguments, add_steps)
-    return run_command(lambda: reproduce(
-        options.trials, options.steps, options.jobs, options.dask, options.output))
+    return run_command(lambda: reproduce(options))
 
 
 if __name__ == '__main__':

@@ -68,6 +68,20 @@ BLOCK, BATCH = 250, 50
 TEST_SEED = 1 << 20
 
 
+def condition(text: str) -> Condition:
+    """Parse an estimator or an input of the network and a level, for argparse."""
+    name, _, level = text.partition(':')
+    try:
+        if name not in (*INPUTS, 'bayes') or not np.isfinite(float(level)):
+            raise ValueError
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f'{text!r}, expected {", ".join(sorted(INPUTS))} or bayes, a colon and the level of '
+            'the multipath [dB]') from None
+    estimator, inputs = (name, '') if name == 'bayes' else (NEURAL, name)
+    return Condition(estimator, inputs, float(level))
+
+
 def optimise(scenario: Mapping[str, Any], samples: int, seed: int) -> dict:
     """Run Algorithm 1 with the settings of Table I and return the codebook's parameters."""
     result = optimize(Scenario(**scenario), method='alternating', sampling='monte_carlo',
@@ -216,6 +230,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
              f'{", ".join(f"{level:g}" for level in LEVELS_DB)}; with --grid '
              f'{", ".join(f"{level:g}" for level in GRID_LEVELS_DB)})')
     add('--no-bayes', action='store_true', help='leave out the posterior mean')
+    add('--conditions', nargs='+', type=condition, metavar='NAME:DB',
+        help='estimators with a level of the multipath each, instead of the previous three '
+             'options; NAME is bayes or an input of the network, as in magnitudes:-30 bayes:0')
     add('--grid', action='store_true',
         help='search, after the fact, for the reading of the paper that matches its errors best')
     add('--ros', action='store_true',
@@ -230,6 +247,8 @@ def complete(options: argparse.Namespace) -> None:
     if options.losses is None:
         options.losses = QUICK_LOSSES if options.quick else options.positions
     levels = options.multipath or (GRID_LEVELS_DB if options.grid else LEVELS_DB)
+    if options.conditions:
+        return
     if options.quick and not options.multipath and not options.grid:
         options.conditions = QUICK_CONDITIONS
         return

@@ -14,7 +14,6 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
-import io
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,7 +28,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments import Job, markdown_table, parse_options, run_command, run_jobs
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.model.pictures import PAGE_IN, new_figure, paper_style, write_picture
 from rhs_isac_ros.positioning import simulate_pairs
 
 TRIALS, QUICK_TRIALS = 40, 4
@@ -88,32 +87,29 @@ def maps_of(options: argparse.Namespace, sizes: Sizes) -> dict[str, dict[str, np
     return maps
 
 
-def picture(maps: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
-    """Draw a row for each plan as PNG, with one scale for all maps."""
-    with optional_import('drawing the figure', extra='plot'):
-        from matplotlib.colors import LogNorm
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import LogLocator
-    figure = Figure(figsize=(10.5, 3.1 * len(maps)), layout='constrained')
+@paper_style('drawing the figure')
+def picture(maps: Mapping[str, Mapping[str, np.ndarray]]) -> Any:
+    """Draw a row for each plan, with one scale for all maps."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.ticker import LogLocator
+    figure = new_figure(PAGE_IN, 0.5 + 1.8 * len(maps))
     panels = figure.subplots(len(maps), 3, sharex=True, sharey=True, squeeze=False)
     roots = {name: {key: np.sqrt(own[key]) for key in TITLES} for name, own in maps.items()}
     values = np.concatenate([own[key].ravel() for own in roots.values() for key in TITLES])
     scale = LogNorm(np.nanmin(values), np.nanmax(values))
     for row, (name, own) in zip(panels, roots.items(), strict=True):
-        for axes, (key, title) in zip(row, TITLES.items(), strict=True):
+        for axes, key in zip(row, TITLES, strict=True):
             # left, right, bottom, top
             extent = maps[name]['corners'].T.ravel().tolist()
-            image = axes.imshow(
-                own[key].T, origin='lower', cmap='cividis', norm=scale, extent=extent)
-            axes.set_title(f'{name}\n{title}', fontsize=9)
-        row[0].set_ylabel('y [m]')
+            image = axes.imshow(own[key].T, origin='lower', norm=scale, extent=extent)
+        row[0].set_ylabel(f'{name}\n$y$ [m]')
+    for axes, title in zip(panels[0], TITLES.values(), strict=True):
+        axes.set_title(title)
     for axes in panels[-1]:
-        axes.set_xlabel('x, distance from the surface [m]')
-    figure.colorbar(image, ax=panels, label='error or bound [m]', shrink=0.8,
+        axes.set_xlabel('$x$, distance from the surface [m]')
+    figure.colorbar(image, ax=panels, label='error or bound [m]', aspect=12 * len(maps),
                     ticks=LogLocator(subs=(1, 2, 5)), format='%g').minorticks_off()
-    stream = io.BytesIO()
-    figure.savefig(stream, format='png', dpi=120)
-    return stream.getvalue()
+    return figure
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -133,12 +129,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             [np.nanmin(own[key]), np.nanmax(own[key])])) for key in TITLES)]
             for name, own in maps.items()]
         report = markdown_table(['plan', *(f'{title} [m]' for title in TITLES.values())], rows)
-        write_whole(options.output / 'map.png', picture(maps))
+        name = f'map.{options.format}'
+        write_picture(options.output / name, picture(maps))
         write_whole(options.output / 'map.json', json.dumps({'version': __version__, 'maps_m2': {
             name: {key: own[key].tolist() for key in TITLES} for name, own in maps.items()}},
             indent=1) + '\n')
-        write_whole(options.output / 'map.md', f'# Map\n\n![map](map.png)\n\n{report}\n')
-        print(f'{report}\n\nwritten: {options.output}/map.png, map.md and map.json')
+        write_whole(options.output / 'map.md', f'# Map\n\n![map]({name})\n\n{report}\n')
+        print(f'{report}\n\nwritten: {options.output}/{name}, map.md and map.json')
 
     return run_command(reproduce)
 

@@ -20,7 +20,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts.plan_curves import Curve, Sizes, add_plan_options, evaluate, read_plans, write
+from parts.plan_curves import Curve, Sizes, add_plan_options, evaluate, read_plans
+from parts.plan_report import write
 
 from rhs_isac_ros.experiments import parse_options, run_command
 
@@ -85,7 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def reproduce() -> None:
         entries = evaluate(CURVES, read_plans(options.plan), sizes, options.output / 'jobs',
                            options.jobs, options.dask)
-        write('synchronisation', CURVES, entries, advice(entries), options.output)
+        write('synchronisation', CURVES, entries, advice(entries), options.output,
+              options.format)
 
     return run_command(reproduce)
 

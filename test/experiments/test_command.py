@@ -20,7 +20,7 @@ def parse(*arguments):
 def test_defaults_are_those_of_the_full_run():
     options = parse()
     assert (options.trials, options.quick, options.jobs, options.dask) == (30, False, -1, None)
-    assert options.output == Path('results/fig0')
+    assert (options.output, options.format) == (Path('results/fig0'), 'png')
 
 
 def test_quick_and_trials_set_the_number_of_trials():
@@ -42,6 +42,14 @@ def test_invalid_options_exit_with_code_2(arguments, capsys):
         parse(*arguments)
     assert caught.value.code == 2
     assert 'error: ' in capsys.readouterr().err
+
+
+def test_another_format_is_refused_with_the_expected_ones(capsys):
+    with pytest.raises(SystemExit) as caught:
+        parse('--format', 'gif')
+    assert caught.value.code == 2
+    error = capsys.readouterr().err.replace("'", '')
+    assert 'argument --format: invalid choice: gif (choose from png, pdf, svg)' in error
 
 
 @pytest.mark.parametrize(('error', 'code', 'text'), [

@@ -67,6 +67,30 @@ def test_the_table_has_a_row_for_each_method_and_number_of_bands(fig3, entries):
                      '1.00 ± 0.00']
 
 
+def test_the_picture_names_symbols_units_and_every_method(fig3, entries):
+    figure = fig3.picture(fig3.Summary(entries))
+    above, (left, right) = figure.axes[-1], figure.axes[:2]
+    assert r'$N_\mathrm{B}$' in left.get_xlabel() and r'N_\mathrm{B} F = 8' in left.get_xlabel()
+    assert left.get_ylabel() == r'average CRLB of $N_\mathrm{sam} = 10$ samples [m$^2$]'
+    assert 'relative to alternating' in right.get_ylabel()
+    legend = above.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == [
+        fig3.NAMES[method] for method in fig3.METHODS]
+    assert legend.get_title().get_text() == 'mean and standard deviation of 3 trials'
+    for axes in (left, right):
+        lines = [container.lines[0] for container in axes.containers]
+        for attribute in ('marker', 'color', 'linestyle'):
+            assert len({getattr(line, f'get_{attribute}')() for line in lines}) == 4
+        # A bar on every point.
+        assert all(len(container.lines[2][0].get_segments()) == 4
+                   for container in axes.containers)
+
+
+def test_a_single_trial_is_drawn_without_deviation(fig3, entries):
+    figure = fig3.picture(fig3.Summary([entry for entry in entries if entry['seed'] == 0]))
+    assert len(figure.axes[0].containers) == 4
+
+
 def test_a_trial_optimises_with_its_arguments(fig3):
     result = fig3.trial('lbfgs', 2, 5, samples=6, held_out=50, max_steps=3)
     assert (result['steps'], result['reason']) == (3, 'max_steps reached')
@@ -94,6 +118,10 @@ def test_the_command_writes_all_files_and_repeats_no_finished_trial(
     # Six more; the results of the first trial are reused.
     assert len(made) == len(set(made)) == 12
     assert {'fig3.json', 'fig3.md', 'fig3.png'} <= set(os.listdir(tmp_path))
+    assert fig3.main(['--trials', '2', '--format', 'svg', *call]) == 0
+    assert len(made) == 12
+    assert (tmp_path / 'fig3.svg').read_bytes().startswith(b'<?xml')
+    assert '(fig3.svg)' in (tmp_path / 'fig3.md').read_text(encoding='utf-8')
     figures = json.loads((tmp_path / 'fig3.json').read_text(encoding='utf-8'))
     assert len(figures['trials']) == 12
     out = capsys.readouterr().out

@@ -25,6 +25,18 @@ def test_values_are_averaged_in_squares(figure):
     assert np.isnan(means).sum() == figure.SQUARES**2 - 2
 
 
+def test_all_maps_share_one_scale_with_a_unit(figure):
+    rng = np.random.default_rng(0)
+    own = {key: rng.uniform(0.01, 4.0, (figure.SQUARES, figure.SQUARES)) for key in figure.TITLES}
+    maps = {name: own | {'corners': Scenario().roi_bounds_m[:, :2]} for name in ('one', 'other')}
+    *panels, bar = figure.picture(maps).axes
+    assert [axes.get_title() for axes in panels[:3]] == list(figure.TITLES.values())
+    assert [axes.get_ylabel() for axes in panels[::3]] == ['one\n$y$ [m]', 'other\n$y$ [m]']
+    assert bar.get_ylabel() == 'error or bound [m]'
+    assert len({axes.images[0].get_clim() for axes in panels}) == 1
+    assert panels[0].images[0].get_extent() == [5, 15, -5, 5]
+
+
 def test_the_command_maps_each_plan(figure, tmp_path, monkeypatch, capsys):
     parts = figure.plan_curves
     monkeypatch.setattr(parts, 'optimise', lambda scenario, steps: parts.plain(

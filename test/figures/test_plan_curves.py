@@ -80,8 +80,8 @@ def test_synchronisation_gives_advice_and_repeats_no_job(
 
 def test_curves_write_a_figure_each(curves, parts, tmp_path, capsys):
     call = ['--quick', '--jobs', '1', '--output', str(tmp_path)]
-    assert curves.main(['bands', 'rice', *call]) == 0
-    assert {path.name for path in tmp_path.glob('*.png')} == {'bands.png', 'rice.png'}
+    assert curves.main(['bands', 'rice', '--format', 'pdf', *call]) == 0
+    assert {path.name for path in tmp_path.glob('*.p*')} == {'bands.pdf', 'rice.pdf'}
     assert 'Rice factor [dB]' in capsys.readouterr().out
 
 
@@ -91,6 +91,32 @@ def test_codebooks_get_the_power_of_the_scenario(curves, parts, tmp_path):
     for file in (tmp_path / 'jobs').glob('errors-*.json'):
         case = json.loads(file.read_text(encoding='utf-8'))['arguments']
         parts.Codebook.from_parameters(case['codebook']).check(Scenario(**case['scenario']))
+
+
+def test_the_picture_has_a_legend_for_every_line_and_intervals(curves, synchronisation):
+    from parts import plan_report
+    bands = curves.CURVES['bands']
+    entries = [{'curve': 'bands', 'line': line, 'value': value, 'mse_m2': 0.5,
+                'mse_error_m2': 0.4, 'crlb_m2': 0.04, 'bound_m2': 0.3, 'bound_error_m2': 0.01}
+               for line in ('one', 'other') for value in bands.values]
+    axes, above = plan_report.picture({'bands': bands}, entries).axes
+    assert (axes.get_xlabel(), axes.get_yscale()) == (bands.label, 'log')
+    legend = above.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == [
+        'one', 'other', 'global bound', 'root of the average CRLB']
+    assert legend.get_title().get_text() == 'bars: intervals of two standard errors'
+    # The interval ends at zero at the lowest.
+    middle, ends = plan_report.roots(entries[:1], 'mse_m2')
+    np.testing.assert_allclose([middle[0] - ends[0, 0], middle[0] + ends[1, 0]],
+                               [0, np.sqrt(1.3)])
+    assert np.isnan(plan_report.roots(entries, 'crlb_m2')[1]).all()
+
+    only = {'timing_std_s': synchronisation.CURVES['timing_std_s']}
+    entries = [{'curve': 'timing_std_s', 'line': 'one', 'value': value, 'mse_m2': 0.5,
+                'mse_error_m2': 0.1} for value in only['timing_std_s'].values]
+    axes, above = plan_report.picture(only, entries).axes
+    assert axes.get_yscale() == 'linear' and axes.get_ylim()[0] == 0
+    assert [text.get_text() for text in above.get_legend().get_texts()] == ['one']
 
 
 def test_an_unknown_curve_is_an_error(curves):

@@ -1,7 +1,7 @@
 """The report of Fig. 4: tables, verdicts on the paper's claims, picture and CSV files."""
 
 import argparse
-import io
+from typing import Any
 
 import numpy as np
 from parts import fig4_claims
@@ -9,7 +9,17 @@ from parts.fig4_results import Condition, Results
 
 from rhs_isac_ros.experiments import markdown_table
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.optional import optional_import
+from rhs_isac_ros.model.pictures import (
+    PAGE_IN,
+    look,
+    new_panels,
+    paper_style,
+    to_paler,
+    write_picture,
+)
+
+# Whiskers of the box plots [%].
+WHISKERS = (5, 95)
 
 
 def write(results: Results, options: argparse.Namespace) -> None:
@@ -27,9 +37,10 @@ def write(results: Results, options: argparse.Namespace) -> None:
             fig4_claims.condition_table(results, condition)))])
     for name, text in csv_files(results).items():
         write_whole(options.output / name, text)
-    write_whole(options.output / 'fig4.png', picture(results))
-    write_whole(options.output / 'fig4.md', f'# Fig. 4\n\n![Fig. 4](fig4.png)\n\n{report}\n')
-    print(f'{report}\n\nwritten: {options.output}/fig4.png, fig4.md, fig4a.csv and fig4b.csv')
+    name = f'fig4.{options.format}'
+    write_picture(options.output / name, picture(results))
+    write_whole(options.output / 'fig4.md', f'# Fig. 4\n\n![Fig. 4]({name})\n\n{report}\n')
+    print(f'{report}\n\nwritten: {options.output}/{name}, fig4.md, fig4a.csv and fig4b.csv')
 
 
 def table(results: Results, condition: Condition) -> str:
@@ -64,35 +75,80 @@ def csv_files(results: Results) -> dict[str, str]:
             for name, lines in (('fig4a.csv', first), ('fig4b.csv', second))}
 
 
-def picture(results: Results) -> bytes:
-    """Draw (a) errors, one dot per trial and their interval, (b) box plots of the losses."""
-    with optional_import('drawing the figure', extra='plot'):
-        from matplotlib.figure import Figure
+@paper_style('drawing the figure')
+def picture(results: Results) -> Any:
+    """Draw (a) the mean squared errors, and (b) box plots of the losses if there are any."""
     conditions, rows = results.conditions, results.rows
-    figure = Figure(figsize=(9, 8), layout='constrained')
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    shifts = (np.arange(len(conditions)) - (len(conditions) - 1) / 2) * 0.8 / len(conditions)
+    figure, ((upper,), *others), above = new_panels(
+        PAGE_IN, 5.6 if results.losses else 3.2, 1 + bool(results.losses), 1, sharex=True)
+    # Each row has a strip; conditions share it.
+    width = 0.8 / len(conditions)
+    shifts = (np.arange(len(conditions)) - (len(conditions) - 1) / 2) * width
     for index, (condition, shift) in enumerate(zip(conditions, shifts, strict=True)):
-        color = f'C{index}'
+        own, label = look(index), str(condition).replace('-', '−')
         for x, row in enumerate(rows):
             mse, low, high = results.statistics(condition, row)['error'].interval()
             mses = np.nanmean(results.errors_m2(condition, row), axis=1)
-            upper.plot(np.full(len(mses), x + shift), mses, '.', color=color, alpha=0.5)
-            upper.errorbar(x + shift, mse, [[mse - low], [high - mse]], fmt='x', color=color,
-                           capsize=3, label=str(condition) if x == 0 else None)
+            upper.plot(np.full(len(mses), x + shift - 0.25 * width), mses, own.marker,
+                       color=own.colour, markersize=2.5, markerfacecolor='none')
+            upper.errorbar(x + shift, mse, [[mse - low], [high - mse]], fmt=own.marker,
+                           color=own.colour, label=label if row == rows[0] else None)
             if (condition, row) in results.losses:
-                box = lower.boxplot(
-                    np.nanmax(results.losses[condition, row], axis=0) / 1e3,
-                    positions=[x + shift], widths=0.6 / len(conditions), showfliers=False,
-                    patch_artist=True, medianprops={'color': 'k'})
-                box['boxes'][0].set(facecolor=color, alpha=0.6)
-    upper.set(ylabel='(a) mean squared error [m²]', yscale='log')
-    # Logarithmic above 1 kbit/s. The search for a beam ends slightly below the maximum, so that
-    # losses may be slightly negative.
-    lower.set(ylabel='(b) capacity loss [kbit/s]', yscale='symlog')
-    lower.set_ylim(bottom=-0.5)
-    lower.set_xticks(range(len(rows)), rows)
-    upper.legend(fontsize='small', ncols=2)
-    stream = io.BytesIO()
-    figure.savefig(stream, format='png', dpi=110)
-    return stream.getvalue()
+                box = others[0][0].boxplot(
+                    np.nanmax(results.losses[condition, row], axis=0), positions=[x + shift],
+                    widths=0.7 * width, showfliers=False, patch_artist=True, whis=WHISKERS)
+                box['boxes'][0].set(**box_style(index))
+    upper.set(ylabel='mean squared error [m$^2$]', yscale='log', title='(a)')
+    lowest = upper
+    for (lowest,) in others:
+        lowest.set(ylabel='capacity loss of band 1 [bit/s]', yscale='log', title='(b)',
+                   ylim=loss_limits_bps(results))
+    for axes in (upper, *(lower for (lower,) in others)):
+        axes.grid(axis='y')
+        # Not a grid of the axis, which would go through the middle of a strip.
+        for x in np.arange(len(rows) - 1) + 0.5:
+            axes.axvline(x, color='0.7', linewidth=0.5)
+    lowest.set_xticks(range(len(rows)), rows)
+    lowest.set(xlabel='codebook', xlim=(-0.5, len(rows) - 0.5))
+    add_legend(above, upper, bool(results.losses))
+    return figure
+
+
+def box_style(index: int) -> dict[str, Any]:
+    """Return the style of the boxes of a condition by its index."""
+    own = look(index)
+    return {'facecolor': to_paler(own.colour), 'edgecolor': own.colour, 'hatch': own.hatch}
+
+
+def loss_limits_bps(results: Results) -> tuple[float, float]:
+    """Return the range of the losses in the picture, in which every box is visible.
+
+    The search for a beam ends slightly below the maximum, so that losses may be slightly negative.
+    """
+    losses = [np.nanmax(own, axis=0) for own in results.losses.values()]
+    high = max(np.percentile(own, WHISKERS[1]) for own in losses)
+    quartiles = np.array([np.percentile(own, 25) for own in losses])
+    low = quartiles[quartiles > 0].min(initial=high)
+    return low / 20, 2 * high
+
+
+def add_legend(above: Any, upper: Any, has_losses: bool) -> None:
+    """Add the conditions, and the meaning of each mark."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles, labels = upper.get_legend_handles_labels()
+    if has_losses:
+        # The colour of a box under the marker.
+        handles = [(Patch(**box_style(index)), handle) for index, handle in enumerate(handles)]
+    marks = [(Line2D([], [], linestyle='', marker='o', markersize=2.5, markerfacecolor='none',
+                     color='0.3'), '(a): a single trial')]
+    mean = above.errorbar([np.nan], [np.nan], [1.0], fmt='o', color='0.3')
+    marks.append((mean, 'mean and its 95 % interval'))
+    if has_losses:
+        marks += [(Patch(facecolor='0.85', edgecolor='0.3'), '(b): quartiles'),
+                  (Line2D([], [], color='black', linewidth=1.4), 'median'),
+                  (Line2D([], [], color='black', linewidth=0.8, marker='_', markersize=6),
+                   '{} to {} %, or beyond the scale'.format(*WHISKERS))]
+    handles += [handle for handle, _ in marks]
+    above.legend(handles, labels + [label for _, label in marks], loc='lower center', ncols=3)

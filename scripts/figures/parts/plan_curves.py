@@ -1,24 +1,19 @@
-"""Errors and bounds of band plans over one parameter of the scenario: points, jobs and figures."""
+"""Errors and bounds of band plans over one parameter of the scenario: points and jobs."""
 
 import argparse
-import io
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import Codebook, optimize
 from rhs_isac_ros.codebook.band_plan import choose_bands
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
-from rhs_isac_ros.experiments import Job, markdown_table, run_jobs
+from rhs_isac_ros.experiments import Job, run_jobs
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.arguments import input_file, positive_int
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 
 Changes = Mapping[str, Any]
@@ -218,76 +213,3 @@ def evaluate(curves: Mapping[str, Curve], plans: Mapping[str, Plan], sizes: Size
             'mse_m2': float(errors.mean()), 'median_m2': float(np.median(errors)),
             'mse_error_m2': float(errors.std() / np.sqrt(len(errors))), **bounded.get(slug, {})})
     return entries
-
-
-def table(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table with a row for each point."""
-    names = [name for name in ('mse_m2', 'mse_error_m2', 'median_m2', 'crlb_m2', 'bound_m2')
-             if name in entries[0]]
-    heads = {'mse_m2': 'MSE [m²]', 'mse_error_m2': 'standard error', 'median_m2': 'median [m²]',
-             'crlb_m2': 'CRLB [m²]', 'bound_m2': 'bound [m²]'}
-    return markdown_table(
-        ['plan', 'value', *(heads[name] for name in names)],
-        [[entry['line'], f'{entry["value"]:g}', *(f'{entry[name]:.3g}' for name in names)]
-         for entry in entries])
-
-
-def picture(curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]]) -> bytes:
-    """Draw a panel for each curve as PNG: root mean squared errors and the roots of the bounds.
-
-    Bars are intervals of two standard errors.
-    """
-    with optional_import('drawing the figure', extra='plot'):
-        from matplotlib import colormaps
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import LogLocator, NullFormatter
-    figure = Figure(figsize=(1.5 + 4 * len(curves), 4.2), layout='constrained')
-    panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
-    for axes, (name, curve) in zip(panels, curves.items(), strict=True):
-        own = [entry for entry in entries if entry['curve'] == name]
-        lines = list(dict.fromkeys(entry['line'] for entry in own))
-        shades = colormaps['cividis'](np.linspace(0, 0.8, len(lines)))
-        for line, shade, marker in zip(lines, shades, 'os^Dv' * len(lines), strict=False):
-            part = [entry for entry in own if entry['line'] == line]
-            places = np.arange(len(part))
-            mean, spread = (np.array([entry[key] for entry in part])
-                            for key in ('mse_m2', 'mse_error_m2'))
-            low, high = np.sqrt(np.maximum(mean - 2 * spread, 0)), np.sqrt(mean + 2 * spread)
-            axes.errorbar(places, np.sqrt(mean), [np.sqrt(mean) - low, high - np.sqrt(mean)],
-                          color=shade, marker=marker, capsize=3, label=line)
-            for key, label, style in (('bound_m2', 'global bound', '--'),
-                                      ('crlb_m2', 'root of the average CRLB', ':')):
-                if key in part[0]:
-                    axes.plot(places, np.sqrt([entry[key] for entry in part]), style, color=shade,
-                              label=label if line == lines[-1] else None)
-        axes.set(xlabel=curve.label)
-        axes.set_xticks(range(len(curve.values)), [f'{value:.4g}' for value in curve.values])
-        axes.grid(axis='y', alpha=0.3)
-    if any(curve.bounds for curve in curves.values()):
-        panels[0].set_yscale('log')
-        panels[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        panels[0].yaxis.set_major_formatter('{x:g}')
-        panels[0].yaxis.set_minor_formatter(NullFormatter())
-    else:
-        panels[0].set_ylim(0, None)
-    panels[0].set_ylabel('root mean squared error [m]')
-    handles, labels = panels[0].get_legend_handles_labels()
-    # Bars come last by default.
-    order = np.argsort([not isinstance(handle, tuple) for handle in handles], kind='stable')
-    panels[0].legend([handles[k] for k in order], [labels[k] for k in order])
-    stream = io.BytesIO()
-    figure.savefig(stream, format='png', dpi=120)
-    return stream.getvalue()
-
-
-def write(name: str, curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]],
-          sentences: Sequence[str], output: Path) -> None:
-    """Print the report, and write it with the figure and the numbers."""
-    tables = [f'{curve.label}\n\n{table([e for e in entries if e["curve"] == key])}'
-              for key, curve in curves.items()]
-    report = '\n\n'.join([*tables, *sentences])
-    write_whole(output / f'{name}.png', picture(curves, entries))
-    write_whole(output / f'{name}.json', json.dumps(
-        {'version': __version__, 'points': entries}, indent=1) + '\n')
-    write_whole(output / f'{name}.md', f'# {name}\n\n![{name}]({name}.png)\n\n{report}\n')
-    print(f'{report}\n\nwritten: {output}/{name}.png, {name}.md and {name}.json')
