@@ -35,7 +35,8 @@ from rhs_isac_ros.ros.processes import (
 )
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.run import use_discovery_profile
-from rhs_isac_ros.tools.demo_report import draw, prepare_drawing, summary, table
+from rhs_isac_ros.tools.demo_picture import draw, prepare_drawing
+from rhs_isac_ros.tools.demo_report import summary, table
 from rhs_isac_ros.tools.process_network import (
     add_network_options,
     load_files,

@@ -1,17 +1,12 @@
-"""Report of the demonstration: a table of the cycles, a summary and a picture."""
+"""Report of the demonstration: a table of the cycles and a summary."""
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.model.pictures import write_picture
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleRecord
 from rhs_isac_ros.protocol.messages import Phase
-from rhs_isac_ros.tools.ellipses import ellipse_95
 
 _PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
 
@@ -56,54 +51,3 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
     lines += [f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
               for record in given_up]
     return '\n'.join(lines)
-
-
-def prepare_drawing() -> None:
-    """Import what `draw` needs, while there is nothing else to do."""
-    # Not at the start of the program, which has more urgent imports.
-    import matplotlib
-
-    matplotlib.use('Agg')
-    from matplotlib import patches, pyplot
-
-    del patches, pyplot
-
-
-def draw(cycles: Sequence[CompleteCycle], scenario: Scenario, path: Path) -> None:
-    """Draw the region of interest from above, with true positions and estimates.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
-    prepare_drawing()
-    from matplotlib import pyplot as plt
-    from matplotlib.patches import Ellipse, Rectangle
-
-    figure, axes = plt.subplots(figsize=(8, 7), layout='constrained')
-    low, high = scenario.roi_bounds_m
-    axes.add_patch(Rectangle(low[:2], *(high - low)[:2], fill=False, linestyle='--', color='0.5',
-                             label='region of interest'))
-    surface = element_positions(scenario)
-    axes.plot(surface[:, 0], surface[:, 1], linewidth=5, color='black', label='surface')
-    for user in sorted({cycle.user for cycle in cycles}):
-        color = f'C{(user - 1) % 10}'
-        own_cycles = [cycle for cycle in cycles if cycle.user == user]
-        truth = np.array([cycle.truth.position for cycle in own_cycles])
-        mean = np.array([cycle.estimate.position for cycle in own_cycles])
-        axes.plot(truth[:, 0], truth[:, 1], 'o', color=color, label=f'user {user}')
-        axes.plot(mean[:, 0], mean[:, 1], 'x', color=color, label=f'user {user}, estimate')
-        axes.plot([truth[:, 0], mean[:, 0]], [truth[:, 1], mean[:, 1]], color=color,
-                  linewidth=0.7)
-        for cycle in own_cycles:
-            x, y, _ = cycle.estimate.position
-            width, height, angle = ellipse_95(cycle.estimate.covariance_m2[:2, :2])
-            axes.add_patch(Ellipse((x, y), width, height, angle=angle, fill=False, color=color,
-                                   alpha=0.4))
-    axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal',
-             title=f'{len(cycles)} cycles from above; ellipses contain 95 % of the posterior')
-    axes.set_xlim(left=min(-1.0, low[0] - 1))
-    axes.legend(loc='upper left', fontsize='small')
-    write_picture(path, figure)
-    plt.close(figure)
