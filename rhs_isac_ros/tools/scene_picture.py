@@ -9,14 +9,14 @@ import numpy as np
 from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions, feed_positions
-from rhs_isac_ros.model.pictures import write_picture
+from rhs_isac_ros.model.pictures import PAGE_IN, look, new_figure, paper_style, write_picture
 from rhs_isac_ros.monitoring.scene_shapes import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
 from rhs_isac_ros.protocol.messages import Mode
 from rhs_isac_ros.tools.ellipses import ellipse_95
 
-_FIGURE_SIZE_IN = (14.0, 9.6)
+_HEIGHT_IN = 5.7
 _MARGIN_M = 0.8
 # Height of the row of the legend, apart from the legend, relative to the views.
 _LEGEND_ROW = 0.001
@@ -24,31 +24,28 @@ _LEGEND_ROW = 0.001
 _SURFACE_WIDTH_POINTS = 6
 # Maximum number of users in the legend.
 _MAX_LABELS = 8
-_PATTERN_STEP_DEG = 2.0
+_PATTERN_STEP_DEG = 1.0
 
 
 def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
-    """Draw a scene as far as it is known and write it as a PNG file.
+    """Draw a scene as far as it is known, in the format that the suffix of `path` names.
 
     Raises
     ------
     OSError
         If the file cannot be written.
     """
-    figure = compose(scene, scenario)
-    write_picture(path, figure)
+    write_picture(path, compose(scene, scenario))
 
 
+@paper_style()
 def compose(scene: SceneState, scenario: Scenario) -> Any:
     """Draw a scene as far as it is known, and return the `matplotlib.figure.Figure`."""
-    # Imported here because it is slow. Unlike pyplot, it needs no window system.
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=_FIGURE_SIZE_IN, layout='constrained')
+    figure = new_figure(PAGE_IN, _HEIGHT_IN)
     # Both views have the same scale, so that their x axes are aligned. The layout adds the height
     # of the legend to the last row.
     limits_m = [_limit_m(scenario, axis) for axis in (1, 2)]
-    grid = figure.add_gridspec(3, 2, width_ratios=(1.9, 1),
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.75, 1),
                                height_ratios=[*limits_m, _LEGEND_ROW * sum(limits_m)])
     pattern = _pattern(scene.shown_beam, scenario)
     above, side = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
@@ -56,10 +53,10 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
     _draw_view(side, [0, 2], scene, scenario, pattern)
     above.set_title('from above', loc='left')
     side.set_title('from the side', loc='left')
-    right = grid[:2, 1].subgridspec(2, 1, height_ratios=(1.5, 1))
+    right = grid[:2, 1].subgridspec(2, 1, height_ratios=(1.2, 1))
     _draw_surface(figure.add_subplot(right[0]), scene, scenario)
     _draw_pattern(figure.add_subplot(right[1], projection='polar'), scene.shown_beam, pattern)
-    figure.suptitle(_title(scene), fontsize='x-large')
+    figure.suptitle(_title(scene))
     # A legend of the figure gets room from the layout only since Matplotlib 3.7.
     below = figure.add_subplot(grid[2, :])
     below.axis('off')
@@ -82,10 +79,6 @@ def _pattern(beam: BeamMessage | None, scenario: Scenario) -> BeamPattern | None
                         math.hypot(*scenario.roi_center_m), _PATTERN_STEP_DEG)
 
 
-def _colour(user: int) -> str:
-    return f'C{(user - 1) % 10}'
-
-
 def _limit_m(scenario: Scenario, axis: int) -> float:
     """Return the half-width of a view along y or z [m]."""
     return float(np.abs(scenario.roi_bounds_m)[:, axis].max()) + _MARGIN_M
@@ -104,7 +97,7 @@ def _draw_view(
         row, column = pattern.peak
         lobe = lobe_m(pattern)
         cut = lobe[row] if plane == [0, 1] else lobe[:, column]
-        colour = _colour(scene.shown_beam.user)
+        colour = look(scene.shown_beam.user - 1).colour
         axes.fill(*cut[:, plane].T, facecolor=colour, alpha=0.13, zorder=1)
         axes.plot(*cut[:, plane].T, color=colour, alpha=0.5, linewidth=0.8, zorder=1)
     half_m = element_interval_m(scenario) * scenario.elements_per_side / 2
@@ -113,33 +106,33 @@ def _draw_view(
     axes.annotate('surface', (0, half_m), xytext=(0, 8), textcoords='offset points', ha='center')
     for user in scene.users.values():
         _draw_user(axes, plane, user)
-    axes.set(xlabel='x [m]', ylabel=f'{"xyz"[plane[1]]} [m]', aspect='equal')
+    axes.set(xlabel='$x$ [m]', ylabel=f'${"xyz"[plane[1]]}$ [m]', aspect='equal')
     axes.set_xlim(min(-_MARGIN_M, low[0] - _MARGIN_M), high[0] + _MARGIN_M)
     limit_m = _limit_m(scenario, plane[1])
     axes.set_ylim(-limit_m, limit_m)
-    axes.grid(color='0.9', linewidth=0.6)
-    axes.set_axisbelow(True)
+    axes.grid()
 
 
 def _draw_user(axes: Any, plane: list[int], user: UserState) -> None:
     from matplotlib.patches import Ellipse
 
-    colour, estimate = _colour(user.user), user.estimate
+    own, estimate = look(user.user - 1), user.estimate
+    colour = own.colour
     true_path = np.array([point[plane] for point in user.true_path]).reshape(-1, 2)
-    axes.plot(*true_path.T, color=colour, linewidth=1.2, alpha=0.8, zorder=3)
+    axes.plot(*true_path.T, color=colour, linewidth=0.9, alpha=0.8, zorder=3)
     if estimate:
         x, y = estimate.position[plane]
         width, height, angle = ellipse_95(estimate.covariance_m2[np.ix_(plane, plane)])
         axes.add_patch(Ellipse((x, y), width, height, angle=angle, facecolor=colour, alpha=0.25,
                                zorder=2))
         axes.add_patch(Ellipse((x, y), width, height, angle=angle, fill=False, edgecolor=colour,
-                               linewidth=1.5, zorder=3))
+                               linewidth=0.9, zorder=3))
         earlier = np.array([point[plane] for point in user.estimated_path][:-1]).reshape(-1, 2)
-        axes.plot(*earlier.T, 'x', color=colour, markersize=4, alpha=0.4, zorder=3)
-        axes.plot(x, y, 'x', color=colour, markersize=10, markeredgewidth=2.5, zorder=5)
+        axes.plot(*earlier.T, 'x', color=colour, markersize=2, alpha=0.5, zorder=3)
+        axes.plot(x, y, 'x', color=colour, markersize=5.5, markeredgewidth=1.4, zorder=5)
     if user.truth:
-        axes.plot(*user.truth.position[plane], 'o', color=colour, markersize=9,
-                  markeredgecolor='black', zorder=6)
+        axes.plot(*user.truth.position[plane], own.marker, color=colour, markersize=5,
+                  markeredgecolor='black', markeredgewidth=0.6, zorder=6)
 
 
 def _draw_surface(axes: Any, scene: SceneState, scenario: Scenario) -> None:
@@ -149,37 +142,40 @@ def _draw_surface(axes: Any, scene: SceneState, scenario: Scenario) -> None:
     message = scene.configuration
     amplitudes = np.full(n_elements, np.nan) if message is None else message.analog.mean(axis=0)
     image = axes.imshow(
-        amplitudes.reshape(side, side), origin='lower', cmap='viridis', vmin=0, vmax=1,
+        amplitudes.reshape(side, side), origin='lower', vmin=0, vmax=1,
         extent=(-half_cm, half_cm, -half_cm, half_cm))
     axes.plot(*(100 * feed_positions(scenario)[:, 1:]).T, 'D', color='white',
-              markeredgecolor='black', markersize=7)
-    axes.figure.colorbar(image, ax=axes, location='bottom', label='amplitude', shrink=0.8)
+              markeredgecolor='black', markersize=4)
+    axes.figure.colorbar(image, ax=axes, location='bottom', label='amplitude', shrink=0.8,
+                         ticks=(0, 0.5, 1))
     text = 'not known yet'
     if message is not None:
         phase = 'positioning' if message.mode is Mode.POSITIONING else 'transmission'
         mean = f', mean of {len(message.analog)} frames' if len(message.analog) > 1 else ''
-        text = f'{phase}, band {message.band}{mean}'
-    axes.set_title(f'surface from the front\n{text}', fontsize='medium')
-    axes.set(xlabel='y [cm]', ylabel='z [cm]')
+        text = f'{phase}, band {message.band}{mean}\ncycle {message.cycle_id}'
+    axes.set_title(f'surface from the front\n{text}')
+    axes.set(xlabel='$y$ [cm]', ylabel='$z$ [cm]')
 
 
 def _draw_pattern(axes: Any, beam: BeamMessage | None, pattern: BeamPattern | None) -> None:
     """Draw the cuts of the beam pattern through its peak, in decibels."""
     axes.set_theta_zero_location('N')
-    axes.set(thetamin=-90, thetamax=90, rlim=(MIN_LEVEL_DB, 0),
-             rticks=np.linspace(MIN_LEVEL_DB, 0, 5))
-    axes.tick_params(labelsize='small')
+    axes.set(thetamin=-90, thetamax=90, rlim=(MIN_LEVEL_DB, 0))
+    levels_db, angles_deg = np.linspace(MIN_LEVEL_DB, 0, 3), range(-90, 91, 45)
+    axes.set_rgrids(levels_db, [f'{level:g}'.replace('-', '−') for level in levels_db])
+    axes.tick_params(labelsize=7, pad=0)
+    axes.set_thetagrids(angles_deg, [f'{angle}°'.replace('-', '−') for angle in angles_deg])
     if beam is None or pattern is None:
-        axes.set_title('no data beam yet', fontsize='medium')
+        axes.set_title('no data beam yet')
         return
     min_power = 10**(MIN_LEVEL_DB / 10)
     for name, (angles, power), style in (
             ('over azimuth', pattern.azimuth_cut(), '-'),
             ('over elevation', pattern.elevation_cut(), ':')):
         axes.plot(angles, 10 * np.log10(np.maximum(power, min_power)), style,
-                  color=_colour(beam.user), linewidth=2, label=name)
-    axes.set_title(f'data beam to user {beam.user}, band {beam.band} [dB]', fontsize='medium')
-    axes.legend(loc='lower center', bbox_to_anchor=(0.5, -0.02), ncols=2, fontsize='small',
+                  color=look(beam.user - 1).colour, linewidth=1.2, label=name)
+    axes.set_title(f'data beam to user {beam.user}, band {beam.band} [dB]')
+    axes.legend(loc='lower center', bbox_to_anchor=(0.5, -0.2), ncols=2,
                 frameon=False)
 
 
@@ -191,16 +187,18 @@ def _legend(scene: SceneState) -> list[Any]:
         return Line2D([], [], linestyle='', marker=symbol, color='0.4', label=label, **style)
     handles: list[Any] = [
         Patch(facecolor='0.95', edgecolor='0.4', linestyle='--', label='region of interest'),
-        marker('o', 'true position', markersize=9, markeredgecolor='black'),
+        marker('o', 'true position', markersize=5, markeredgecolor='black'),
         Line2D([], [], color='0.4', label='its path'),
-        marker('x', 'estimate', markersize=10, markeredgewidth=2.5),
-        marker('x', 'earlier estimates', markersize=4),
+        marker('x', 'estimate', markersize=5.5, markeredgewidth=1.4),
+        marker('x', 'earlier estimates', markersize=2),
         Patch(facecolor='0.8', edgecolor='0.4', label='95 % of the posterior'),
         marker('D', 'feed', markerfacecolor='white', markeredgecolor='black')]
     if scene.shown_beam:
-        handles.append(Patch(facecolor='0.92', label=f'data beam, {MIN_LEVEL_DB:g} to 0 dB'))
+        handles.append(Patch(facecolor='0.92', label=f'data beam, −{-MIN_LEVEL_DB:g} to 0 dB'))
     users = sorted(scene.users)
-    handles += [Patch(color=_colour(user), label=f'user {user}') for user in users[:_MAX_LABELS]]
+    handles += [marker(look(user - 1).marker, f'user {user}', markersize=5,
+                       markeredgecolor='black', markerfacecolor=look(user - 1).colour)
+                for user in users[:_MAX_LABELS]]
     if len(users) > _MAX_LABELS:
         handles.append(Line2D([], [], linestyle='', label=f'and {len(users) - _MAX_LABELS} more'))
     return handles

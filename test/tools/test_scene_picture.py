@@ -5,11 +5,13 @@ import itertools
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.colors import to_hex
+from matplotlib.patches import Ellipse, Polygon, Rectangle
 from matplotlib.text import Text
 
 from rhs_isac_ros.link import steer
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.pictures import look
 from rhs_isac_ros.monitoring.scene_state import SceneState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.ellipses import ellipse_95
@@ -58,7 +60,7 @@ def test_no_text_is_cut_off_or_overlaps_another(monkeypatch):
     scenario = Scenario()
     figure = compose(make_scene(scenario, 12), scenario)
     found = texts(figure, monkeypatch)
-    assert {'x [m]', 'y [m]', 'z [m]', 'user 8', 'and 4 more', 'surface'} <= {
+    assert {'$x$ [m]', '$y$ [m]', '$z$ [m]', 'user 8', 'and 4 more', 'surface'} <= {
         text for text, _ in found}
     page = figure.bbox.padded(1)
     for text, box in found:
@@ -72,7 +74,7 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
     figure = compose(make_scene(scenario, 3), scenario)
     views = {axes.get_ylabel(): axes for axes in figure.axes}
     low, high = scenario.roi_bounds_m
-    for label, plane in (('y [m]', [0, 1]), ('z [m]', [0, 2])):
+    for label, plane in (('$y$ [m]', [0, 1]), ('$z$ [m]', [0, 2])):
         axes = views[label]
         (region,) = [patch for patch in axes.patches if type(patch) is Rectangle]
         assert region.get_xy() == pytest.approx(low[plane])
@@ -85,13 +87,40 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
         for patch in ellipses:
             assert (patch.width, patch.height, patch.angle) == pytest.approx(wanted)
         dots = {tuple(np.round(line.get_xydata()[0], 9)) for line in axes.lines
-                if line.get_marker() == 'o'}
+                if line.get_markeredgecolor() == 'black' and line.get_marker() != 'None'}
         assert dots == {tuple(np.round(position[plane] + 0.8, 9)) for position in POSITIONS}
         assert axes.get_aspect() == 1.0
-    surface = views['z [cm]'].images[0].get_array()
+    surface = views['$z$ [cm]'].images[0].get_array()
     assert surface.shape == (10, 10)
     # No error is shown: the true position of user 3 belongs to another cycle.
     assert [text.get_text() for text in figure.texts] == ['cycle 103, user 3']
+
+
+def test_title_beam_and_lobe_are_of_one_user():
+    """Even if the estimate of another user is more recent than the beam."""
+    scenario = Scenario()
+    scene = make_scene(scenario, 3)
+    beam = steer(scenario, POSITIONS[2])
+    scene.add(m.Beam(cycle_id=102, user=2, codebook_id='cb', band=0, analog=beam.analog,
+                     digital=beam.digital, expected_bps=1e6), 0.0)
+    figure = compose(scene, scenario)
+    assert [text.get_text() for text in figure.texts] == ['cycle 102, user 2']
+    (polar,) = [axes for axes in figure.axes if axes.name == 'polar']
+    assert polar.get_title() == 'data beam to user 2, band 0 [dB]'
+    assert [text.get_text() for text in polar.get_legend().get_texts()] == [
+        'over azimuth', 'over elevation']
+    assert {line.get_color() for line in polar.lines} == {look(1).colour}
+    (above,) = [axes for axes in figure.axes if axes.get_ylabel() == '$y$ [m]']
+    assert [to_hex(patch.get_facecolor()).upper() for patch in above.patches
+            if type(patch) is Polygon] == [look(1).colour]
+
+
+def test_users_differ_by_marker():
+    scenario = Scenario()
+    figure = compose(make_scene(scenario, 3), scenario)
+    (above,) = [axes for axes in figure.axes if axes.get_ylabel() == '$y$ [m]']
+    assert [line.get_marker() for line in above.lines if line.get_markeredgecolor() == 'black'
+            and line.get_marker() != 'None'] == [look(user).marker for user in range(3)]
 
 
 def test_the_surface_is_shown_from_the_front(small):
