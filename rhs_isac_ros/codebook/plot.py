@@ -11,13 +11,23 @@ from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.search import Progress
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.optional import optional_import
-from rhs_isac_ros.model.pictures import write_picture
+from rhs_isac_ros.model.pictures import (
+    LOOKS,
+    PAGE_IN,
+    add_panels,
+    label_decades,
+    look,
+    new_figure,
+    paper_style,
+    write_picture,
+)
 from rhs_isac_ros.model.surface import radiation_matrix
 
 # Points of the map of the bound along each axis, and of a beam over azimuth.
 _N_MAP_POINTS = 60
 _N_AZIMUTHS = 361
+# Panels of beams side by side.
+_N_COLUMNS = 3
 
 
 def plot_optimization(
@@ -32,25 +42,33 @@ def plot_optimization(
     MissingLibraryError
         If matplotlib is not installed.
     ValueError
-        If matplotlib does not support the file format.
+        If the suffix is not one of `PICTURE_FORMATS`.
     OSError
         If the file cannot be written.
     """
-    with optional_import('plotting', extra='plot'):
-        from matplotlib.figure import Figure
+    write_picture(path, compose(scenario, codebook, history))
 
-    rows = -(-scenario.n_bands // 3)
-    figure = Figure(figsize=(11, 4.2 + 3 * rows), layout='constrained')
-    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(4.2, 3 * rows))[:, 0]
-    left, right = above.subplots(1, 2)
+
+@paper_style('plotting')
+def compose(scenario: Scenario, codebook: Codebook, history: Sequence[Progress]) -> Any:
+    """Return the `matplotlib.figure.Figure` of `plot_optimization`."""
+    rows = -(-scenario.n_bands // _N_COLUMNS)
+    figure = new_figure(PAGE_IN, 2.7 + 2.3 * rows)
+    above, below = figure.add_gridspec(2, 1, height_ratios=(2.7, 2.3 * rows))
+    left, right = above.subgridspec(1, 2).subplots()
     _draw_convergence(left, history)
     _draw_bound(right, scenario, codebook)
-    axes = below.subplots(rows, min(scenario.n_bands, 3), squeeze=False)
+    axes, legend = add_panels(
+        below, rows, min(scenario.n_bands, _N_COLUMNS), sharex=True, sharey=True)
     for axis in axes.flat[scenario.n_bands:]:
         axis.set_visible(False)
     for band, axis in zip(range(scenario.n_bands), axes.flat, strict=False):
         _draw_beams(axis, scenario, codebook, band)
-    write_picture(path, figure)
+    for axis in axes[:, 0]:
+        axis.set_ylabel('relative power [dB]')
+    if scenario.n_frames <= len(LOOKS):
+        legend.legend(*axes[0, 0].get_legend_handles_labels(), loc='lower center', ncols=4)
+    return figure
 
 
 def beam_powers(
@@ -73,9 +91,11 @@ def beam_powers(
 
 
 def _draw_convergence(axis: Any, history: Sequence[Progress]) -> None:
-    axis.semilogy([entry.step for entry in history], [entry.value_m2 for entry in history])
-    axis.set(xlabel='step', ylabel='objective [m$^2$]', title='Convergence')
-    axis.grid(alpha=0.3)
+    axis.semilogy([entry.step for entry in history], [entry.value_m2 for entry in history],
+                  color=look(0).colour)
+    axis.set(xlabel='step', ylabel='objective [m$^2$]', title='convergence')
+    label_decades(axis.yaxis)
+    axis.grid()
 
 
 def _draw_bound(axis: Any, scenario: Scenario, codebook: Codebook) -> None:
@@ -83,20 +103,20 @@ def _draw_bound(axis: Any, scenario: Scenario, codebook: Codebook) -> None:
     x, y = np.linspace(low[0], high[0], _N_MAP_POINTS), np.linspace(low[1], high[1], _N_MAP_POINTS)
     grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), scenario.roi_center_m[2])], -1)
     bound = np.sqrt(crlb(scenario, codebook, grid.reshape(-1, 3))).reshape(len(y), len(x))
-    image = axis.pcolormesh(x, y, np.where(np.isfinite(bound), bound, np.nan), shading='gouraud')
-    axis.set(xlabel='x [m]', ylabel='y [m]', aspect='equal',
-             title='Root of the CRLB at mid-height')
-    axis.figure.colorbar(image, ax=axis, label='m')
+    image = axis.pcolormesh(x, y, np.where(np.isfinite(bound), bound, np.nan), shading='gouraud',
+                            rasterized=True)
+    axis.set(xlabel='$x$ [m]', ylabel='$y$ [m]', aspect='equal', title='bound at mid-height')
+    axis.figure.colorbar(image, ax=axis, label='√CRLB [m]')
 
 
 def _draw_beams(axis: Any, scenario: Scenario, codebook: Codebook, band: int) -> None:
     azimuths, powers = beam_powers(scenario, codebook, band)
     for frame, power in enumerate(powers):
         decibels = 10 * np.log10(np.maximum(power / powers.max(), 1e-3))
-        axis.plot(np.degrees(azimuths), decibels, label=f'frame {frame}')
-    axis.set(xlabel='azimuth [deg]', ylabel='power [dB]', xlim=(-90, 90), ylim=(-30, 1),
-             xticks=range(-90, 91, 30),
-             title=f'Beams of band {band}, {scenario.center_frequencies_hz[band] / 1e9:g} GHz')
-    axis.grid(alpha=0.3)
-    if scenario.n_frames <= 8:
-        axis.legend(fontsize='x-small')
+        own = look(frame)
+        axis.plot(np.degrees(azimuths), decibels, color=own.colour, linestyle=own.line,
+                  label=f'frame {frame}')
+    axis.set(xlabel='azimuth [°]', xlim=(-90, 90), ylim=(-30, 1),
+             xticks=range(-90, 91, 45),
+             title=f'beams of band {band}, {scenario.center_frequencies_hz[band] / 1e9:g} GHz')
+    axis.grid()

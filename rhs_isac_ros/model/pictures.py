@@ -35,6 +35,8 @@ _STYLE: dict[Any, object] = {
     'svg.fonttype': 'path',
     # The same ids in each run.
     'svg.hashsalt': 'rhs_isac_ros'}
+# Decimal places of positions, relative to the size of a figure.
+_POSITION_DIGITS = 6
 # Without dates, repeated runs write the same file.
 _METADATA: dict[str, dict[str, Any]] = {
     'png': {}, 'pdf': {'CreationDate': None}, 'svg': {'Date': None}}
@@ -123,21 +125,40 @@ def new_figure(width_in: float, height_in: float) -> Any:
 def new_panels(
         width_in: float, height_in: float, n_rows: int, n_columns: int,
         **sharing: bool) -> tuple[Any, Any, Any]:
-    """Return a figure, its panels as an array of axes, and axes above them for a legend.
+    """Return a figure with the panels and the axes of `add_panels`."""
+    figure = new_figure(width_in, height_in)
+    return figure, *add_panels(figure.add_gridspec(1, 1)[0], n_rows, n_columns, **sharing)
+
+
+def add_panels(
+        place: Any, n_rows: int, n_columns: int, **sharing: bool) -> tuple[Any, Any]:
+    """Return panels, an array of axes, and axes above for a legend.
 
     Parameters
     ----------
+    place
+        A `matplotlib.gridspec.SubplotSpec`, the part of the figure to use.
     sharing
         Arguments ``sharex`` and ``sharey`` of `matplotlib.gridspec.GridSpecBase.subplots`.
     """
-    figure = new_figure(width_in, height_in)
     # The layout adds the height of the legend. A legend of the figure itself gets room from the
     # layout only since Matplotlib 3.7.
-    grid = figure.add_gridspec(2, 1, height_ratios=(0.001, 1))
+    grid = place.subgridspec(2, 1, height_ratios=(0.001, 1))
     panels = grid[1].subgridspec(n_rows, n_columns).subplots(squeeze=False, **sharing)
-    above = figure.add_subplot(grid[0])
+    above = panels[0, 0].figure.add_subplot(grid[0])
     above.axis('off')
-    return figure, panels, above
+    return panels, above
+
+
+def label_decades(axis: Any) -> None:
+    """Label a logarithmic axis with plain numbers, after drawing on it."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(
+        subs=(1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+    axis.set_major_formatter('{x:g}')
+    axis.set_minor_formatter(NullFormatter())
 
 
 def picture_format(path: str | Path) -> str:
@@ -164,5 +185,23 @@ def write_picture(path: str | Path, figure: Any) -> None:
     kind = picture_format(path)
     # Matplotlib makes ticks and loads fonts only now.
     with paper_style():
+        _fix_layout(figure)
         write_whole(path, lambda stream: figure.savefig(
             stream, format=kind, metadata=_METADATA[kind]))
+
+
+def _fix_layout(figure: Any) -> None:
+    """Lay a figure out, and round the positions.
+
+    The last digits of the layout, and with them files and ids in SVG, differ between runs.
+    """
+    from matplotlib import rc_context
+    from matplotlib.transforms import Bbox
+
+    figure.draw_without_rendering()
+    # The name 'none' of no layout engine exists only since Matplotlib 3.7.
+    with rc_context({'figure.constrained_layout.use': False}):
+        figure.set_layout_engine(None)
+    for axes in figure.axes:
+        extents = axes.get_position(original=True).extents
+        axes.set_position(Bbox.from_extents(extents.round(_POSITION_DIGITS)))

@@ -9,7 +9,14 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.model.pictures import PAGE_IN, look, new_figure, paper_style, write_picture
+from rhs_isac_ros.model.pictures import (
+    PAGE_IN,
+    label_decades,
+    look,
+    new_figure,
+    paper_style,
+    write_picture,
+)
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.tools.ellipses import ellipse_95
 
@@ -66,7 +73,7 @@ def compose(cycles: Sequence[CompleteCycle], scenario: Scenario) -> Any:
     errors.set(xlabel='cycle', ylabel='[m]', yscale='log',
                title='(b) position error and its bound, in the order of the cycles')
     errors.xaxis.get_major_locator().set_params(integer=True)
-    errors.yaxis.set_major_formatter('{x:g}')
+    label_decades(errors.yaxis)
     errors.grid()
     above.legend(handles=_legend(users), loc='lower center', ncols=4)
     return figure

@@ -16,11 +16,11 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from parts.ambiguity_speed import ambiguity_speed
-from parts.optimizer_growth import GROWTH, POSITIONS, growth, side_by_side, surfaces
+from parts.optimizer_growth import POSITIONS, growth, side_by_side, surfaces
+from parts.optimizer_picture import draw
 from peers.jax_crlb import JaxAverageCrlb
 from scipy.optimize import minimize
 
@@ -42,7 +42,6 @@ from rhs_isac_ros.model.arguments import (
     positive_float,
 )
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.model.pictures import write_picture
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
@@ -61,7 +60,8 @@ def main() -> None:
                         help='time limit per method in (b) [s]')
     parser.add_argument('--parts', type=parts, default='abcd', help='letters of abcde')
     parser.add_argument('--json', type=output_file, help='JSON file for the results')
-    parser.add_argument('--picture', type=picture_file, help='file for the picture')
+    parser.add_argument('--picture', type=picture_file,
+                        help='file for the picture of (a) to (c): PNG, PDF or SVG')
     options = parser.parse_args()
     check_distinct(parser, {}, {'--json': options.json, '--picture': options.picture})
     restrict_to(options.threads)
@@ -77,7 +77,7 @@ def main() -> None:
     if options.json:
         write_whole(options.json, json.dumps(figures, indent=2) + '\n')
     if options.picture:
-        draw(figures, options.picture)
+        write_picture(options.picture, draw(figures))
 
 
 def parts(text: str) -> str:
@@ -264,29 +264,6 @@ def first_below(scenario: Scenario, trace: Trace, held_out: np.ndarray) -> tuple
         else:
             low = middle + 1
     return trace[high]
-
-
-def draw(figures: dict, path: Path) -> None:
-    """Draw the results of all parts that were run."""
-    with optional_import('--picture', extra='plot'):
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 3.6), layout='constrained')
-    left, middle, right = figure.subplots(1, 3)
-    if 'gradient_ms' in figures:
-        left.barh(list(figures['gradient_ms']), list(figures['gradient_ms'].values()))
-        left.set(title='(a) Value and gradient', xlabel='ms')
-    if 'target' in figures:
-        names = [name for name, row in figures['target'].items() if row['target_s']]
-        middle.barh(names, [figures['target'][name]['target_s'] for name in names])
-        middle.set(title=f'(b) Time to {TARGET_M2} m$^2$', xlabel='s', xscale='log')
-    if 'growth' in figures:
-        for symbol, values in GROWTH.items():
-            times = [figures['growth'][f'{symbol} = {n}']['evaluation_ms'] for n in values]
-            right.loglog(np.array(values) / values[0], times, 'o-', label=symbol)
-        right.set(title='(c) Growth of an evaluation', xlabel='size, relative', ylabel='ms')
-        right.legend()
-    write_picture(path, figure)
 
 
 if __name__ == '__main__':

@@ -10,6 +10,7 @@ from rhs_isac_ros.codebook.directional import width_points
 from rhs_isac_ros.codebook.plot import beam_powers, plot_optimization
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.optional import MissingLibraryError
+from rhs_isac_ros.model.pictures import PICTURE_FORMATS, write_picture
 
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
@@ -28,6 +29,31 @@ def test_draws_any_number_of_bands(scenario, n_bands, tmp_path):
     assert (tmp_path / 'p.png').read_bytes().startswith(b'\x89PNG')
 
 
+def test_axes_have_units_and_the_beams_one_legend():
+    pytest.importorskip('matplotlib')
+    scenario = Scenario()
+    figure = plot.compose(scenario, directional_codebook(scenario), HISTORY)
+    labels = [(axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes]
+    for expected in (('step', 'objective [m$^2$]'), ('$x$ [m]', '$y$ [m]'), ('', '√CRLB [m]'),
+                     ('azimuth [°]', 'relative power [dB]')):
+        assert expected in labels
+    (legend,) = filter(None, [axes.get_legend() for axes in figure.axes])
+    assert [text.get_text() for text in legend.get_texts()] == [
+        f'frame {frame}' for frame in range(4)]
+    (beams,) = [axes for axes in figure.axes if axes.get_title() == 'beams of band 0, 2.5 GHz']
+    assert len({line.get_linestyle() for line in beams.lines}) == 4
+
+
+def test_repeated_runs_write_the_same_files(scenario, tmp_path):
+    pytest.importorskip('matplotlib')
+    for run in 'ab':
+        figure = plot.compose(scenario, directional_codebook(scenario), HISTORY)
+        for kind in PICTURE_FORMATS:
+            write_picture(tmp_path / f'{run}.{kind}', figure)
+    for kind in PICTURE_FORMATS:
+        assert (tmp_path / f'a.{kind}').read_bytes() == (tmp_path / f'b.{kind}').read_bytes()
+
+
 def test_an_unknown_format_is_an_error(scenario, tmp_path):
     pytest.importorskip('matplotlib')
     with pytest.raises(ValueError, match='xyz'):
@@ -36,7 +62,7 @@ def test_an_unknown_format_is_an_error(scenario, tmp_path):
 
 
 def test_without_matplotlib_the_error_names_the_extra(scenario, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
     with pytest.raises(
             MissingLibraryError, match='^plotting needs matplotlib, .*rhs_isac_ros.plot'):
         plot_optimization(scenario, directional_codebook(scenario), HISTORY, tmp_path / 'p.png')

@@ -13,8 +13,10 @@ from rhs_isac_ros.model.optional import MissingLibraryError
 from rhs_isac_ros.model.pictures import (
     LOOKS,
     PICTURE_FORMATS,
+    label_decades,
     look,
     new_figure,
+    new_panels,
     paper_style,
     picture_format,
     write_picture,
@@ -101,6 +103,37 @@ def test_the_style_replaces_the_settings_of_the_user_inside_the_block_only():
             assert not matplotlib.rcParams['axes.grid']
         assert matplotlib.rcParams['font.size'] == 30.0
         assert matplotlib.rcParams['axes.grid']
+
+
+@pytest.mark.parametrize(('high', 'expected'), [
+    (0.17, {'0.08', '0.1', '0.15'}), (7.0, {'0.1', '0.2', '0.5', '1', '2', '5'})])
+def test_a_logarithmic_axis_has_labels_within_a_decade_and_beyond(high, expected):
+    pytest.importorskip('matplotlib')
+    with paper_style():
+        axes = new_figure(3.5, 2.5).subplots()
+        axes.semilogy([0, 1], [0.078, high])
+        label_decades(axes.yaxis)
+        low, top = axes.get_ylim()
+        assert {text.get_text() for text in axes.get_yticklabels()
+                if low <= text.get_position()[1] <= top} == expected
+
+
+@pytest.mark.parametrize('shape', [(1, 2), (3, 1)])
+def test_a_legend_above_the_panels_overlaps_none(shape):
+    pytest.importorskip('matplotlib')
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    with paper_style():
+        figure, panels, above = new_panels(7.0, 4.0, *shape, sharex=True)
+        for axes in panels.flat:
+            axes.plot([0, 1], label='a line')
+            axes.set_title('title')
+        legend = above.legend(*panels[0, 0].get_legend_handles_labels(), loc='lower center',
+                              title='two\nlines')
+        FigureCanvasAgg(figure).draw()
+    assert panels.shape == shape
+    box = legend.get_window_extent()
+    assert figure.bbox.y1 >= box.y1
+    assert all(axes.title.get_window_extent().y1 <= box.y0 for axes in panels[0])
 
 
 def lightness(colour):

@@ -14,6 +14,7 @@ from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.pictures import (
     COLUMN_IN,
     PAGE_IN,
+    label_decades,
     look,
     new_panels,
     paper_style,
@@ -45,16 +46,13 @@ def picture(curves: Mapping[str, Curve], entries: Sequence[Mapping[str, Any]]) -
     Bars are intervals of two standard errors.
     """
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import LogLocator, NullFormatter
     width_in = COLUMN_IN if len(curves) == 1 else PAGE_IN
     figure, (panels,), above = new_panels(width_in, 3.0, 1, len(curves), sharey=True)
     for axes, (name, curve) in zip(panels, curves.items(), strict=True):
         _draw_curve(axes, curve, [entry for entry in entries if entry['curve'] == name])
     if any(curve.bounds for curve in curves.values()):
         panels[0].set_yscale('log')
-        panels[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        panels[0].yaxis.set_major_formatter('{x:g}')
-        panels[0].yaxis.set_minor_formatter(NullFormatter())
+        label_decades(panels[0].yaxis)
     else:
         panels[0].set_ylim(0, None)
     panels[0].set_ylabel('root mean squared error [m]')
