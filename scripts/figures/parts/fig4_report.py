@@ -143,7 +143,8 @@ def add_legend(above: Any, upper: Any, has_losses: bool) -> None:
         handles = [(Patch(**box_style(index)), handle) for index, handle in enumerate(handles)]
     marks = [(Line2D([], [], linestyle='', marker='o', markersize=2.5, markerfacecolor='none',
                      color='0.3'), '(a): a single trial')]
-    mean = above.errorbar([np.nan], [np.nan], [1.0], fmt='o', color='0.3')
+    mean = above.errorbar([0], [0], [1], fmt='o', color='0.3')
+    mean.remove()
     marks.append((mean, 'mean and its 95 % interval'))
     if has_losses:
         marks += [(Patch(facecolor='0.85', edgecolor='0.3'), '(b): quartiles'),

@@ -85,10 +85,16 @@ def _draw_curve(axes: Any, curve: Curve, entries: Sequence[Mapping[str, Any]]) -
     axes.grid(axis='y')
 
 
-def roots(entries: Sequence[Mapping[str, Any]], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return roots of mean squares, and the distances to the ends of their intervals [2, n]."""
-    means, spreads = (np.array([entry.get(name, np.nan) for entry in entries], float)
-                      for name in (key, ERRORS.get(key)))
+def roots(
+        entries: Sequence[Mapping[str, Any]], key: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return roots of mean squares, and the distances to the ends of their intervals [2, n].
+
+    Exact mean squares have no interval.
+    """
+    means = np.array([entry[key] for entry in entries])
+    if key not in ERRORS:
+        return np.sqrt(means), None
+    spreads = np.array([entry[ERRORS[key]] for entry in entries])
     ends = np.sqrt(np.maximum([means - 2 * spreads, means + 2 * spreads], 0))
     middle: np.ndarray = np.sqrt(means)
     return middle, np.abs(ends - middle)
