@@ -15,6 +15,8 @@ algorithm:
 
 Beyond the paper, each codebook is also evaluated on 500 held-out positions, the same for all: a
 method may overfit ten samples.
+
+Duration on two cores: two minutes with --quick, about 20 minutes without.
 """
 
 import os

@@ -21,6 +21,8 @@ units, retrained in every trial, and `bayes`, the posterior mean.
 All rows are evaluated with the same positions, multipath and noise. Panel (b) uses the training of
 each row with the smallest validation error. In rows whose codebook differs between trials, each
 trial serves an equal share of the positions.
+
+Duration on two cores: four minutes with --quick, about six hours without.
 """
 
 import os
