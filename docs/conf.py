@@ -14,12 +14,12 @@ version = release = __version__
 extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'generated', 'mathml']
 
 # The pages must display offline, so no fonts and no MathJax are loaded from other sites.
-html_theme = 'alabaster'
-html_theme_options = {
-    'description': 'Multi-band ISAC with a holographic surface, on ROS 2',
-    'fixed_sidebar': True, 'page_width': '1100px', 'body_max_width': 'none'}
+html_theme = 'furo'
+html_title = f'rhs_isac_ros {version}'
 html_static_path = ['_static']
-html_sidebars = {'**': ['about.html', 'navigation.html', 'searchbox.html']}
+html_css_files = ['custom.css']
+pygments_dark_style = 'github-dark'
+toc_object_entries_show_parents = 'hide'
 html_math_renderer = 'mathml'
 html_show_sourcelink = False
 html_copy_source = False

@@ -33,8 +33,14 @@ RECEIVES = {'user': User.RECEIVES, 'channel': Channel.RECEIVES, 'bs': BaseStatio
             'rhs_controller': RhsController.RECEIVES, 'positioner': Positioner.RECEIVES,
             'transmission': Transmission.RECEIVES}
 _COLUMN, _ROW, _TOP, _LEFT = 165, 24, 50, 70
-_STYLE = ('text{font:11px monospace;fill:#222}.role{font-weight:bold;font-size:13px}'
-          '.life{stroke:#aab;stroke-dasharray:4 4}path,circle{stroke:#567;fill:#567}')
+# The page includes the picture, so that its style must not match other pictures. The background is
+# that of the theme, light or dark.
+_STYLE = ('.sequence text{font:11px monospace;fill:currentColor}'
+          '.sequence .role{font-weight:bold;font-size:13px}'
+          '.sequence .life{stroke:currentColor;stroke-opacity:.4;stroke-dasharray:4 4}'
+          '.sequence path,.sequence circle{stroke:currentColor;fill:currentColor}'
+          '.sequence .label{paint-order:stroke;stroke-width:4px;'
+          'stroke:var(--color-background-primary,white)}')
 
 
 class _Centre:
@@ -112,8 +118,8 @@ def svg():
                       ['user' if run[0][1].direction is m.Direction.DOWNLINK else 'bs'])
         last = sender == list(RECEIVES)[-1]
         parts += _arrows(place[sender], [place[name] for name in recipients], y, label, last)
-    return (f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
-            f'viewBox="0 0 {width} {height}" role="img"><title>One cycle</title>'
+    return (f'<svg xmlns="http://www.w3.org/2000/svg" class="sequence" width="{width}" '
+            f'height="{height}" viewBox="0 0 {width} {height}" role="img"><title>One cycle</title>'
             f'<style>{_STYLE}</style>{"".join(parts)}</svg>')
 
 
@@ -135,6 +141,6 @@ def _arrows(begin, ends, y, label, last):
         parts.append(f'<path d="M{begin} {y} L{end} {y} l{tip} -4 l0 8 L{end} {y}"/>')
     right = not last and (not ends or max(ends) > begin)
     anchor, x = ('start', begin + 8) if right else ('end', begin - 8)
-    parts.append(f'<text x="{x}" y="{y - 5}" text-anchor="{anchor}" paint-order="stroke" '
-                 f'stroke="white" stroke-width="4">{html.escape(label)}</text>')
+    parts.append(f'<text class="label" x="{x}" y="{y - 5}" text-anchor="{anchor}">'
+                 f'{html.escape(label)}</text>')
     return parts

@@ -7,9 +7,14 @@ from typing import NamedTuple
 
 # Sizes of the picture [px].
 _BOX, _PORT, _GAP, _LANE, _LETTER = 150, 20, 30, 14, 6.8
+# Pages may be dark, so the picture has their colour of text. They include it, so that its style
+# must not match other pictures.
 _STYLE = (
-    'text{font:11px monospace;fill:#222}.state{font-weight:bold;font-size:13px}'
-    'rect{fill:#eef3fa;stroke:#345}path{fill:none;stroke:#567}.head{fill:#567;stroke:none}')
+    '.states text{font:11px monospace;fill:currentColor}'
+    '.states .state{font-weight:bold;font-size:13px}'
+    '.states rect{fill:currentColor;fill-opacity:.08;stroke:currentColor}'
+    '.states path{fill:none;stroke:currentColor;stroke-opacity:.6}'
+    '.states .head{fill:currentColor;fill-opacity:.8}')
 
 
 class Edge(NamedTuple):
@@ -61,8 +66,9 @@ def draw(name: str, states: Sequence[enum.Enum], edges: Sequence[Edge]) -> str:
         edge_x = left + (_BOX if side > 0 else 0)
         parts += _around(group, side, edge_x, label[side], _ports(states, group, tops), place)
     bottom = tops[states[-1]] + heights[states[-1]] + 10
-    return (f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{bottom}" '
-            f'viewBox="0 0 {width:.0f} {bottom}" role="img"><title>States of {name}</title>'
+    return (f'<svg xmlns="http://www.w3.org/2000/svg" class="states" width="{width:.0f}" '
+            f'height="{bottom}" viewBox="0 0 {width:.0f} {bottom}" role="img">'
+            f'<title>States of {name}</title>'
             f'<style>{_STYLE}</style>{"".join(parts)}</svg>')
 
 

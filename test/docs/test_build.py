@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip('sphinx', reason='Sphinx is not installed')
+for library in ('sphinx', 'furo'):
+    pytest.importorskip(library, reason=f'{library} is not installed')
 pytest.importorskip('rclpy', reason='the pages of the interfaces need ROS')
 
 from rhs_isac_ros.model import Scenario  # noqa: E402
@@ -57,6 +58,25 @@ def test_pages_load_nothing_from_other_sites(site):
         assert not [source for source in loaded if '//' in source], path
     for path in site.rglob('*.css'):
         assert not re.search(r'url\(["\']?https?:', path.read_text(encoding='utf-8')), path
+
+
+def test_pages_have_a_dark_mode_and_a_search(site):
+    text = page(site, 'index')
+    assert 'class="theme-toggle' in text
+    assert 'role="search"' in text
+    assert 'What this does not model' in (site / 'searchindex.js').read_text(encoding='utf-8')
+
+
+def test_diagrams_and_their_style_have_the_colour_of_the_text(site):
+    for picture in re.findall(r'<svg[^>]*class="(?:states|sequence)".*?</svg>',
+                              page(site, 'protocol'), re.DOTALL):
+        (name,) = re.findall(r'^<svg[^>]*class="(\w+)"', picture)
+        (style,) = re.findall(r'<style>(.*)</style>', picture)
+        colors = re.findall(r'(?:fill|stroke):([^;}]+)', style)
+        assert set(colors) <= {'currentColor', 'none', 'var(--color-background-primary,white)'}
+        # The page contains other pictures, which a style without a class would change.
+        assert all(rule.startswith(f'.{name} ') for rule in re.findall(
+            r'([^{},]+)(?=[^{}]*\{)', style))
 
 
 def test_formulas_are_mathml(site):
