@@ -56,7 +56,7 @@ setup(
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
             'pymoo', 'mcap', 'rich', 'rerun-sdk==0.22.1', 'pyarrow==25.0.0'],
-        'docs': ['sphinx', 'furo'],
+        'docs': ['sphinx', 'furo', 'myst-parser'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'rosbags'],
     },
     zip_safe=False,

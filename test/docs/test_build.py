@@ -1,6 +1,7 @@
 """The documentation builds without a warning and displays without a network."""
 
 import dataclasses
+import json
 import os
 import re
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-for library in ('sphinx', 'furo'):
+for library in ('sphinx', 'furo', 'myst_parser', 'matplotlib'):
     pytest.importorskip(library, reason=f'{library} is not installed')
 pytest.importorskip('rclpy', reason='the pages of the interfaces need ROS')
 
@@ -20,15 +21,17 @@ from rhs_isac_ros.ros import parameters, topics  # noqa: E402
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / 'docs'
 PAGES = sorted(path.stem for path in DOCS.glob('*.rst'))
+NOTEBOOKS = sorted(path.stem for path in (DOCS / 'notebooks').glob('*.md'))
 
 
 @pytest.fixture(scope='module')
-def site(tmp_path_factory):
+def site(tmp_path_factory, notebooks):
     """Folder of the pages, built as scripts/docs builds them."""
     folder = tmp_path_factory.mktemp('docs')
     done = subprocess.run(
         [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-E', '-q', '-b', 'html',
-         '-d', folder / 'doctrees', DOCS, folder / 'html'],
+         '-D', f'notebook_folder={notebooks[1]}', '-d', folder / 'doctrees', DOCS,
+         folder / 'html'],
         capture_output=True, text=True, timeout=240, check=False,
         # A proxy that does not exist: reading from the network fails.
         env={**os.environ, 'http_proxy': 'http://127.0.0.1:9', 'https_proxy': 'http://127.0.0.1:9',
@@ -77,6 +80,21 @@ def test_diagrams_and_their_style_have_the_colour_of_the_text(site):
         # The page contains other pictures, which a style without a class would change.
         assert all(rule.startswith(f'.{name} ') for rule in re.findall(
             r'([^{},]+)(?=[^{}]*\{)', style))
+
+
+@pytest.mark.parametrize('name', NOTEBOOKS)
+def test_notebooks_are_pages_with_their_outputs(site, notebooks, name):
+    text = page(site, f'notebooks/{name}')
+    cells = json.loads((site / 'notebooks' / f'{name}.ipynb').read_text(encoding='utf-8'))['cells']
+    outputs = [output for cell in cells for output in cell.get('outputs', ())]
+    pictures = re.findall(r'<img alt="([^"]+)"[^>]*src="\.\./(_images/[^"]+)"', text)
+    assert [alt for alt, _ in pictures] == [
+        output['metadata']['image/png']['alt'] for output in outputs
+        if output['output_type'] == 'display_data']
+    assert all((site / file).is_file() for _, file in pictures)
+    assert text.count('cell-output highlight') == sum(
+        output['output_type'] == 'stream' for output in outputs)
+    assert f'href="{name}.ipynb"' in text
 
 
 def test_formulas_are_mathml(site):
@@ -142,9 +160,10 @@ def test_the_installation_page_lists_every_extra():
         assert rows[name] in (', '.join(libraries), 'all of the above')
 
 
-@pytest.mark.parametrize('name', PAGES)
-def test_commands_on_the_pages_exist(name):
-    text = (DOCS / f'{name}.rst').read_text(encoding='utf-8')
+@pytest.mark.parametrize(
+    'path', [*DOCS.glob('*.rst'), *DOCS.glob('notebooks/*.md')], ids=lambda path: path.stem)
+def test_commands_on_the_pages_exist(path):
+    text = path.read_text(encoding='utf-8')
     for command in re.findall(r'scripts/([a-z.]+[a-z])', text):
         assert (ROOT / 'scripts' / command).is_file(), command
     for module in re.findall(r'python -m (rhs_isac_ros[\w.]*)', text):
@@ -158,7 +177,7 @@ def test_commands_on_the_pages_exist(name):
         assert (ROOT / 'scripts' / folder / f'{benchmark}.py').is_file(), benchmark
 
 
-@pytest.mark.parametrize('name', PAGES)
+@pytest.mark.parametrize('name', [*PAGES, *(f'notebooks/{name}' for name in NOTEBOOKS)])
 def test_every_page_is_in_the_table_of_contents(name):
     index = (DOCS / 'index.rst').read_text(encoding='utf-8')
     assert name == 'index' or re.search(rf'^   {name}$', index, re.MULTILINE)
