@@ -12,7 +12,7 @@ author = 'rhs_isac_ros authors'
 copyright = author
 version = release = __version__
 extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'myst_parser', 'generated', 'mathml',
-              'notebook_pages']
+              'notebook_pages', 'pictures']
 
 # The pages must display offline, so no fonts and no MathJax are loaded from other sites.
 html_theme = 'furo'

@@ -11,7 +11,6 @@ import base64
 import json
 import os
 import shutil
-import struct
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import run_notebook
 from docutils import nodes
+from pictures import image_node
 from sphinx.errors import ExtensionError
 from sphinx.util.docutils import SphinxDirective
 
@@ -75,15 +75,8 @@ class CodeCell(SphinxDirective):
 
     def _output(self, output, file):
         if output['output_type'] == 'display_data':
-            picture = base64.b64decode(output['data']['image/png'])
-            file.write_bytes(picture)
-            # The header of a PNG file contains its width [pixels].
-            (width,) = struct.unpack('>I', picture[16:20])
-            page = Path(self.env.doc2path(self.env.docname))
-            return nodes.image(
-                uri=Path(os.path.relpath(file, page.parent)).as_posix(),
-                alt=output['metadata']['image/png']['alt'],
-                width=f'{width * 96 // run_notebook.DPI}px', classes=['cell-output'])
+            file.write_bytes(base64.b64decode(output['data']['image/png']))
+            return image_node(self, file, output['metadata']['image/png']['alt'])
         text = ''.join(output.get('text') or output['data']['text/plain'])
         return nodes.literal_block(text, text, language='none', classes=['cell-output'])
 

@@ -70,6 +70,15 @@ def test_pages_have_a_dark_mode_and_a_search(site):
     assert 'What this does not model' in (site / 'searchindex.js').read_text(encoding='utf-8')
 
 
+@pytest.mark.parametrize(('name', 'words'), [
+    ('model', 'region of interest'), ('band_plans', 'Range ambiguity')])
+def test_pictures_are_drawn_with_a_description(site, name, words):
+    (picture,) = re.findall(r'<img alt="([^"]+)" class="drawn"[^>]*src="(_images/[^"]+)"',
+                            page(site, name))
+    assert words in picture[0]
+    assert (site / picture[1]).stat().st_size > 5000
+
+
 def test_diagrams_and_their_style_have_the_colour_of_the_text(site):
     for picture in re.findall(r'<svg[^>]*class="(?:states|sequence)".*?</svg>',
                               page(site, 'protocol'), re.DOTALL):
