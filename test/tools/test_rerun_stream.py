@@ -1,5 +1,8 @@
 """The entries of a view in a file of Rerun, read back with its own reader."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -133,6 +136,27 @@ def test_another_release_is_named_in_one_line(monkeypatch):
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
     with pytest.raises(OSError, match='missing'):
         RerunStream().save(tmp_path / 'missing' / 'view.rrd')
+
+
+def test_serving_does_not_block():
+    """Threads of Rerun free arrays, for which they wait for the global interpreter lock."""
+    program = (
+        'import socket\n'
+        'from rhs_isac_ros.tools.rerun_stream import RerunStream\n'
+        'for _ in range(20):\n'
+        '    while True:\n'
+        '        with socket.socket() as one, socket.socket() as two:\n'
+        '            one.bind(("", 0))\n'
+        '            port = one.getsockname()[1]\n'
+        '            try:\n'
+        '                two.bind(("", port + 1))\n'
+        '                break\n'
+        '            except OSError:\n'
+        '                pass\n'
+        '    stream = RerunStream()\n'
+        '    stream.serve(port)\n'
+        '    stream.close()\n')
+    subprocess.run([sys.executable, '-c', program], timeout=60, check=True)
 
 
 def test_a_discarded_file_leaves_nothing(tmp_path):
