@@ -8,19 +8,25 @@ from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.monitoring.entities import Entry, Number, Series
 from rhs_isac_ros.monitoring.scene_shapes import user_colour
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.newest import NewestDict
 
 # Title of each chart by the path that its series begin with.
 TITLES: Mapping[str, str] = {
     'error': 'Position error [m]',
     'capacity': 'Capacity [Mbit/s]',
-    'loss': 'Loss of capacity by the position error [%]',
+    'loss': 'Loss of capacity [%]',
     'latency': 'Latency [ms]',
-    'drops': 'Dropped messages and given-up cycles',
+    'drops': 'Drops and given-up cycles',
 }
+# Number of users and of nodes with a series of their own: a longer legend hides the chart.
+_MAX_SERIES = 8
+# Number of nodes whose messages are counted; their names come from messages.
+_MAX_NODES = 4096
 _MEGA = 1e6
 _MILLI = 1e-3
-_RED, _WHITE, _GREEN, _BLUE, _ORANGE = (
-    (0.95, 0.3, 0.3), (0.95, 0.95, 0.95), (0.35, 0.8, 0.4), (0.4, 0.6, 1.0), (1.0, 0.65, 0.2))
+_RED, _WHITE, _GREEN, _BLUE, _ORANGE, _GREY = (
+    (0.95, 0.3, 0.3), (0.95, 0.95, 0.95), (0.35, 0.8, 0.4), (0.4, 0.6, 1.0), (1.0, 0.65, 0.2),
+    (0.6, 0.6, 0.6))
 _PHASE_COLOURS = dict(zip(m.Phase, (_BLUE, _GREEN, _ORANGE, _RED), strict=True))
 
 
@@ -46,7 +52,10 @@ class Charts:
         self._styles: dict[str, Series] = {}
         self._square_m2 = 0.0
         self._n_fixes = self._n_given_up = 0
-        self._n_dropped: dict[str, int] = {}
+        self._n_dropped: NewestDict[str, int] = NewestDict(_MAX_NODES)
+        # Users and nodes with a series of their own.
+        self._users: set[int] = set()
+        self._nodes: set[str] = set()
 
     def add(self, cycle: int, samples: Iterator[Sample]) -> list[Entry]:
         """Return samples as entries of a cycle; the first of a series comes with its style.
@@ -64,11 +73,16 @@ class Charts:
         return entries
 
     def dropped(self, node: str, count: int) -> Iterator[Sample]:
-        """Yield the number of messages that a node dropped since its start, and that of all."""
-        self._n_dropped[node] = count
+        """Yield the number of messages that a node dropped since its start, and that of all.
+
+        Only the first eight nodes that dropped a message have a series of their own.
+        """
+        self._n_dropped.put(node, count)
         yield Sample('drops/all', sum(self._n_dropped.values()), Series('all nodes', _WHITE))
         name = node.rpartition('/')[2]
-        if count or f'drops/{name}' in self._styles:
+        if count and len(self._nodes) < _MAX_SERIES:
+            self._nodes.add(name)
+        if name in self._nodes:
             # Python's hash of a string differs between processes.
             yield Sample(f'drops/{name}', count, Series(name, user_colour(sum(name.encode()))))
 
@@ -77,18 +91,27 @@ class Charts:
         self._n_given_up += 1
         yield Sample('drops/given_up', self._n_given_up, Series('cycles given up', _RED))
 
-    def of_cycle(self, cycle: CompleteCycle, with_user: bool = True) -> Iterator[Sample]:
-        """Yield the samples of a complete cycle, with the series of its user if `with_user`."""
-        if with_user:
+    def of_cycle(self, cycle: CompleteCycle) -> Iterator[Sample]:
+        """Yield the samples of a complete cycle.
+
+        Only the first eight users have a series of their own; the others share one.
+        """
+        if len(self._users) < _MAX_SERIES:
+            self._users.add(cycle.user)
+        if cycle.user in self._users:
             yield Sample(f'error/user_{cycle.user}', cycle.error_m,
                          Series(f'user {cycle.user}', user_colour(cycle.user), dots=True))
+        else:
+            yield Sample('error/others', cycle.error_m, Series('other users', _GREY, dots=True))
         yield from self._errors(cycle)
         capacity = cycle.capacity
+        # A small loss would hide one of two lines behind the other, so the actual values are dots.
         for name, value, colour in (
                 ('perfect', capacity.perfect_bps, _WHITE),
                 ('actual', capacity.actual_bps, _GREEN),
                 ('expected', capacity.expected_bps, _BLUE)):
-            yield Sample(f'capacity/{name}', value / _MEGA, Series(name, colour))
+            yield Sample(f'capacity/{name}', value / _MEGA,
+                         Series(name, colour, dots=name == 'actual'))
         yield Sample('loss/percent', capacity.loss_percent, Series('loss', _ORANGE, dots=True))
         for phase, duration_s in cycle.durations_s().items():
             name = phase.name.lower()

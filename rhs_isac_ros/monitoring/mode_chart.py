@@ -13,8 +13,8 @@ from rhs_isac_ros.positioning.weighted_modes import WeightedModes
 # Half the width of the chart, the distance of its labels, and the height of the probability 1 [m].
 REACH_M = 3.0
 _STEP_M = 0.6
-HEIGHT_M = 1.5
-_LABEL_OFFSET_M = 0.12
+HEIGHT_M = 3.0
+_LABEL_OFFSET_M = 0.2
 _GRID_LEVELS = (0.25, 0.5, 0.75, 1.0)
 _GREY = (0.3, 0.3, 0.3)
 _WHITE = (1.0, 1.0, 1.0)
@@ -29,7 +29,7 @@ def axes() -> tuple[Lines, Points]:
     grid = [_line(place, HEIGHT_M) for place in places]
     grid += [np.array([[-REACH_M, -level * HEIGHT_M], [REACH_M, -level * HEIGHT_M]])
              for level in (0.0, *_GRID_LEVELS)]
-    labels = [*((place, _LABEL_OFFSET_M, f'{place:+.1f} m') for place in places[1:-1:2]),
+    labels = [*((place, _LABEL_OFFSET_M, f'{place:+.1f}') for place in places[1:-1:2]),
               *((-REACH_M, -level * HEIGHT_M, f'{level:.0%}') for level in _GRID_LEVELS)]
     return (Lines(tuple(grid), _GREY, _GRID_WIDTH),
             Points(np.array([label[:2] for label in labels]), np.full((len(labels), 3), 0.7),

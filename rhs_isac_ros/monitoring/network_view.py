@@ -28,7 +28,7 @@ MODES = 'modes'
 POSITIONING = 'surface/positioning'
 TRANSMISSION = 'surface/transmission'
 LOG = 'log'
-# Further users are in the charts of all users only, because the ids come from messages.
+# Further users are in the charts only, because the ids come from messages.
 _MAX_USERS = 64
 # Number of latest cycles whose messages may still arrive.
 _MAX_CYCLES = 64
@@ -138,7 +138,9 @@ class NetworkView:
                 yield f'{WORLD}/beam', scene.lobe(self._scenario, message)
             case m.GroundTruth():
                 path = self._path(message.user)
-                yield f'{path}/truth', scene.truth(message)
+                ball, name = scene.truth(message)
+                yield f'{path}/truth', ball
+                yield f'{path}/name', name
                 if message.cycle_id:
                     self._origins.put(message.cycle_id, message.position)
                 yield f'{path}/true_path', scene.path(
@@ -162,18 +164,17 @@ class NetworkView:
         entries: list[Entry] = []
         for record in self._log.given_up:
             cycle = self._count(record.cycle_id)
-            user = f', user {record.user}' if record.user else ''
+            user = f'user {record.user}: ' if record.user else ''
             entries.append(Entry(cycle, LOG, Text(
-                f'cycle {record.cycle_id}{user}: {record.outcome}', warning=True)))
+                f'{user}{record.outcome} (cycle {record.cycle_id})', warning=True)))
             entries += self._charts.add(cycle, self._charts.given_up())
         for complete in self._log.complete:
             cycle = self._count(complete.cycle_id)
             entries.append(Entry(cycle, LOG, Text(
-                f'cycle {complete.cycle_id}, user {complete.user}: '
-                f'error {complete.error_m:.2f} m, '
-                f'loss of capacity {complete.capacity.loss_percent:.1f} %')))
-            entries += self._charts.add(
-                cycle, self._charts.of_cycle(complete, self._shows(complete.user)))
+                f'user {complete.user}: error {complete.error_m:.2f} m, '
+                f'loss {complete.capacity.loss_percent:.1f} % '
+                f'(cycle {complete.cycle_id})')))
+            entries += self._charts.add(cycle, self._charts.of_cycle(complete))
         self.n_ended += len(self._log.given_up) + len(self._log.complete)
         self._log.clear()
         return entries

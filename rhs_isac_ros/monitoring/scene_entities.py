@@ -14,17 +14,25 @@ from rhs_isac_ros.positioning.weighted_modes import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 
 _GREY = (0.5, 0.5, 0.5)
-_TRUTH_RADIUS_M = 0.12
-_ESTIMATE_RADIUS_M = 0.06
+_TRUTH_RADIUS_M = 0.18
+_ESTIMATE_RADIUS_M = 0.12
 # The volume of the ball of a mode is proportional to its probability.
-_MODE_RADIUS_M = 0.16
+_MODE_RADIUS_M = 0.2
 # Modes of a smaller probability are not shown.
 _MIN_PROBABILITY = 0.005
 _THIN, _THICK = 0.6, 2.0
 # Brightness of the beam and of the true paths, behind which other entities remain visible.
 _DIM = 0.45
+# Height of the name above the user; a name on the user hides the estimate.
+_NAME_HEIGHT_M = 1.0
+# Edge of the surface relative to the distance of the region: at its true size, elements would be
+# smaller than a pixel.
+_BOARD_SIZE = 0.2
+# Every line of a lobe of this step is shown; more hide what is behind.
+_LOBE_STEP = 2
 # Thinner bodies are invisible.
 _MIN_HALF_SIZE_M = 1e-3
+_INVISIBLE_M = 1e-3
 _MAX_GREY = 255
 
 
@@ -37,14 +45,18 @@ def region(scenario: Scenario) -> Boxes:
 def board(scenario: Scenario, configuration: np.ndarray) -> Boxes:
     """Return the surface as one plate for each element, from dark for 0 to bright for 1.
 
+    It is enlarged about its centre, so that single elements are visible from a distance at which
+    the whole region is.
+
     Parameters
     ----------
     configuration
         Applied configuration, float64 [F, N_E] in [0, 1], of which the mean over the frames is
         shown.
     """
-    positions = element_positions(scenario)
-    half_m = 0.45 * element_interval_m(scenario)
+    interval_m = _BOARD_SIZE * math.hypot(*scenario.roi_center_m) / scenario.elements_per_side
+    positions = interval_m / element_interval_m(scenario) * element_positions(scenario)
+    half_m = 0.45 * interval_m
     half_sizes = np.tile([_MIN_HALF_SIZE_M, half_m, half_m], (len(positions), 1))
     level = np.mean(configuration, axis=0)
     return Boxes(positions, half_sizes, np.stack([level, level, 0.3 + 0.2 * level], axis=1),
@@ -68,10 +80,12 @@ def configurations(bands: Iterable[np.ndarray]) -> Picture:
     return Picture(np.vstack(rows)[:-1, :-1])
 
 
-def truth(message: m.GroundTruth) -> Points:
-    """Return the true position of a user as a ball in the colour of the user."""
-    return Points(message.position[None], np.array([user_colour(message.user)]),
-                  np.array([_TRUTH_RADIUS_M]), (f'user {message.user}',))
+def truth(message: m.GroundTruth) -> tuple[Points, Points]:
+    """Return the true position of a user as a ball in its colour, and its name above the ball."""
+    colour = np.array([user_colour(message.user)])
+    name = message.position[None] + np.array([0.0, 0.0, _NAME_HEIGHT_M])
+    return (Points(message.position[None], colour, np.array([_TRUTH_RADIUS_M])),
+            Points(name, colour, np.array([_INVISIBLE_M]), (f'user {message.user}',)))
 
 
 def estimate(message: m.PositionEstimate) -> tuple[Points, Ellipsoids]:
@@ -125,7 +139,7 @@ def lobe(scenario: Scenario, message: m.Beam) -> Lines:
     points = lobe_m(beam_pattern(
         scenario, Beam(message.analog, message.digital, message.band),
         math.hypot(*scenario.roi_center_m)))
-    strips = [*points, *np.swapaxes(points, 0, 1)]
+    strips = [*points[::_LOBE_STEP], *np.swapaxes(points, 0, 1)[::_LOBE_STEP]]
     # Most lines have no extent.
     return Lines(tuple(strip for strip in strips if strip.any()), _dim(message.user), _THIN)
 

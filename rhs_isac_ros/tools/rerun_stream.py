@@ -119,27 +119,30 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
     import rerun.blueprint as rrb
 
     scene = rrb.Spatial3DView(
-        origin=network_view.WORLD, name='Scene', background=_BACKGROUND)
+        origin=network_view.WORLD, name='Scene (surface enlarged)', background=_BACKGROUND)
     reach, height = mode_chart.REACH_M, mode_chart.HEIGHT_M
     modes = rrb.Spatial2DView(
         origin=network_view.MODES, background=_BACKGROUND,
-        name='Modes of the posterior: probability over the error of the range; white: estimate',
+        name='Modes: probability over range error [m]',
         visual_bounds=rrb.VisualBounds2D(
-            x_range=[-1.1 * reach, 1.1 * reach], y_range=[-1.1 * height, 0.2 * height]))
+            x_range=[-1.25 * reach, 1.1 * reach], y_range=[-1.1 * height, 0.2 * height]))
     positioning = rrb.Spatial2DView(
-        origin=network_view.POSITIONING, name='Surface: positioning')
+        origin=network_view.POSITIONING, name='Surface: pilots')
     transmission = rrb.Spatial2DView(
         origin=network_view.TRANSMISSION, name='Surface: data')
+    # New values appear on the right, where a legend would hide them; a single series needs none.
     error, *others = (
-        rrb.TimeSeriesView(origin=path, name=title, plot_legend=rrb.Corner2D.RightTop)
+        rrb.TimeSeriesView(origin=path, name=title, plot_legend=rrb.PlotLegend(
+            rrb.Corner2D.LeftTop, visible=path != 'loss'))
         for path, title in charts.TITLES.items())
     log = rrb.TextLogView(origin=network_view.LOG, name='Cycles')
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(scene, modes, row_shares=[5, 3]),
-            rrb.Vertical(error, rrb.Grid(*others, grid_columns=2),
-                         rrb.Horizontal(positioning, transmission, log, column_shares=[4, 2, 5]),
-                         row_shares=[3, 5, 2]),
+            rrb.Vertical(scene, rrb.Horizontal(
+                modes, rrb.Vertical(positioning, transmission), column_shares=[3, 2]),
+                row_shares=[5, 3]),
+            # The log is wide, because its text is in the last of six columns.
+            rrb.Vertical(error, rrb.Grid(*others, grid_columns=2), log, row_shares=[4, 6, 3]),
             column_shares=[1, 1]),
         rrb.TimePanel(state='collapsed'), rrb.SelectionPanel(state='hidden'),
         rrb.BlueprintPanel(state='hidden'))

@@ -1,5 +1,6 @@
 """The view of a network in memory: what it shows, on which path, and from which cycle on."""
 
+import re
 import types
 
 import numpy as np
@@ -44,7 +45,7 @@ def test_cycles_are_counted_from_one(watched):
     logged = on(watched.entries, network_view.LOG)
     assert [cycle for cycle, _ in logged] == list(range(1, N_CYCLES + 1))
     for (_, text), cycle_id in zip(logged, ids, strict=True):
-        assert text.text.startswith(f'cycle {cycle_id}, user ')
+        assert re.fullmatch(rf'user [12]: error .* \(cycle {cycle_id}\)', text.text)
 
 
 def test_truth_and_estimate_are_those_of_the_messages(watched):
@@ -62,7 +63,8 @@ def test_the_board_shows_each_configuration(watched, scenario):
     shown = on(watched.entries, f'{network_view.WORLD}/board')
     assert len(shown) == len(sent)
     for (_, board), message in zip(shown, sent, strict=True):
-        assert board.centres == pytest.approx(element_positions(scenario))
+        assert board.centres / board.centres.max() == pytest.approx(
+            element_positions(scenario) / element_positions(scenario).max())
         assert board.colours[:, 0] == pytest.approx(message.analog.mean(axis=0))
     side = scenario.elements_per_side
     (_, picture), *_ = on(watched.entries, network_view.TRANSMISSION)
@@ -172,9 +174,25 @@ def test_dropped_messages_are_shown_for_all_nodes_and_for_those_with_any(scenari
     assert values == {'drops/bs': 4, 'drops/all': 4}
 
 
-def test_cycles_of_further_users_are_in_the_charts_of_all_users(
-        watched, scenario, monkeypatch):
+def test_few_nodes_that_drop_messages_have_a_series_of_their_own(scenario):
+    view = NetworkView(scenario)
+    entries = [entry for number in range(20) for entry in view.add_report(
+        f'node_{number}', Report(True, '', {'dropped.duplicate': '1'}))]
+    series = [entry.path for entry in entries if isinstance(entry.entity, Series)]
+    assert series == ['drops/all', *(f'drops/node_{number}' for number in range(8))]
+    assert on(entries, 'drops/all')[-1][1].value == 20
+
+
+def test_the_name_of_a_user_is_above_the_user(watched):
+    ((_, ball), *_), ((_, name), *_) = (
+        on(watched.entries, f'{network_view.WORLD}/user_1/{part}') for part in ('truth', 'name'))
+    assert (ball.labels, name.labels) == ((), ('user 1',))
+    assert (name.positions - ball.positions)[0] == pytest.approx([0, 0, 1])
+
+
+def test_cycles_of_further_users_are_in_the_charts(watched, scenario, monkeypatch):
     monkeypatch.setattr(network_view, '_MAX_USERS', 1)
+    monkeypatch.setattr(charts, '_MAX_SERIES', 1)
     view = NetworkView(scenario)
     entries = [entry for sent in messages_of(watched.run)
                for entry in view.add(sent.message, sent.time_s)]
@@ -182,6 +200,9 @@ def test_cycles_of_further_users_are_in_the_charts_of_all_users(
     assert len([entity for _, entity in on(entries, 'error/root_mean_square')
                 if isinstance(entity, Number)]) == N_CYCLES
     assert {path for _, path, _ in entries if path.startswith('error/user_')} == {'error/user_1'}
+    assert len([entity for _, entity in on(entries, 'error/others')
+                if isinstance(entity, Number)]) == N_CYCLES / 2
+    assert not any(path.startswith(f'{network_view.WORLD}/user_2') for _, path, _ in entries)
 
 
 def test_the_number_of_users_is_bounded(scenario):
