@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
 # Messages that the scene state needs.
 RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.GroundTruths, m.PositionEstimate, m.Beam)
@@ -79,7 +80,8 @@ class SceneState:
     beam
         Latest beam of a transmission; None before the first.
     users
-        Users by id.
+        Users by id, at most `MAX_USERS`, because the ids come from messages. Further users are
+        ignored until others are discarded.
     """
 
     def __init__(self) -> None:
@@ -96,15 +98,25 @@ class SceneState:
             case m.Beam():
                 self.beam, self._beam_s = message, now_s
             case m.GroundTruth():
-                self._updated_user(message.user, now_s).add_truth(message)
+                self._add_truth(message, now_s)
             case m.GroundTruths():
                 for truth in message.each():
-                    self._updated_user(truth.user, now_s).add_truth(truth)
+                    self._add_truth(truth, now_s)
             case m.PositionEstimate():
-                self._updated_user(message.user, now_s).add_estimate(message)
+                if state := self._updated_user(message.user, now_s):
+                    state.add_estimate(message)
 
-    def _updated_user(self, user: int, now_s: float) -> UserState:
-        state = self.users.setdefault(user, UserState(user, now_s))
+    def _add_truth(self, truth: m.GroundTruth, now_s: float) -> None:
+        if state := self._updated_user(truth.user, now_s):
+            state.add_truth(truth)
+
+    def _updated_user(self, user: int, now_s: float) -> UserState | None:
+        """Return the state of a user; None if it is new and there are too many."""
+        state = self.users.get(user)
+        if state is None:
+            if len(self.users) >= MAX_USERS:
+                return None
+            state = self.users[user] = UserState(user, now_s)
         state.updated_s = now_s
         return state
 
@@ -121,13 +133,19 @@ class SceneState:
         return stale
 
     @property
-    def complete(self) -> bool:
-        """Whether the surface, the users and the beam of a known estimate are known.
+    def drawable(self) -> bool:
+        """Whether the surface, an estimate and its beam are known."""
+        return self.configuration is not None and self.shown_beam is not None
 
-        Every user has an estimate.
-        """
-        return (self.configuration is not None and self.shown_beam is not None
-                and all(state.estimate for state in self.users.values()))
+    @property
+    def complete(self) -> bool:
+        """Whether the scene is drawable and every user has an estimate."""
+        return self.drawable and not self.without_estimate
+
+    @property
+    def without_estimate(self) -> list[int]:
+        """Ids of the users without an estimate, sorted."""
+        return sorted(user for user, state in self.users.items() if not state.estimate)
 
     @property
     def shown_user(self) -> UserState | None:

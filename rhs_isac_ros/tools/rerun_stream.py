@@ -76,8 +76,8 @@ class RerunStream:
 
     def serve(self, port: int, open_browser: bool = False) -> str:
         """Serve the viewer on a port and the data on the next one; return the address."""
-        # Without the layout: serve_web would wait for the thread that sends it, and hold the global
-        # interpreter lock, which that thread needs to free the arrays of the layout.
+        # Without the layout: serve_web would wait for the thread that sends it, and hold the
+        # global interpreter lock, which that thread needs to free the arrays of the layout.
         self._rerun.serve_web(
             open_browser=open_browser, web_port=port, ws_port=port + 1, recording=self._stream)
         self._rerun.send_blueprint(blueprint(), recording=self._stream)

@@ -47,20 +47,29 @@ class SnapshotNode(Node):
         self.scene = SceneState()
         self.mismatch = ''
         self._began_s: float | None = None
+        self._drawable_s: float | None = None
         subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()
         self._began_s = self._began_s or now_s
         self.scene.add(message, now_s)
+        if self._drawable_s is None and self.scene.drawable:
+            self._drawable_s = now_s
 
     def _on_mismatch(self, error: m.MessageError) -> None:
         self.mismatch = str(error)
 
-    @property
-    def complete(self) -> bool:
-        """Whether the scene is complete and every user had time to report."""
-        return self.scene.complete and self._receiving_for(_REPORT_PERIOD_S)
+    def is_ready(self, wait_s: float) -> bool:
+        """Return whether to draw the scene, after every user had time to report.
+
+        It is complete, or it has been drawable for a time [s] although users lack an estimate.
+        """
+        if not self._receiving_for(_REPORT_PERIOD_S):
+            return False
+        return self.scene.complete or (
+            self._drawable_s is not None and self.scene.drawable
+            and time.monotonic() > self._drawable_s + wait_s)
 
     @property
     def has_other_scenario(self) -> bool:
@@ -73,7 +82,7 @@ class SnapshotNode(Node):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the scene when it is complete, or after a timeout as far as it is known.
+    """Draw the scene when it is complete, or after some time as far as it is known.
 
     Parameters
     ----------
@@ -103,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return nodes
 
     def done() -> bool:
-        return (nodes[0].complete or nodes[0].has_other_scenario
+        return (nodes[0].is_ready(options.wait) or nodes[0].has_other_scenario
                 or time.monotonic() > end_s)
     code = run(create, [_PROGRAM, *arguments], done)
     if not nodes or not done():
@@ -113,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def write_picture(
         scene: SceneState, mismatch: str, scenario: Scenario, options: argparse.Namespace) -> int:
-    """Draw a scene, or print why there is nothing to draw.
+    """Draw a scene and print what it lacks, or print why there is nothing to draw.
 
     Parameters
     ----------
@@ -135,10 +144,9 @@ def write_picture(
         print_error(f'no user found within {options.timeout:g} s, in the domain '
                     f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace', _PROGRAM)
         return 1
-    missing = sorted(user for user, state in scene.users.items() if not state.estimate)
+    missing = _missing(scene)
     if missing:
-        print(f'no estimate of user {join_users(missing)} within {options.timeout:g} s',
-              file=sys.stderr)
+        print(f'{_PROGRAM}: not in the picture: {"; ".join(missing)}', file=sys.stderr)
     try:
         draw(scene, scenario, options.output)
     except OSError as error:
@@ -148,14 +156,32 @@ def write_picture(
     return 0
 
 
+def _missing(scene: SceneState) -> list[str]:
+    """Describe each part that a scene lacks."""
+    parts = []
+    if scene.configuration is None:
+        parts.append('the configuration of the surface')
+    if scene.shown_beam is None:
+        parts.append('a data beam')
+    users = scene.without_estimate
+    if users:
+        parts.append(f'estimates of {len(users)} of {len(scene.users)} users: {join_users(users)}')
+    return parts
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog=_PROGRAM, description='Draw the scene of a network when every user has an '
-        'estimate. ROS arguments select the namespace: --ros-args -r __ns:=/lab')
+        'estimate, or some seconds after the first one. ROS arguments select the namespace: '
+        '--ros-args -r __ns:=/lab')
     parser.add_argument('--output', type=picture_file, default='scene.png', metavar='FILE',
                         help='picture to write: PNG, PDF or SVG (default: scene.png)')
+    parser.add_argument('--wait', type=nonnegative_float, default=5.0, metavar='S',
+                        help='wait for the estimates of further users after the first one '
+                        '(default: 5 s)')
     parser.add_argument('--timeout', type=nonnegative_float, default=30.0, metavar='S',
-                        help='draw an incomplete scene after this time (default: 30 s)')
+                        help='maximum wait in all; the scene is then drawn as far as it is known '
+                        '(default: 30 s)')
     parser.add_argument('--config', type=input_file, metavar='FILE',
                         help="scenario file of the network; by default the paper's Table I")
     return parser

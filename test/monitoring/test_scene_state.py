@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from rhs_isac_ros.monitoring import scene_state
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
 
@@ -33,8 +34,10 @@ def test_the_scene_is_complete_once_every_user_has_an_estimate():
                     truth(1, [9, 0, 0]), truth(2, [8, 0, 0]), estimate(1, [9, 1, 0], 1)):
         scene.add(message, 1.0)
         assert not scene.complete
+    assert not scene.drawable
     scene.add(beam(1), 1.0)
-    assert not scene.complete
+    assert scene.drawable and not scene.complete
+    assert scene.without_estimate == [2]
     scene.add(estimate(2, [8, 1, 0], 2), 1.0)
     assert scene.complete
     # User and beam belong to the same cycle, although the other user has a later estimate.
@@ -57,6 +60,22 @@ def test_the_messages_of_a_network_complete_it(network):
     assert scene.shown_user.estimate.cycle_id == 3
     assert len(scene.users[1].estimated_path) == 3
     assert scene.beam.cycle_id == 3
+
+
+def test_the_number_of_users_is_bounded(monkeypatch):
+    monkeypatch.setattr(scene_state, 'MAX_USERS', 2)
+    scene = SceneState()
+    scene.add(m.GroundTruths(
+        cycle_id=0, users=np.arange(1, 4), position=np.ones((3, 3)), velocity=np.zeros((3, 3))),
+        1.0)
+    for message in (truth(4, [9, 0, 0]), estimate(5, [9, 0, 0], 1), estimate(1, [9, 0, 0], 1)):
+        scene.add(message, 2.0)
+    assert list(scene.users) == [1, 2]
+    assert scene.users[1].estimate
+    # The place of a user that has left is free for another.
+    assert scene.discard_stale(1.5) == [2]
+    scene.add(truth(4, [9, 0, 0]), 2.0)
+    assert list(scene.users) == [1, 4]
 
 
 def test_an_error_needs_the_true_position_of_its_cycle():

@@ -11,7 +11,7 @@ import pytest
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.scene_state import SceneState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.tools.snapshot import write_picture
+from rhs_isac_ros.tools.snapshot import SnapshotNode, write_picture
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / 'scripts' / 'snapshot'
@@ -59,4 +59,20 @@ def test_of_many_users_without_an_estimate_few_are_named(tmp_path, capsys):
     options = SimpleNamespace(timeout=1.0, output=tmp_path / 'now.png')
     assert write_picture(scene, '', Scenario(), options) == 0
     assert capsys.readouterr().err == (
-        'no estimate of user 1, 2, 3, 4, 5, 6, 7, 8 and 12 others within 1 s\n')
+        'snapshot: not in the picture: the configuration of the surface; a data beam; '
+        'estimates of 20 of 20 users: 1, 2, 3, 4, 5, 6, 7, 8 and 12 others\n')
+
+
+def test_it_does_not_wait_for_all_users_of_a_large_network(shared_session):
+    """An absent user, whose true position is known, never has an estimate."""
+    node = SnapshotNode(Scenario.from_yaml(ROOT / 'config' / 'quick.yaml'))
+    node.scene.add(m.GroundTruth(
+        cycle_id=0, user=99, position=np.array([9.0, 1.0, 0.3]), velocity=np.zeros(3)), 0.0)
+    shared_session._executor.add_node(node)
+    try:
+        assert shared_session.spin_until(lambda: node.is_ready(0.2), 60)
+        assert 99 in node.scene.without_estimate
+        assert not node.is_ready(1e6)
+    finally:
+        shared_session._executor.remove_node(node)
+        node.destroy_node()
