@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rhs_isac_ros.codebook.search import Search
+from rhs_isac_ros.model.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -36,6 +37,8 @@ def run_lbfgs(
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
 
+    # SciPy multiplies the corrections with a BLAS of its own.
+    one_blas_thread.find_libraries()
     return minimize(
         objective, start, jac=True, method='L-BFGS-B', bounds=bounds,
         callback=lambda _: on_step(),

@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import (
@@ -22,7 +23,7 @@ from rhs_isac_ros.codebook import (
 )
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, threads
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 STEPS = 30
@@ -132,6 +133,25 @@ def test_every_method_lowers_every_objective(scenario, positions, method, object
     assert made.value_m2 == result.history[-1].value_m2
     exact = crlb(scenario, result.codebook, positions).mean()
     assert result.codebook.average_crlb_m2 == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize('method', ['alternating', 'direct', 'lbfgs'])
+def test_methods_of_scipy_run_its_blas_with_one_thread(
+        scenario, positions, method, monkeypatch):
+    seen = []
+
+    def record(_):
+        libraries = ThreadpoolController().select(user_api='blas').lib_controllers
+        seen.append({library.get_num_threads() for library in libraries})
+
+    # A process that has not imported SciPy yet.
+    for name in ('_shared', '_per_thread'):
+        monkeypatch.setattr(threads.one_blas_thread, name, [])
+    with threadpool_limits(3, user_api='blas'):
+        for library in ThreadpoolController().select(user_api='blas').lib_controllers:
+            getattr(library, 'clear_controlling_thread', lambda: None)()
+        optimize(scenario, positions, method, seed=3, max_steps=2, progress=record)
+    assert seen[-1] == {1}
 
 
 @pytest.mark.parametrize('method', SEARCHING)
