@@ -59,24 +59,33 @@ class ElementSums:
         # T_i times 1 and the coordinates of the element [m], complex128 [N_B, N_SB, N_E, G F].
         self._moments = moments.reshape(*self._frames.shape[:3], -1)
 
-    def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the mean, [N, N_B, N_SB F], and its derivative, [N, 3, N_B, N_SB F] [1/m]."""
+    def terms(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the mean and the terms of its derivative, complex128 [N_B, N, 1 + G, N_SB F].
+
+        The first row is the mean; `weights` multiply the others.
+        """
         n, (n_bands, n_subbands, _, n_frames) = len(positions), self._frames.shape
-        mean = np.empty((n, n_bands, n_subbands, n_frames), complex)
-        jacobian = np.empty((n, 3, n_bands, n_subbands, n_frames), complex)
+        n_terms = 2 + len(self._axes) + self._has_pattern
+        terms = np.empty((n_bands, n, n_terms, n_subbands, n_frames), complex)
         gains = self._gains_with_pattern if self._has_pattern else self._gains
         for band, (gain, radial, boresight_term) in enumerate(gains(positions)):
-            frames = self._frames[band]
-            mean[:, band] = np.matmul(gain, frames).transpose(1, 0, 2)
-            sums = np.matmul(radial, self._moments[band]).reshape(n_subbands, n, -1, n_frames)
-            sums = sums.transpose(2, 1, 0, 3)
-            for axis in range(3):
-                np.multiply(positions[:, axis, None, None], sums[0], out=jacobian[:, axis, band])
-            for moment, coordinate in enumerate(self._axes, start=1):
-                jacobian[:, coordinate, band] -= sums[moment]
-            if boresight_term is not None:
-                jacobian[:, 0, band] += np.matmul(boresight_term, frames).transpose(1, 0, 2)
-        return mean.reshape(n, n_bands, -1), jacobian.reshape(n, 3, n_bands, -1)
+            frames, rows = self._frames[band], np.moveaxis(terms[band], 2, 0)
+            rows[:, :, 0] = np.matmul(gain, frames)
+            sums = np.matmul(radial, self._moments[band])
+            rows[:, :, 1:2 + len(self._axes)] = sums.reshape(n_subbands, n, -1, n_frames)
+            if self._has_pattern:
+                rows[:, :, -1] = (
+                    0 if boresight_term is None else np.matmul(boresight_term, frames))
+        return terms.reshape(n_bands, n, n_terms, -1)
+
+    def weights(self, positions: np.ndarray) -> np.ndarray:
+        """Compute the weights of the terms for each coordinate's derivative, float64 [N, 3, G]."""
+        weights = np.zeros((len(positions), 3, 1 + len(self._axes) + self._has_pattern))
+        weights[:, :, 0] = positions
+        weights[:, self._axes, 1 + np.arange(len(self._axes))] = -1
+        if self._has_pattern:
+            weights[:, 0, -1] = 1
+        return weights
 
     def _gains(self, positions: np.ndarray) -> Iterator[_Terms]:
         """Yield `los_derivative_terms` of each band over the constant part, sub-bands first."""

@@ -195,18 +195,39 @@ class MeasurementModel:
         map_blocks(fill, range(0, len(positions), _BLOCK))
         return jacobian
 
-    def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute `mean` and `jacobian` together, much faster, but with different rounding."""
-        positions = checked_positions(positions)
-        mean = np.empty((len(positions), *self.shape), complex)
-        jacobian = np.empty((len(positions), 3, *self.shape), complex)
-        weights = self._weights
+    def mean_and_jacobian(
+            self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
+            whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Compute `mean` and `jacobian` together, much faster, but with different rounding.
+
+        Parameters
+        ----------
+        by_coordinate
+            Derivatives of the positions with respect to other coordinates, float64 [N, 3, Q],
+            for the derivatives of the mean with respect to these, [N, Q, N_B, N_SB F].
+        whitened
+            Whether to `whiten` both.
+        """
+        positions, weights = checked_positions(positions), self._weights
+        n, (n_bands, n_rows) = len(positions), self.shape
+        by_term = weights.weights(positions)
+        if by_coordinate is not None:
+            by_term = np.matmul(np.swapaxes(by_coordinate, 1, 2), by_term)
+        mean = np.empty((n, n_bands, n_rows), complex)
+        jacobian = np.empty((n, by_term.shape[1], n_bands, n_rows), complex)
 
         def fill(start: int) -> None:
             block = slice(start, start + weights.block)
-            mean[block], jacobian[block] = weights.mean_and_jacobian(positions[block])
+            terms = weights.terms(positions[block])
+            if whitened:
+                shape = terms.shape
+                terms = np.matmul(terms.reshape(n_bands, -1, n_rows),
+                                  np.swapaxes(self.whitener, 1, 2)).reshape(shape)
+            mean[block] = np.swapaxes(terms[:, :, 0], 0, 1)
+            parts = np.matmul(by_term[block], terms[:, :, 1:].view(float))
+            jacobian[block] = np.moveaxis(parts.view(complex), 0, 2)
 
-        map_blocks(fill, range(0, len(positions), weights.block))
+        map_blocks(fill, range(0, n, weights.block))
         return mean, jacobian
 
     @one_blas_thread

@@ -8,7 +8,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.modes import Modes
-from rhs_isac_ros.positioning.samples import Samples
+from rhs_isac_ros.positioning.samples import WeightedSamples
 from rhs_isac_ros.positioning.search import SearchEstimator
 
 
@@ -30,17 +30,14 @@ class BayesEstimator(SearchEstimator):
                          surface=surface)
         self._prior_covariance = np.diag((self._bounds[1] - self._bounds[0])**2 / 12)
 
-    def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-        positions, log_weights, factors = samples
-        weights = np.exp(log_weights - log_weights.max())
-        weights /= weights.sum()
-        flat = weights.reshape(-1)
-        mean = flat @ positions.reshape(-1, 3)
-        offsets = (positions - mean).reshape(-1, 3)
-        covariance = (flat[:, None] * offsets).T @ offsets
+    def _moments(
+            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+        mean, covariance = samples.moments()
         # The mean of few samples is itself uncertain; its covariance never exceeds that of the
         # prior.
-        within = np.einsum('m,mab,mcb->ac', weights.sum(axis=1), factors, factors)
-        within = within @ np.linalg.solve(within + self._prior_covariance, self._prior_covariance)
-        covariance = covariance + within * np.sum(weights**2)
-        return mean, (covariance + covariance.T) / 2
+        within = samples.average(np.matmul(samples.spread, np.swapaxes(samples.spread, 1, 2)))
+        prior = self._prior_covariance
+        within = within @ np.linalg.solve(within + prior, np.broadcast_to(prior, within.shape))
+        share = samples.sums(np.einsum('ms,ms->m', samples.weights, samples.weights))
+        covariance += within * share[:, None, None]
+        return mean, (covariance + np.swapaxes(covariance, 1, 2)) / 2

@@ -4,7 +4,7 @@ import numpy as np
 
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.polar import jacobian, to_positions
-from rhs_isac_ros.positioning.samples import Samples
+from rhs_isac_ros.positioning.samples import WeightedSamples
 from rhs_isac_ros.positioning.search import SearchEstimator
 
 
@@ -17,10 +17,15 @@ class MlEstimator(SearchEstimator):
 
     name = 'ml'
 
-    def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-        best = np.argmax(modes.roi_log_likelihood)
-        point = modes.roi_points[best]
-        by_point = jacobian(point[None])[0]
-        covariance = by_point @ np.linalg.solve(modes.curvature[best], by_point.T)
-        position = np.clip(to_positions(point), *self._bounds)
-        return position, (covariance + covariance.T) / 2
+    def _moments(
+            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+        ends = [*samples.starts[1:].tolist(), len(modes.points)]
+        value = modes.roi_log_likelihood
+        best = np.array([start + np.argmax(value[start:end])
+                         for start, end in zip(samples.starts.tolist(), ends, strict=True)])
+        points = modes.roi_points[best]
+        by_point = jacobian(points)
+        covariance = np.matmul(
+            by_point, np.linalg.solve(modes.curvature[best], np.swapaxes(by_point, 1, 2)))
+        positions = np.clip(to_positions(points), *self._bounds)
+        return positions, (covariance + np.swapaxes(covariance, 1, 2)) / 2

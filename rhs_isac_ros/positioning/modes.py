@@ -151,11 +151,10 @@ def local_model(
     point, [M, N_B, N_SB F]; returns float64 [M, 3, 3], [M, 3] and [M].
     """
     n = len(points)
-    mean, by_position = model.mean_and_jacobian(to_positions(points))
+    mean, slopes = model.mean_and_jacobian(to_positions(points), jacobian(points))
     # Re(a^H b) is the inner product of real and imaginary parts.
     residual = (whitened - mean).reshape(n, -1).view(float)
-    derivative = by_position.reshape(n, 3, -1).view(float)
-    derivative = np.matmul(np.swapaxes(jacobian(points), 1, 2), derivative)
-    curvature = quadratic_form(derivative.view(complex)) + np.diag(MIN_CURVATURE)
-    gradient = 2 * np.matmul(derivative, residual[..., None])[..., 0]
+    derivative = slopes.reshape(n, 3, -1)
+    curvature = quadratic_form(derivative) + np.diag(MIN_CURVATURE)
+    gradient = 2 * np.matmul(derivative.view(float), residual[..., None])[..., 0]
     return curvature, gradient, -np.sum(residual**2, axis=1)

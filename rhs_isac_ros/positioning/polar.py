@@ -14,7 +14,7 @@ def to_positions(points: np.ndarray) -> np.ndarray:
     Directions outside the unit circle have x = 0.
     """
     distance, u, v = points[..., 0], points[..., 1], points[..., 2]
-    positions = np.empty(points.shape)
+    positions = np.empty_like(points, dtype=float)
     positions[..., 0] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
     positions[..., 1:] = points[..., 1:]
     positions *= distance[..., None]

@@ -10,6 +10,21 @@ _N_PROJECTIONS = 4
 _RANGE_TOLERANCE_M = 0.02
 
 
+def is_inside(positions: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Return whether positions, float64 [..., 3] [m], are in the region, bool [...].
+
+    The bounds are those of `offset_to_roi`.
+    """
+    low, high = bounds
+    inside = np.ones(positions.shape[:-1], bool)
+    # A reduction over the coordinates takes several times as long.
+    for axis in range(positions.shape[-1]):
+        coordinate = positions[..., axis]
+        inside &= coordinate >= low[axis]
+        inside &= coordinate <= high[axis]
+    return inside
+
+
 def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Compute the offsets from modes to the nearest points of the region of interest.
 

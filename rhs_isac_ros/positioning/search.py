@@ -2,7 +2,7 @@
 
 import abc
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,7 @@ from rhs_isac_ros.positioning.modes import (
     find_modes_of_each,
 )
 from rhs_isac_ros.positioning.posterior import Doubt, Posterior
-from rhs_isac_ros.positioning.samples import Samples, draw_samples, draw_samples_of_each
+from rhs_isac_ros.positioning.samples import WeightedSamples, draw_samples_of_each
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.surroundings import Surroundings
 from rhs_isac_ros.positioning.table import TemplateTable
@@ -45,8 +45,8 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _GAIN_REACH = 6
 # Coordinates fitted to the signals of each phase.
 _N_COORDINATES = 3
-# Number of phases that are located together: their arrays fit into the cache.
-_BLOCK = 32
+# Number of phases that are located together.
+_BLOCK = 128
 
 
 class SearchEstimator(abc.ABC):
@@ -163,10 +163,8 @@ class SearchEstimator(abc.ABC):
         found = [self._found(*phase) for phase in zip(
             whitened[usable], find_modes_of_each(self._model, self._table, whitened[usable]),
             strict=True)]
-        samples = draw_samples_of_each(
-            [one.modes for one in found], self._table.normal, self._bounds)
-        for row, one, drawn in zip(usable.tolist(), found, samples, strict=True):
-            located[row], _ = self._judge(one, drawn)
+        for row, (one, _) in zip(usable.tolist(), self._judge(found), strict=True):
+            located[row] = one
         return located
 
     def _analyse(
@@ -178,9 +176,7 @@ class SearchEstimator(abc.ABC):
             return (*_no_fix(), reason, np.nan, np.nan), None, None
         found = (self._marginal.find(received) if self._marginal
                  else self._find(received, whitened))
-        samples = found.samples or draw_samples(
-            found.modes, self._table.normal, self._bounds)
-        located, doubt = self._judge(found, samples)
+        ((located, doubt),) = self._judge([found])
         return located, None if located[2] else found.modes, doubt
 
     def _too_weak(self, whitened: np.ndarray) -> str:
@@ -188,21 +184,41 @@ class SearchEstimator(abc.ABC):
         return self._test.min_energy_test(
             float(np.sum(np.abs(whitened)**2)) * self._max_power)
 
-    def _judge(self, found: Found, samples: Samples) -> tuple[Located, Doubt | None]:
-        """Return the position, or why there is none, and the doubt."""
-        residual = float(found.residuals[np.argmax(found.modes.roi_log_likelihood)])
-        outside = 0.0
-        if self._rejects_outside:
-            inside = samples.log_evidence(self._volume_m3)
-            outside = outside_probability(inside - found.log_evidence_outside)
+    def _judge(self, found: Sequence[Found]) -> Iterator[tuple[Located, Doubt | None]]:
+        """Yield the position of each phase, or why there is none, and the doubt."""
+        starts = np.array([0, *itertools.accumulate(len(one.residuals) for one in found[:-1])])
+        modes = Modes(*map(np.concatenate, zip(*(one.modes for one in found), strict=True)))
+        residuals = np.concatenate([one.residuals for one in found])
+        drawn = found[0].samples or draw_samples_of_each(
+            modes, starts, self._table.normal, self._bounds)
+        samples = WeightedSamples.of(drawn, starts)
+        evidence = samples.log_evidence(self._volume_m3)
+        moments = self._moments(modes, samples)
+        # Averaged over the posterior, the energy of a model that holds has the mean of a
+        # chi-square variable. At the best of several modes it is smaller, by the difference from
+        # the average.
+        expected = self._mean_residual - samples.average(residuals)
+        likelihood = modes.roi_log_likelihood
+        for row, (one, start) in enumerate(zip(found, starts.tolist(), strict=True)):
+            end = start + len(one.residuals)
+            residual = float(residuals[start + np.argmax(likelihood[start:end])])
+            outside = outside_probability(evidence[row] - one.log_evidence_outside)
+            yield self._conclude(one, residual, expected[row] + residual, outside,
+                                 (moments[0][row], moments[1][row]))
+
+    def _conclude(
+            self, found: Found, residual: float, expected: float, outside: float,
+            moments: tuple[np.ndarray, np.ndarray]) -> tuple[Located, Doubt | None]:
+        """Return a position, or why there is none, and the doubt."""
         reason = self._reason(found, residual, outside)
-        moments = _no_fix() if reason else self._moments(found.modes, samples)
-        expected, doubt = np.nan, None
-        if outside <= DOUBT_LIMIT or self._test.residual_test(residual) == reason != '':
-            expected = self._expected_residual(found.residuals, residual, samples)
-        elif not reason:
-            doubt = Doubt(outside, found.whitened, found.scale_outside)
-            moments = moments[0], self.with_outside(*moments, doubt)
+        if reason:
+            moments = _no_fix()
+        doubt = None
+        if outside > DOUBT_LIMIT and not self._test.residual_test(residual) == reason != '':
+            expected = np.nan
+            if not reason:
+                doubt = Doubt(outside, found.whitened, found.scale_outside)
+                moments = moments[0], self.with_outside(*moments, doubt)
         return (*moments, reason, residual, expected), doubt
 
     def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
@@ -242,25 +258,15 @@ class SearchEstimator(abc.ABC):
             return unexplained
         return outside_test(outside) or unexplained
 
-    def _expected_residual(
-            self, residuals: np.ndarray, residual: float, samples: Samples) -> float:
-        """Expected energy of the residual at the best mode.
-
-        Averaged over the posterior, the energy of a model that holds has the mean of a chi-square
-        variable. At the best of several modes it is smaller, by the difference from the average.
-        """
-        weights = np.exp(samples.log_weights - samples.log_weights.max()).sum(axis=1)
-        average = float(weights @ residuals / weights.sum())
-        return self._mean_residual - (average - residual)
-
     @property
     def surface(self) -> Surface | None:
         """What the estimator assumes to be known of the surface."""
         return self._model.surface
 
     @abc.abstractmethod
-    def _moments(self, modes: Modes, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-        """Return a position [3] and its covariance [3, 3] from the modes."""
+    def _moments(
+            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions, [N, 3], and covariances, [N, 3, 3], of N phases."""
 
 
 def _no_fix() -> tuple[np.ndarray, np.ndarray]:

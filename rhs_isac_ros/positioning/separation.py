@@ -6,6 +6,8 @@ import numpy as np
 _BLOCK = 64
 # Number of lists from which their treatment at once is faster than one after the other.
 _FEW_LISTS = 4
+# Number of points up to which a comparison of all pairs is faster than that with each choice.
+_SHORT_LIST = 48
 
 
 def separate(points: np.ndarray, max_points: int) -> list[int]:
@@ -51,6 +53,8 @@ def separate_each(
                 for one, index in zip(points, own, strict=True)]
         lists = np.repeat(np.arange(len(kept)), [len(one) for one in kept])
         return lists, np.concatenate(kept or [np.empty(0, int)])
+    if points.shape[1] <= _SHORT_LIST:
+        return _separate_short(points, valid, max_points)
     free, rows = valid.copy(), np.arange(len(points))
     coordinates = np.ascontiguousarray(np.moveaxis(points, 2, 0))
     chosen = []
@@ -69,6 +73,21 @@ def separate_each(
     indices = np.stack(chosen, axis=1) if chosen else np.empty((len(points), 0), int)
     lists, place = np.nonzero(indices >= 0)
     return lists, indices[lists, place]
+
+
+def _separate_short(
+        points: np.ndarray, valid: np.ndarray, max_points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Apply `separate_each` to lists of few points, with arrays of all pairs."""
+    # Whether a point is close to an earlier one, [L, N, N].
+    close = np.tri(points.shape[1], k=-1, dtype=bool) & valid[:, None]
+    for coordinate in np.ascontiguousarray(np.moveaxis(points, 2, 0)):
+        close &= np.abs(coordinate[:, :, None] - coordinate[:, None]) < 1
+    # Each round settles at least one more point, because only earlier ones matter; a few suffice.
+    chosen, previous = valid, None
+    while previous is None or not np.array_equal(chosen, previous):
+        chosen, previous = valid & ~(close & chosen[:, None]).any(axis=2), chosen
+    lists, indices = np.nonzero(chosen & (np.cumsum(chosen, axis=1) <= max_points))
+    return lists, indices
 
 
 def _close(points: np.ndarray, others: np.ndarray) -> np.ndarray:

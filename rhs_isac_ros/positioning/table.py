@@ -10,7 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 from rhs_isac_ros.positioning.polar import to_positions
-from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
+from rhs_isac_ros.positioning.region import is_inside, likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.separation import separate, separate_each
 from rhs_isac_ros.positioning.templates import RANGE_CELL_M, carrier_wavenumbers
 
@@ -19,6 +19,8 @@ STEPS_PER_WAVELENGTH = 8
 # Number of grid points, and of peaks along their range, that the search examines closely.
 _MAX_CELLS = 256
 _MAX_PEAKS = 256
+# Number of phases to search at a time.
+_BLOCK = 32
 # Peaks closer than this in all of (r in wavelengths, u, v) are one mode.
 _MIN_SEPARATION = (0.3, 0.05, 0.05)
 # Error of a mode's log-likelihood due to the grid, as a share of the template's energy.
@@ -129,6 +131,17 @@ class TemplateTable:
         tuple of numpy.ndarray
             The phase of each mode, int [M], ascending, and the modes, float64 [M, 3].
         """
+        starts = range(0, len(whitened), _BLOCK)
+        found = [self._modes_of_block(whitened[start:start + _BLOCK], max_modes, margin)
+                 for start in starts]
+        if len(found) == 1:
+            return found[0]
+        phases = [start + phase for start, (phase, _) in zip(starts, found, strict=True)]
+        return np.concatenate(phases), np.concatenate([points for _, points in found])
+
+    def _modes_of_block(
+            self, whitened: np.ndarray, max_modes: int, margin: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         signals = whitened.astype(np.complex64)
         cells, outputs = self._best_cells(signals)
         index, fine, value = self._peaks_of_each(cells, outputs)
@@ -158,7 +171,7 @@ class TemplateTable:
         """
         outputs = np.matmul(np.swapaxes(signals, 0, 1), np.swapaxes(self._filters, 1, 2))
         # Along the range, the log-likelihood is at most that of outputs in phase.
-        highest = np.sqrt(outputs.real**2 + outputs.imag**2).sum(axis=0)
+        highest = np.abs(outputs).sum(axis=0)
         highest *= 2
         highest -= self._energy
         n_cells = min(_MAX_CELLS, highest.shape[1])
@@ -241,9 +254,7 @@ class TemplateTable:
 
         The loss is infinite for points that are too unlikely even without it.
         """
-        low, high = self._bounds
-        positions = to_positions(points)
-        inside = ((positions >= low) & (positions <= high)).all(axis=2)
+        inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         values = np.where(inside, value, -np.inf)
         best, rows = values.argmax(axis=1)[:, None], np.arange(len(cell))[:, None]

@@ -17,6 +17,7 @@ from rhs_isac_ros.positioning.mixture import Mixture, concatenate, reduce
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.motion import Motion
 from rhs_isac_ros.positioning.polar import jacobian
+from rhs_isac_ros.positioning.region import is_inside
 from rhs_isac_ros.positioning.search import SearchEstimator
 from rhs_isac_ros.positioning.track_update import update
 
@@ -152,15 +153,14 @@ class Tracker:
         heavy = mixture.log_weights >= _MIN_LOG_WEIGHT
         mixture, light = mixture.select(heavy), mixture.select(~heavy)
         positions = mixture.positions(self.estimator.normal)
-        low, high = self.estimator.scenario.roi_bounds_m
-        inside = ((positions >= low) & (positions <= high)).all(axis=-1)
+        inside = is_inside(positions, self.estimator.scenario.roi_bounds_m)
         reaches = inside.mean(axis=1) >= _MIN_INSIDE
         if reaches.any():
             mixture, positions = mixture.select(reaches), positions[reaches]
             inside = inside[reaches]
         else:
             inside[...] = True
-            positions = np.clip(positions, low, high)
+            positions = np.clip(positions, *self.estimator.scenario.roi_bounds_m)
         weights = np.exp(mixture.log_weights)[:, None] * inside
         flat, points = (weights / weights.sum()).ravel(), positions.reshape(-1, 3)
         mean = flat @ points

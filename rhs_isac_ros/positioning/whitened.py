@@ -65,23 +65,22 @@ class WhitenedModel:
         """
         return self._model.whiten(self._model.mean(positions))
 
-    def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def mean_and_jacobian(
+            self, positions: np.ndarray, by_coordinate: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Compute whitened mean signals and their derivative with respect to the position.
 
         Parameters
         ----------
         positions
             Float64 [N, 3] [m].
+        by_coordinate
+            Derivatives of the positions with respect to other coordinates, float64 [N, 3, 3], for
+            the derivatives with respect to these.
 
         Returns
         -------
         tuple of numpy.ndarray
             Complex128 [N, N_B, N_SB F] and [N, 3, N_B, N_SB F] [1/m].
         """
-        mean, jacobian = self._model.mean_and_jacobian(positions)
-        for band, whitener in enumerate(self._model.whitener):
-            mean[:, band] = mean[:, band] @ whitener.T
-            # One product for all coordinates and positions, written through the view.
-            slopes = np.swapaxes(jacobian[:, :, band], 0, 1)
-            slopes[...] = (slopes.reshape(-1, len(whitener)) @ whitener.T).reshape(slopes.shape)
-        return mean, jacobian
+        return self._model.mean_and_jacobian(positions, by_coordinate, whitened=True)

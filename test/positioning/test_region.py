@@ -3,7 +3,7 @@
 import numpy as np
 
 from rhs_isac_ros.positioning.polar import to_polar, to_positions
-from rhs_isac_ros.positioning.region import likelihood_loss, offset_to_roi
+from rhs_isac_ros.positioning.region import is_inside, likelihood_loss, offset_to_roi
 
 BOUNDS = np.array([[6.0, -4.0, -1.0], [14.0, 4.0, 1.0]])
 # Range and direction are independent here.
@@ -13,6 +13,16 @@ COUPLED = np.array([[1e6, 2e3, -1e3], [2e3, 1e3, 0.0], [-1e3, 0.0, 1e3]])
 
 def curvatures(matrix, n):
     return np.tile(matrix, (n, 1, 1))
+
+
+def test_the_region_includes_its_border():
+    centre = BOUNDS.mean(axis=0)
+    assert is_inside(np.stack([centre, *BOUNDS]), BOUNDS).all()
+    for axis in range(3):
+        for bound, direction in zip(BOUNDS, (-1, 1), strict=True):
+            beyond = centre.copy()
+            beyond[axis] = bound[axis] + direction * 1e-9
+            assert not is_inside(beyond[None, None], BOUNDS).any()
 
 
 def test_offsets_inside_the_region_are_zero():

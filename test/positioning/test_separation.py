@@ -21,11 +21,12 @@ def test_separate_accepts_no_points():
     assert list(separate(np.zeros((0, 3)), 5)) == []
 
 
+@pytest.mark.parametrize('n_points', [1, 30, 150])
 @pytest.mark.parametrize('n_lists', [0, 1, 3, 20])
 @pytest.mark.parametrize('max_points', [1, 7, 1000])
-def test_separate_each_treats_every_list_alone(n_lists, max_points):
+def test_separate_each_treats_every_list_alone(n_points, n_lists, max_points):
     rng = np.random.default_rng(6)
-    points = rng.uniform(0, 4, (n_lists, 150, 3))
+    points = rng.uniform(0, 4, (n_lists, n_points, 3))
     valid = rng.uniform(size=points.shape[:2]) < rng.uniform(size=(n_lists, 1))
     valid[:1] = False
     lists, indices = separate_each(points, valid, max_points)

@@ -111,7 +111,7 @@ def test_modes_are_sorted_separate_and_within_the_margin(scenario, model, table,
 def test_modes_of_each_phase_are_those_of_the_phase_alone(scenario, model, table):
     rng = np.random.default_rng(6)
     received = simulate_received(
-        scenario, model.codebook, scenario.sample_positions(9, rng), rng)
+        scenario, model.codebook, scenario.sample_positions(40, rng), rng)
     whitened = model.whiten(received)
     phases, points = table.modes_of_each(whitened, 30, 10.0)
     for phase, y in enumerate(whitened):

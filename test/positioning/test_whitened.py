@@ -65,6 +65,16 @@ def test_jacobian_is_the_limit_of_differences_of_the_mean(case, model):
             jacobian[:, u], difference, rtol=0, atol=1e-7 * np.abs(jacobian).max())
 
 
+def test_derivatives_with_respect_to_other_coordinates_follow_the_chain_rule(case, model):
+    positions = case.vectors['positions']
+    by_coordinate = np.random.default_rng(0).normal(size=(len(positions), 3, 3))
+    mean, jacobian = model.mean_and_jacobian(positions)
+    same, by_other = model.mean_and_jacobian(positions, by_coordinate)
+    np.testing.assert_array_equal(same, mean)
+    expected = np.einsum('nabr,naq->nqbr', jacobian, by_coordinate)
+    np.testing.assert_allclose(by_other, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
 def test_a_codebook_that_does_not_fit_is_an_error(small):
     with pytest.raises(CodebookError, match='analog: shape'):
         WhitenedModel(dataclasses.replace(small.scenario, elements_per_side=3), small.codebook)
