@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,63 @@ class Mobility(Protocol):
         ...
 
 
+class Leg(NamedTuple):
+    """A straight part of a path at constant velocity.
+
+    Attributes
+    ----------
+    origin
+        Position at the departure, float64 [3] [m].
+    velocity
+        Float64 [3] [m/s].
+    departure_s, end_s
+        Times of departure and of the end of the leg [s].
+    """
+
+    origin: np.ndarray
+    velocity: np.ndarray
+    departure_s: float
+    end_s: float
+
+
+@runtime_checkable
+class StraightMobility(Mobility, Protocol):
+    """Path of straight legs."""
+
+    def leg(self, now_s: float) -> Leg:
+        """Return the leg at a time; the times of all calls must not decrease."""
+        ...
+
+
+class Crowd:
+    """The paths of many users; those of straight legs are evaluated with one array operation."""
+
+    def __init__(self, mobilities: Sequence[Mobility]) -> None:
+        self._mobilities = mobilities
+        straight = [isinstance(mobility, StraightMobility) for mobility in mobilities]
+        self._others = np.flatnonzero(~np.array(straight, bool))
+        n = len(mobilities)
+        self._origin, self._velocity = np.zeros((n, 3)), np.zeros((n, 3))
+        # No leg has begun yet.
+        self._departure_s, self._end_s = np.zeros(n), np.where(straight, -math.inf, math.inf)
+
+    def states(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions, float64 [N, 3] [m], and velocities, float64 [N, 3] [m/s].
+
+        The times of successive calls must not decrease.
+        """
+        for user in np.flatnonzero(now_s >= self._end_s).tolist():
+            mobility = self._mobilities[user]
+            if isinstance(mobility, StraightMobility):
+                (self._origin[user], self._velocity[user], self._departure_s[user],
+                 self._end_s[user]) = mobility.leg(now_s)
+        velocity = self._velocity.copy()
+        position = self._origin + velocity * (now_s - self._departure_s)[:, None]
+        for user in self._others.tolist():
+            position[user], velocity[user] = self._mobilities[user].state(now_s)
+        return position, velocity
+
+
 class Static:
     """User that stands still at a position, float64 [3] [m]."""
 
@@ -34,6 +91,10 @@ class Static:
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the fixed position [3] [m] and velocity 0 [3] [m/s]."""
         return self._position.copy(), np.zeros(3)
+
+    def leg(self, now_s: float) -> Leg:
+        """Return a leg that never ends."""
+        return Leg(self._position, np.zeros(3), now_s, math.inf)
 
 
 class Waypoints:
@@ -81,17 +142,20 @@ class RandomWalk:
         self._begin_leg()
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s] on the current leg.
+        """Return position [3] [m] and velocity [3] [m/s] on the current leg."""
+        leg = self.leg(now_s)
+        return leg.origin + leg.velocity * (now_s - leg.departure_s), leg.velocity.copy()
 
-        The next leg begins when the current one ends.
-        """
+    def leg(self, now_s: float) -> Leg:
+        """Return the current leg; the next one begins when it ends."""
         if self._departure_s is None:
             self._departure_s = now_s
         while now_s - self._departure_s >= self._duration_s:
             self._departure_s += self._duration_s
             self._origin, self._target = self._target, self._draw()
             self._begin_leg()
-        return self._origin + self._velocity * (now_s - self._departure_s), self._velocity.copy()
+        return Leg(self._origin, self._velocity, self._departure_s,
+                   self._departure_s + self._duration_s)
 
     def _draw(self) -> np.ndarray:
         position: np.ndarray = self._scenario.sample_positions(1, self._rng)[0]

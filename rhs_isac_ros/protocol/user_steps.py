@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rhs_isac_ros.model.mobility import Mobility
+from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, LogMessage, PeersChanged, Send, Timeout
 from rhs_isac_ros.protocol.instance import started
@@ -60,6 +60,7 @@ class UserSteps(StateMachine[State]):
         # By user: describes the node with the same number that is served instead.
         self._conflicts: dict[int, str] = {}
         self._mobilities = mobilities
+        self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
         # Cycle and band of the last pilot request answered.
         self._sounded = (0, 0)
@@ -84,11 +85,9 @@ class UserSteps(StateMachine[State]):
 
     def ground_truths(self, now_s: float) -> m.GroundTruths:
         """Return the positions and velocities of all users at a time on the clock of `handle`."""
-        states = [self._mobilities[user].state(now_s) for user in self.users]
-        position, velocity = zip(*states, strict=True)
+        position, velocity = self._crowd.states(now_s)
         return m.GroundTruths(
-            cycle_id=0, users=np.array(self.users), position=np.array(position),
-            velocity=np.array(velocity))
+            cycle_id=0, users=np.array(self.users), position=position, velocity=velocity)
 
     def status(self) -> Mapping[str, str]:
         """Return ``conflict.user_<n>`` while another node with the same number is served."""

@@ -176,3 +176,35 @@ def test_a_walk_changes_its_direction():
 def test_malformed_positions_are_errors(make):
     with pytest.raises(ValueError, match='positions'):
         make()
+
+
+def test_a_crowd_has_the_states_of_its_users():
+    """Walkers, who begin legs at different times, and users of other kinds in between."""
+    def users():
+        walks = [mobility.RandomWalk(Scenario(), speed, np.random.default_rng(n))
+                 for n, speed in enumerate((0.0, 0.8, 3.0, 50.0))]
+        return [*walks, mobility.Static((7, -1, 0)), mobility.Waypoints(SQUARE, 2.0), Jump()]
+
+    class Jump:
+        """The mobility of another package."""
+
+        def state(self, now_s):
+            return np.array([8.0, np.floor(now_s), 0.0]), np.zeros(3)
+
+    alone, crowd = users(), mobility.Crowd(users())
+    for now_s in np.random.default_rng(1).exponential(0.7, 60).cumsum():
+        position, velocity = crowd.states(now_s)
+        expected = [user.state(now_s) for user in alone]
+        np.testing.assert_array_equal(position, [state[0] for state in expected])
+        np.testing.assert_array_equal(velocity, [state[1] for state in expected])
+        position += 1
+        velocity += 1
+
+
+def test_states_of_a_crowd_and_of_its_users_may_alternate():
+    users = [mobility.RandomWalk(Scenario(), 40.0, np.random.default_rng(n)) for n in range(5)]
+    crowd = mobility.Crowd(users)
+    for now_s in np.arange(0, 3, 0.05):
+        single = users[2].state(now_s)
+        for part, one in zip(crowd.states(now_s), single, strict=True):
+            np.testing.assert_array_equal(part[2], one)
