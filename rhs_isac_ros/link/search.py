@@ -19,10 +19,12 @@ _MAX_SUBBANDS = 16
 # Number of random starts, and of those that remain after the first step.
 _N_STARTS = 256
 _N_DIRECT = 96
-# Number of configurations that are improved with the multipath, and that remain after each step.
-_N_KEPT = (24, 12, 8)
-# Number of modes that decide which configurations are improved.
+# Number of steps with the strongest modes of the multipath, of these modes, and of configurations
+# that are then improved with all modes. A selection after fewer steps would lose the best starts
+# if the multipath is as strong as the line of sight.
+_N_STEPS = 4
 _N_STRONGEST = 5
+_N_KEPT = 12
 # Number of configurations for the multipath alone, of their random starts and of steps.
 _N_SCATTERED = 8
 _N_SCATTERED_STARTS = 256
@@ -79,7 +81,8 @@ def candidate_configurations(
     best pair of waves for a configuration belongs to the largest singular value of B diag(c) G.
     It begins with the line of sight alone, for which the best wave on the board is known, and
     continues with the best of the configurations found, with those that are best for the
-    multipath alone, and with the matched filter.
+    multipath alone, and with the matched filter. All of them are improved with the strongest
+    modes, and the best then with all modes.
 
     The configurations of a band are in no particular order, and some may be equal.
 
@@ -103,12 +106,12 @@ def candidate_configurations(
     analog = np.concatenate([
         _direct_configurations(tables, direct), tables.scattered[index],
         _matched(tables, direct)], axis=1)
-    # A first selection needs the strongest modes only.
     gains = np.ascontiguousarray(paths[..., :1 + _N_STRONGEST])
-    waves = _Waves.at(gains, analog).best(_N_KEPT[0])
-    for n_kept in _N_KEPT[1:]:
-        waves = _Waves.at(paths, waves.corner(gains, tables.fixed), waves.on_board)
-        waves, gains = waves[_best(waves.rate, n_kept)], paths
+    waves = _Waves.at(gains, analog)
+    for _ in range(_N_STEPS):
+        waves = _Waves.at(gains, waves.corner(gains, tables.fixed), waves.on_board)
+    waves = waves.best(_N_KEPT)
+    waves = _Waves.at(paths, waves.corner(gains, tables.fixed), waves.on_board)
     return waves.best(n).analog.astype(float)
 
 
@@ -230,7 +233,7 @@ class _Waves:
         on_board = on_board / (np.linalg.norm(on_board, axis=-2, keepdims=True)
                                + np.float32(_MIN_NORM))
         # Faster than a product of many small matrices.
-        in_air = np.sum(np.conj(on_board) * channels, axis=-2, keepdims=True)
+        in_air = np.einsum('bsjko,bsjkl->bsjol', np.conj(on_board), channels)
         parts = in_air.view(np.float32)
         snr = np.einsum('bsjkl,bsjkl->bsj', parts, parts)
         in_air /= (1 + snr)[..., None, None]
