@@ -9,9 +9,11 @@ from rhs_isac_ros.link.steering import (
     applied_beam,
     capacity_report,
     choose_beam,
+    prepare_steering,
     steer,
 )
 
 __all__ = [
     'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'RunningQuartiles', 'applied_beam',
-    'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacity', 'steer']
+    'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacity',
+    'prepare_steering', 'steer']

@@ -89,6 +89,15 @@ def steer_bands(
     return [Beam(*parts) for parts in zip(best, digital, bands, strict=True)]
 
 
+@one_blas_thread
+def prepare_steering(scenario: Scenario, surface: SurfaceEstimate | None = None) -> None:
+    """Compute the tables of a scenario and surface, for which the first beam would have to wait.
+
+    They are kept for the most recent 16 scenarios and surfaces.
+    """
+    choose_beam(scenario, np.array(scenario.roi_center_m), surface=surface)
+
+
 def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
     """Return a beam with the coefficients and the gain that a calibrated surface applies."""
     if surface is None:

@@ -5,6 +5,7 @@ import types
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.link import prepare_steering
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.settings import TransmissionSettings
@@ -39,7 +40,9 @@ class TransmissionNode(RoleNode[Transmission]):
         if values.band >= n_bands:
             raise ParameterError(
                 f'band: {values.band}, expected 0 to {n_bands - 1} of the scenario, or -1')
-        self._surfaces[values.calibration_file] = calibrated_surface(values, self.scenario)
+        surface = calibrated_surface(values, self.scenario)
+        self._surfaces[values.calibration_file] = surface
+        prepare_steering(self.scenario, surface)
         return settings_of(TransmissionSettings, values)
 
     def _on_codebook(self, codebook: Codebook) -> None:

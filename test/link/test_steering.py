@@ -10,10 +10,13 @@ from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
     applied_beam,
+    band_link,
     capacity,
     capacity_report,
     choose_beam,
     expected_capacity,
+    prepare_steering,
+    search,
     steer,
 )
 from rhs_isac_ros.link.steering import steer_bands
@@ -85,6 +88,15 @@ def test_the_beams_of_all_bands_are_those_of_each_one(table1, positions):
             alone = steer(table1.scenario, position, band)
             np.testing.assert_array_equal(beam.analog, alone.analog)
             np.testing.assert_array_equal(beam.digital, alone.digital)
+
+
+def test_no_beam_waits_for_tables_after_the_preparation(small):
+    scenario = dataclasses.replace(small.scenario, max_power_w=0.0123)
+    prepare_steering(scenario)
+    caches = search.tables, band_link.arrays, band_link.representative_subbands
+    before = [cache.cache_info().misses for cache in caches]
+    choose_beam(scenario, scenario.sample_positions(1, np.random.default_rng(0))[0], np.eye(3))
+    assert [cache.cache_info().misses for cache in caches] == before
 
 
 def test_a_beam_of_a_small_surface_is_close_to_the_optimum(small, reference_link):
