@@ -26,6 +26,7 @@ from rhs_isac_ros.positioning import (
 )
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import (
     Action,
     BuildEstimator,
@@ -144,9 +145,9 @@ class PositionerNode(RoleNode[Positioner]):
         if isinstance(event, EstimatorReady):
             self.subscribe()
 
-    def publish(self, message: m.Message) -> bool:
+    def publish(self, message: m.Message, to: tuple[Recipient, ...] = ()) -> bool:
         """Publish a message, and poses for an estimate; return False if it is invalid."""
-        is_published = super().publish(message)
+        is_published = super().publish(message, to)
         if is_published and isinstance(message, m.PositionEstimate):
             pose = convert.pose(message, self.get_clock().now().to_msg())
             for publisher in (self._pose, *self._user_poses.publishers(message.user)):

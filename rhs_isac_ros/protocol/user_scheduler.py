@@ -1,7 +1,7 @@
 """The users that a base station waits for, and the order in which it serves them."""
 
 import bisect
-from collections.abc import Callable
+from collections.abc import Callable, Set
 
 import numpy as np
 
@@ -137,6 +137,11 @@ class UserScheduler:
             del self._served[user]
             del self._numbers[bisect.bisect_left(self._numbers, user)]
             self._awaited.discard(user)
+
+    @property
+    def awaited(self) -> Set[int]:
+        """Registered users that were invited and have not answered yet."""
+        return self._awaited
 
     @property
     def n_users(self) -> int:

@@ -5,11 +5,10 @@ import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from rclpy.publisher import Publisher
-
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import (
     Action,
     Event,
@@ -22,14 +21,15 @@ from rhs_isac_ros.protocol.events import (
 from rhs_isac_ros.protocol.instance import started
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.log_once import LogOnce
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
 from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
-from rhs_isac_ros.ros.subscriptions import subscribe
+from rhs_isac_ros.ros.role_publishers import RolePublishers
+from rhs_isac_ros.ros.role_subscriptions import RoleSubscriptions
 from rhs_isac_ros.ros.timers import steady_timer
 
 # Maximum number of senders whose wrong scenario is logged, which bounds the log.
@@ -81,8 +81,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._foreign: set[int] = set()
         self._presence: PresenceClient | None = None
         self._is_advertised = self._stands_by = False
-        self._role_publishers: dict[type[m.Message], Publisher] = {}
-        self._subscribed: set[type[m.Message]] = set()
+        self._role_publishers = RolePublishers(self, executable)
+        self._role_subscriptions = RoleSubscriptions(
+            self, executable, self.instance, self._receive_bytes)
         self._log_once = LogOnce(self)
         self._statistics = RoleStatistics()
         # One timer serves all deadlines. It is set again only if it would expire too late, or
@@ -115,18 +116,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         A node that stands by creates them when it resumes.
         """
         self._is_advertised = True
-        for kind in () if self._stands_by else self.role.SENDS:
-            if kind not in self._role_publishers:
-                self._role_publishers[kind] = self.create_publisher(
-                    convert.ros_type(kind), topics.NAMES[kind], qos.profile_for(kind))
+        if not self._stands_by:
+            self._role_publishers.advertise(self.role.SENDS)
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
-        for kind in self.role.RECEIVES:
-            if kind not in self._subscribed:
-                self._subscribed.add(kind)
-                subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
-                          self._receiver(kind), qos.profile_for(kind), raw=True)
+        self._role_subscriptions.subscribe(self.role.RECEIVES)
 
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
@@ -160,9 +155,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if stands_by:
             self.stand_by()
             # Subscriptions remain: the executor may hold messages for them. They are ignored.
-            for publisher in self._role_publishers.values():
-                self.destroy_publisher(publisher)
-            self._role_publishers.clear()
+            self._role_publishers.withdraw()
         else:
             if self._is_advertised:
                 self.advertise()
@@ -193,10 +186,15 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self._timer_due_s is None or deadline_s < self._timer_due_s):
             self._set_timer(deadline_s - now_s, deadline_s)
 
-    def publish(self, message: m.Message) -> bool:
+    def publish(self, message: m.Message, to: tuple[Recipient, ...] = ()) -> bool:
         """Publish a valid message and return True, or log its error and return False.
 
         A node that stands by publishes nothing.
+
+        Parameters
+        ----------
+        to
+            Recipients, as in `Send`.
         """
         if self._stands_by:
             return False
@@ -207,7 +205,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         except m.MessageError as error:
             self._log_error('not sent', error)
             return False
-        self._role_publishers[type(message)].publish(content)
+        self._role_publishers.publish(type(message), content, to)
         return True
 
     def execute(self, action: Action) -> None:
@@ -220,22 +218,20 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
-    def _receiver(self, kind: type[m.Message]) -> Callable[[bytes], None]:
-        def receive(serialized: bytes) -> None:
-            self._statistics.count_received(kind)
-            try:
-                message = convert.from_bytes(kind, serialized)
-                if message.scenario_id not in ('', self.scenario.id):
-                    self._drop_foreign(message)
-                    return
-                m.check(message, self._sizes)
-            except m.MessageError as error:
-                self.role.counters['malformed'] += 1
-                self._log_error('dropped', error)
+    def _receive_bytes(self, kind: type[m.Message], serialized: bytes) -> None:
+        self._statistics.count_received(kind)
+        try:
+            message = convert.from_bytes(kind, serialized)
+            if message.scenario_id not in ('', self.scenario.id):
+                self._drop_foreign(message)
                 return
-            if not self._stands_by:
-                self.dispatch(message)
-        return receive
+            m.check(message, self._sizes)
+        except m.MessageError as error:
+            self.role.counters['malformed'] += 1
+            self._log_error('dropped', error)
+            return
+        if not self._stands_by:
+            self.dispatch(message)
 
     def _drop_foreign(self, message: m.Message) -> None:
         """Count a message of another scenario, and log the first of each sender."""
@@ -255,8 +251,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _perform(self, action: Action) -> None:
         match action:
-            case Send(message):
-                self.publish(message)
+            case Send(message, to):
+                self.publish(message, to)
             case LogMessage(text, True):
                 self.get_logger().warning(text)  # type: ignore[no-untyped-call]
             case LogMessage(text):

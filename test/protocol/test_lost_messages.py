@@ -27,7 +27,6 @@ LOST = [
     (m.RhsCommand, {'band': 1}, 'rhs_controller', 'rhs_silent', {}),
     (m.RhsConfiguration, {'mode': POSITIONING}, 'bs', 'rhs_silent', {}),
     (m.RhsConfiguration, {'mode': POSITIONING}, 'channel', 'user_gone', {}),
-    (m.RhsConfiguration, {'mode': POSITIONING}, 'transmission', 'served', {}),
     (m.RhsConfiguration, {'mode': POSITIONING, 'band': 1}, 'bs', 'rhs_silent', {}),
     (m.PilotRequest, {}, 'user1', 'user_gone', {}),
     (m.PilotRequest, {'band': 1}, 'user1', 'user_gone', {}),
@@ -46,10 +45,8 @@ LOST = [
     (m.RhsConfiguration, {'mode': TRANSMISSION}, 'transmission', 'served', {}),
     (m.Data, DOWN | OFFERED, 'channel', 'data_lost', {}),
     (m.Data, DOWN | DELIVERED, 'user1', 'data_lost', {}),
-    (m.Data, DOWN | DELIVERED, 'bs', 'served', {}),
     (m.Data, UP | OFFERED, 'channel', 'data_lost', {}),
     (m.Data, UP | DELIVERED, 'bs', 'data_lost', {}),
-    (m.Data, UP | DELIVERED, 'user1', 'served', {}),
 ]
 IDS = [f'{kind.__name__}-{"-".join(map(str, fields.values()))}-{recipient}'
        for kind, fields, recipient, _, _ in LOST]

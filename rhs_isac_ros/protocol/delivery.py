@@ -1,0 +1,64 @@
+"""Messages that wake only the nodes to which they are addressed.
+
+Every message of the protocol has a topic. Nodes that all subscribed to it would also receive the
+messages for others, and to receive a message often takes longer than to handle it. The messages
+in `DELIVERIES` therefore have further topics, to which only their recipients subscribe.
+"""
+
+from typing import NamedTuple
+
+from rhs_isac_ros.protocol import messages as m
+
+# A role, or the instance of a node of users; `UNKNOWN` stands for all nodes of users.
+Recipient = str | int
+USER, UNKNOWN = 'user', 0
+
+
+class Delivery(NamedTuple):
+    """A message that is delivered on topics of its recipients.
+
+    Attributes
+    ----------
+    kind
+        Class of the message.
+    sender, recipient
+        The roles.
+    """
+
+    kind: type[m.Message]
+    sender: str
+    recipient: str
+
+
+DELIVERIES = (
+    Delivery(m.Beacon, 'bs', USER),
+    Delivery(m.Grant, 'bs', USER),
+    Delivery(m.PilotRequest, 'bs', USER),
+    Delivery(m.Data, 'channel', USER),
+    Delivery(m.Data, 'channel', 'bs'),
+    Delivery(m.RhsConfiguration, 'rhs_controller', 'transmission'),
+)
+
+
+def deliveries_from(sender: str) -> tuple[Delivery, ...]:
+    """Return the deliveries that a role sends."""
+    return tuple(one for one in DELIVERIES if one.sender == sender)
+
+
+def deliveries_to(recipient: str) -> tuple[Delivery, ...]:
+    """Return the deliveries to a role."""
+    return tuple(one for one in DELIVERIES if one.recipient == recipient)
+
+
+def is_due(one: Delivery, instance: int, to: tuple[Recipient, ...]) -> bool:
+    """Return whether a node of the recipient receives a delivery.
+
+    Parameters
+    ----------
+    instance
+        Instance of the node.
+    to
+        Recipients, as in `Send`.
+    """
+    return not to or one.recipient in to or (
+        one.recipient == USER and (instance in to or UNKNOWN in to))
