@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 from rhs_isac_ros.protocol import messages as m
 
-# A role, or the instance of a node of users; `UNKNOWN` stands for all nodes of users.
+# A role, `OBSERVERS` for none of the roles, or the instance of a node of users, where `UNKNOWN`
+# stands for all of these nodes.
 Recipient = str | int
+OBSERVERS = 'observers'
 USER, UNKNOWN = 'user', 0
 
 
@@ -34,9 +36,14 @@ DELIVERIES = (
     Delivery(m.Beacon, 'bs', USER),
     Delivery(m.Grant, 'bs', USER),
     Delivery(m.PilotRequest, 'bs', USER),
-    Delivery(m.Data, 'channel', USER),
-    Delivery(m.Data, 'channel', 'bs'),
     Delivery(m.RhsConfiguration, 'rhs_controller', 'transmission'),
+    Delivery(m.GroundTruth, USER, 'channel'),
+    Delivery(m.GroundTruth, USER, 'transmission'),
+    # Offered to the channel, which delivers them.
+    Delivery(m.Data, 'bs', 'channel'),
+    Delivery(m.Data, USER, 'channel'),
+    Delivery(m.Data, 'channel', 'bs'),
+    Delivery(m.Data, 'channel', USER),
 )
 
 

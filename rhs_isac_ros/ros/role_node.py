@@ -103,7 +103,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.role = role
         if advertise:
             self.advertise()
-        self._diagnostics = Diagnostics(self, self.report)
+        self._diagnostics = Diagnostics(self, self._report_regularly)
         if self.is_unique:
             self._presence = PresenceClient(
                 self, self._executable, self.instance, self.scenario, self._on_presence)
@@ -136,6 +136,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             return report
         return dataclasses.replace(
             report, fault=True, summary='; '.join(conflicts), values=values)
+
+    def _report_regularly(self) -> Report:
+        self._role_subscriptions.examine_senders()
+        return self.report()
 
     @property
     def is_standing_by(self) -> bool:

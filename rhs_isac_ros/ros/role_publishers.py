@@ -43,13 +43,13 @@ class RolePublishers:
 
     def advertise(self, kinds: Iterable[type[m.Message]]) -> None:
         """Create the publishers of messages that have none."""
-        for kind in kinds:
-            if kind in self._publishers:
-                continue
-            # First, so that no recipient discovers the sender without them.
+        new = [kind for kind in kinds if kind not in self._publishers]
+        # First, so that no recipient discovers the sender without them.
+        for kind in new:
             self._deliveries[kind] = {
                 one: self._create(kind, topics.delivery(kind, one.recipient))
                 for one in deliveries_from(self._sender) if one.kind is kind}
+        for kind in new:
             self._publishers[kind] = self._create(kind, topics.NAMES[kind])
 
     def withdraw(self) -> None:

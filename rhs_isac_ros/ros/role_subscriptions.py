@@ -7,14 +7,10 @@ from collections.abc import Callable, Iterable
 from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import USER, Delivery, deliveries_to
+from rhs_isac_ros.protocol.delivery import DELIVERIES, USER, deliveries_to
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.peer_monitor import identifying_endpoints
 from rhs_isac_ros.ros.subscriptions import subscribe
-from rhs_isac_ros.ros.timers import steady_timer
 
-# Period at which the senders are examined [s].
-_POLL_S = 1.0
 # Number of messages kept to recognise copies; those of a cycle are fewer.
 _MAX_RECENT = 32
 
@@ -22,9 +18,9 @@ _MAX_RECENT = 32
 class RoleSubscriptions:
     """Subscribes to the messages of a role.
 
-    Messages of `DELIVERIES` are received on the topics for this role or node. A sender that does
-    not publish there, such as a program of another project, makes the node subscribe to the
-    topics for all nodes as well.
+    Messages of `DELIVERIES` are received on the topics for this role or node. A publisher that
+    does not deliver them, such as ``ros2 topic pub``, makes the node subscribe to the topic for
+    all nodes as well.
 
     Parameters
     ----------
@@ -41,12 +37,11 @@ class RoleSubscriptions:
             on_message: Callable[[type[m.Message], bytes], None]) -> None:
         self._node, self._instance, self._on_message = node, instance, on_message
         self._deliveries = deliveries_to(recipient)
+        self._delivery_topics = {one.kind: _delivery_topics(one.kind) for one in self._deliveries}
         self._subscribed: set[type[m.Message]] = set()
         # Messages that are received on the topics for all nodes as well, and the latest of them.
         self._both: set[type[m.Message]] = set()
         self._recent: collections.deque[bytes] = collections.deque(maxlen=_MAX_RECENT)
-        if self._deliveries:
-            steady_timer(node, _POLL_S, self._examine_senders)
 
     def subscribe(self, kinds: Iterable[type[m.Message]]) -> None:
         """Create the subscriptions to messages that have none."""
@@ -73,18 +68,20 @@ class RoleSubscriptions:
             self._recent.append(content)
         self._on_message(kind, content)
 
-    def _examine_senders(self) -> None:
-        for one in self._deliveries:
-            if one.kind in self._subscribed - self._both and self._has_other_senders(one):
-                self._both.add(one.kind)
-                self._create(one.kind, topics.NAMES[one.kind])
-
-    def _has_other_senders(self, one: Delivery) -> bool:
-        """Return whether a node has the role of the sender but does not deliver."""
-        identifying, = identifying_endpoints(one.sender).publishers
-        return (self._n_publishers(topics.NAMES[identifying])
-                > self._n_publishers(topics.delivery(one.kind, one.recipient)))
+    def examine_senders(self) -> None:
+        """Subscribe to the topics for all nodes if a publisher uses no others."""
+        for kind in {one.kind for one in self._deliveries} & self._subscribed - self._both:
+            n_delivering = sum(self._n_publishers(name) for name in self._delivery_topics[kind])
+            if self._n_publishers(topics.NAMES[kind]) > n_delivering:
+                self._both.add(kind)
+                self._create(kind, topics.NAMES[kind])
 
     def _n_publishers(self, name: str) -> int:
         # The counts do not apply remapping rules.
         return self._node.count_publishers(self._node.resolve_topic_name(name))
+
+
+def _delivery_topics(kind: type[m.Message]) -> frozenset[str]:
+    """Return topics on which each node that delivers a message has one publisher."""
+    recipients = {one.sender: one.recipient for one in DELIVERIES if one.kind is kind}
+    return frozenset(topics.delivery(kind, recipient) for recipient in recipients.values())

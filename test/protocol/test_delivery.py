@@ -24,10 +24,6 @@ def test_every_delivery_is_sent_and_received_by_its_roles(roles):
     assert {*sum(map(deliveries_to, roles), ())} == set(DELIVERIES)
 
 
-def test_a_message_has_one_sender_that_delivers_it_to_a_role():
-    assert len(OF) == len(DELIVERIES)
-
-
 @pytest.mark.parametrize(('one', 'instance', 'to', 'due'), [
     (GRANT, 5, (), True),
     (GRANT, 5, (5, 7), True),

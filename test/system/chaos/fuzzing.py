@@ -15,6 +15,7 @@ from visualization_msgs.msg import MarkerArray
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.delivery import DELIVERIES
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.subscriptions import subscribe
@@ -26,8 +27,10 @@ from system.observer import NetworkObserver
 _BATCH = 32
 _TIMEOUT_S = 30.0
 _MAX_ORIGINALS = 32
-# Messages of the protocol by topic.
-_PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
+# Messages of the protocol by topic. Those for single roles come first, so that no node mistakes
+# this one for a publisher without them and subscribes to further topics.
+_PROTOCOL = {topics.delivery(one.kind, one.recipient): one.kind for one in DELIVERIES} | {
+    name: kind for kind, name in topics.NAMES.items()}
 # Topics with other messages.
 _OTHERS = {
     topics.CODEBOOK: (ros.Codebook, qos.LATCHED_WITH_LEASE),
@@ -38,7 +41,8 @@ _OTHERS = {
 }
 # Topics without messages in a correct network with one codebook, a node for each user and no
 # visualizer.
-_UNUSED = {topics.NAMES[m.NoFix], topics.NAMES[m.GroundTruths], topics.MARKERS}
+_UNUSED = {topics.NAMES[m.NoFix], topics.NAMES[m.GroundTruths], topics.MARKERS,
+           *(name for name in _PROTOCOL if name not in topics.NAMES.values())}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,11 +118,7 @@ class _Counters:
 
     def __init__(self, observer: NetworkObserver) -> None:
         self._observer = observer
-        own_name = observer.get_name()
-        self.subscribers = {name: sorted({
-            info.node_name for info in observer.get_subscriptions_info_by_topic(
-                observer.resolve_topic_name(name)) if info.node_name != own_name})
-            for name in _PROTOCOL}
+        self.subscribers = {name: sorted(_subscribers(observer, name)) for name in _PROTOCOL}
         self._nodes = {node for nodes in self.subscribers.values() for node in nodes}
         self._before: dict[str, dict[str, int]] = {}
         self._before = self.current()
@@ -136,9 +136,13 @@ class _Counters:
 
     def all_received(self, sent: collections.Counter[str]) -> bool:
         """Return whether every subscriber has received the mutations sent on its topics."""
+        due: collections.Counter[tuple[str, str]] = collections.Counter()
+        for name, nodes in self.subscribers.items():
+            for node in nodes:
+                due[node, _PROTOCOL[name].__name__] += sent[name]
         counters = self.current()
-        return all(counters[node].get(f'received.{_PROTOCOL[name].__name__}', 0) >= sent[name]
-                   for name, nodes in self.subscribers.items() for node in nodes)
+        return all(counters[node].get(f'received.{kind}', 0) >= n
+                   for (node, kind), n in due.items())
 
 
 def fuzz(
@@ -185,6 +189,12 @@ def fuzz(
             raise ChaosError(f'not all mutations were received within {_TIMEOUT_S:g} s')
         on_progress(sent.total())
     return _result(observer, processes, counters, sent, malformed)
+
+
+def _subscribers(observer: NetworkObserver, name: str) -> set[str]:
+    """Return the names of the other nodes that subscribe to a topic."""
+    return {info.node_name for info in observer.get_subscriptions_info_by_topic(
+        observer.resolve_topic_name(name))} - {observer.get_name()}
 
 
 def _is_malformed(kind: type[m.Message], content: bytes, scenario: Scenario) -> bool:
