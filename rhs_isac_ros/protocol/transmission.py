@@ -42,7 +42,8 @@ _MAX_REMEMBERED = 8
 # Time without messages of a cycle after which the role computes a report [s]. In a process with
 # other roles, the rest of the cycle then comes first.
 _IDLE_S = 5e-3
-# Longest time by which such messages postpone a report [s], and number of postponed reports.
+# Longest time by which such messages, or a true position that has not arrived, postpone a report
+# [s], and number of postponed reports.
 _MAX_DELAY_S = 0.25
 _MAX_WAITING = 8
 
@@ -58,11 +59,10 @@ class _Steered(NamedTuple):
 
 
 class _Waiting(NamedTuple):
-    """A report to compute: the beam applied in a cycle, the true position, and the last time."""
+    """A report to compute: the beam applied in a cycle, and the last time [s]."""
 
     steered: _Steered
     applied: m.RhsConfiguration
-    truth: m.GroundTruth | None
     deadline_s: float
 
 
@@ -108,7 +108,7 @@ class Transmission(PlainRole):
             case Timeout() if self._waiting:
                 # Messages that have arrived meanwhile precede the next report.
                 self._active_s = now_s
-                return self._report(self._waiting.popleft())
+                return self._report_next()
             case CodebookOffered(codebook):
                 self._codebooks.put(codebook.id, None)
                 return [LogMessage(f'serving: codebook {codebook.id}')]
@@ -125,14 +125,17 @@ class Transmission(PlainRole):
             case m.RhsConfiguration(mode=m.Mode.TRANSMISSION):
                 self._await_report(event, now_s)
                 if len(self._waiting) > _MAX_WAITING:
-                    return self._report(self._waiting.popleft())
+                    return self._report_next()
         return []
 
     def next_deadline(self) -> float | None:
         """Return when the next report is due [s], or None."""
         if not self._waiting:
             return None
-        return min(self._active_s + _IDLE_S, self._waiting[0].deadline_s)
+        deadline_s = self._waiting[0].deadline_s
+        if any(map(self._truth_of, self._waiting)):
+            deadline_s = min(deadline_s, self._active_s + _IDLE_S)
+        return deadline_s
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use."""
@@ -178,11 +181,17 @@ class Transmission(PlainRole):
         elif applied.band != steered.beam.band:
             self.count(outcomes.Outcome.WRONG_BAND)
         else:
-            self._waiting.append(_Waiting(
-                steered, applied, self._truth_of(steered.estimate), now_s + _MAX_DELAY_S))
+            self._waiting.append(_Waiting(steered, applied, now_s + _MAX_DELAY_S))
 
-    def _report(self, waiting: _Waiting) -> list[Action]:
-        steered, applied, truth, _ = waiting
+    def _report_next(self) -> list[Action]:
+        """Compute the first report whose true position is known, or the first if none is."""
+        waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
+        self._waiting.remove(waiting)
+        return self._report(waiting.steered, waiting.applied, self._truth_of(waiting))
+
+    def _report(
+            self, steered: _Steered, applied: m.RhsConfiguration, truth: m.GroundTruth | None
+    ) -> list[Action]:
         beam, result = steered.beam, CapacityReport(math.nan, math.nan)
         if truth:
             used = Beam(applied.analog[0], beam.digital, beam.band)
@@ -195,8 +204,9 @@ class Transmission(PlainRole):
             loss_percent=result.loss_percent, at_estimate_bps=steered.at_estimate_bps)
         return [Send(report), *self._summarize(report)]
 
-    def _truth_of(self, estimate: m.PositionEstimate) -> m.GroundTruth | None:
+    def _truth_of(self, waiting: _Waiting) -> m.GroundTruth | None:
         """Return the true position of the node whose position was estimated, if known."""
+        estimate = waiting.steered.estimate
         found = [truth for (cycle_id, user, instance), truth in self._truths.items()
                  if (cycle_id, user) == (estimate.cycle_id, estimate.user)
                  and m.same_instance(instance, estimate.user_instance)]

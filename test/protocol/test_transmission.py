@@ -100,6 +100,32 @@ def test_the_position_of_another_cycle_or_user_is_not_used(
     assert report.expected_bps == beam.expected_bps
 
 
+def test_a_report_waits_for_a_true_position_that_is_late(transmission, truth, estimate):
+    ((beam,),) = feed(transmission, [estimate])
+    transmission.handle(configured(beam), 1.0)
+    # Without it, the report is due after a quarter of a second.
+    assert transmission.next_deadline() == pytest.approx(1.25)
+    transmission.handle(truth, 1.1)
+    assert 1.1 < transmission.next_deadline() < 1.2
+    report, _ = (action.message for action in transmission.handle(Timeout(), 1.2))
+    assert report.cycle_id == beam.cycle_id
+    assert math.isfinite(report.loss_percent)
+    assert transmission.next_deadline() is None
+
+
+def test_a_report_without_a_true_position_does_not_delay_the_next(
+        transmission, truth, estimate):
+    earlier = dataclasses.replace(estimate, cycle_id=2)
+    first, second = (beam for (beam,) in feed(transmission, [earlier, estimate]))
+    for n, event in enumerate((configured(first), configured(second), truth)):
+        transmission.handle(event, 2 + 0.001 * n)
+    assert transmission.next_deadline() < 2.1
+    reports = [transmission.handle(Timeout(), now_s)[0].message for now_s in (2.1, 2.3)]
+    assert [report.cycle_id for report in reports] == [3, 2]
+    assert math.isfinite(reports[0].actual_bps)
+    assert math.isnan(reports[1].actual_bps)
+
+
 def test_a_duplicate_estimate_is_answered_with_the_same_beam(
         transmission, estimate, truth, monkeypatch):
     ((beam,),) = feed(transmission, [estimate])
@@ -255,6 +281,7 @@ def test_a_report_waits_until_no_message_of_a_cycle_arrives(transmission, estima
 def test_messages_without_a_pause_do_not_postpone_a_report_for_ever(
         transmission, estimate, truth):
     (beam,) = (action.message for action in transmission.handle(estimate, 0.0))
+    transmission.handle(truth, 0.0)
     transmission.handle(configured(beam), 0.0)
     for n in range(1, 100):
         transmission.handle(dataclasses.replace(truth, cycle_id=4 + n), n * 4e-3)
@@ -262,11 +289,11 @@ def test_messages_without_a_pause_do_not_postpone_a_report_for_ever(
 
 
 def test_the_next_report_waits_for_messages_that_arrived_during_the_last_one(
-        transmission, estimate):
+        transmission, estimate, truth):
     (beam,) = (action.message for action in transmission.handle(estimate, 0.0))
-    for _ in range(2):
-        transmission.handle(configured(beam), 0.0)
-    assert len(transmission.handle(Timeout(), 0.005)) == 1
+    for event in (truth, configured(beam), configured(beam)):
+        transmission.handle(event, 0.0)
+    report, statistics = transmission.handle(Timeout(), 0.005)
     assert transmission.next_deadline() == pytest.approx(0.01)
     assert len(transmission.handle(Timeout(), 0.01)) == 1
     assert transmission.handle(Timeout(), 0.02) == []
