@@ -93,7 +93,7 @@ class Transmission(PlainRole):
         # By cycle. `_counted` holds the cycles that the statistics already include.
         self._steered: NewestDict[int, _Steered] = NewestDict(_MAX_REMEMBERED)
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
-            _MAX_REMEMBERED)
+            _MAX_REMEMBERED + _MAX_WAITING)
         self._counted: NewestDict[int, None] = NewestDict(_MAX_REMEMBERED)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
