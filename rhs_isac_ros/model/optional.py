@@ -9,7 +9,7 @@ class MissingLibraryError(ImportError):
 
 
 @contextlib.contextmanager
-def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
+def optional_import(purpose: str, extra: str = '', script: str = '') -> Iterator[None]:
     """Replace an ImportError inside the block by one that names the library and the extra.
 
     Parameters
@@ -18,6 +18,8 @@ def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
         Task that needs the library; the first words of the message.
     extra
         Extra of this package that installs the library, if there is one.
+    script
+        Script that installs the library in a clone, if `extra` is not installed there.
 
     Raises
     ------
@@ -28,6 +30,7 @@ def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
         yield
     except ImportError as error:
         library = (error.name or str(error)).partition('.')[0]
-        hint = f" (pip install 'rhs_isac_ros[{extra}]')" if extra else ''
+        in_clone = f'; in a clone: {script}' if script else ''
+        hint = f" (pip install 'rhs_isac_ros[{extra}]'{in_clone})" if extra else ''
         raise MissingLibraryError(
             f'{purpose} needs {library}, which is not installed{hint}') from error

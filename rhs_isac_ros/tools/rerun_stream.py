@@ -49,12 +49,12 @@ class RerunStream:
     """
 
     def __init__(self) -> None:
-        with optional_import('view', extra='view'):
+        with optional_import('view', extra='view', script='scripts/_view'):
             import rerun
         if not rerun.__version__.startswith(f'{_VERSION}.'):
             raise MissingLibraryError(
                 f'view needs rerun-sdk {_VERSION}, found {rerun.__version__} '
-                "(pip install 'rhs_isac_ros[view]')")
+                "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/_view)")
         self._rerun = rerun
         rerun.set_strict_mode(True)
         self._stream = rerun.new_recording(_APPLICATION)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
-from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
@@ -49,8 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0, including after a signal; 1 if rerun is missing or the port is in use; 2 if
-        an argument or a file is invalid.
+        Exit code: 0, including after a signal; 1 if rerun is missing, the port is in use, or no
+        cycle was observed that could be saved; 2 if an argument or a file is invalid.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
@@ -69,16 +68,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             # After `close`, there is nothing left to discard.
             stream.discard()
-    except (RecordingError, ScenarioError, CodebookError, CalibrationError, OSError) as error:
+    except (RecordingError, ScenarioError, CalibrationError, OSError) as error:
         print_error(error, _PROGRAM)
         return 2
-    except (MissingLibraryError, _PortError) as error:
+    except (MissingLibraryError, _PortError, _NoCycleError) as error:
         print_error(error, _PROGRAM)
         return 1
 
 
 class _PortError(RuntimeError):
     """The viewer cannot be served."""
+
+
+class _NoCycleError(RuntimeError):
+    """There is nothing to save."""
 
 
 def _show(stream: RerunStream, options: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -124,6 +127,8 @@ def _show_live(
     def done() -> bool:
         return bool(options.cycles) and nodes[0].view.n_ended >= options.cycles
     code = run(create, arguments, done)
+    if options.save and nodes and not nodes[0].view.n_cycles:
+        raise _NoCycleError(f'{options.save} is not written: {nodes[0].silence}')
     if not code:
         _finish(stream, options)
     return code

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import os
 import time
 from collections.abc import Callable, Iterable
 
@@ -20,9 +21,12 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
 from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
+from rhs_isac_ros.ros.timers import steady_timer
 from rhs_isac_ros.ros.user_topics import MAX_USERS
 from rhs_isac_ros.tools.view_posteriors import Posteriors
 
+# If no cycle is observed for this time, the reason is logged.
+_SILENCE_S = 5.0
 # Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
 _BEAM_PERIOD_S = 0.2
 
@@ -52,6 +56,8 @@ class ViewNode(Node):
         super().__init__('view', start_parameter_services=False)
         self.view, self._scenario_id = NetworkView(scenario), scenario.id
         self.mismatch = ''
+        # Names of a destroyed node are not available.
+        self._namespace = self.get_namespace()
         self._posteriors, self._write = posteriors, write
         self._worker, self._bounds = BackgroundWorker(self), BackgroundWorker(self)
         self._requested: set[str] = set()  # ids of codebooks that are being prepared
@@ -64,6 +70,20 @@ class ViewNode(Node):
         subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.EXCHANGE)
         subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
                            exchange=qos.OBSERVATION)
+        self._silence_timer = steady_timer(self, _SILENCE_S, self._log_silence)
+
+    @property
+    def silence(self) -> str:
+        """Reason why no cycle is observed."""
+        domain = os.environ.get('ROS_DOMAIN_ID', '0')
+        return (f'the network uses another scenario ({self.mismatch})' if self.mismatch else
+                f'no cycle in the domain {domain} and the namespace {self._namespace}')
+
+    def _log_silence(self) -> None:
+        self._silence_timer.cancel()
+        if not self.view.n_cycles:
+            self.get_logger().warning(  # type: ignore[no-untyped-call]
+                f'{self.silence}; still waiting')
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.entities import Entry
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
@@ -33,21 +34,20 @@ def entries(
     Raises
     ------
     RecordingError
-        If the file is not a recording, has no messages in the namespace, or contains a malformed
-        message.
-    CodebookError
-        If a recorded codebook is invalid or does not fit the scenario.
+        If the file is not a recording, has no messages in the namespace, or contains a message
+        that is malformed or does not fit the scenario.
     """
     prefix = topic_prefix(namespace)
     view = NetworkView(scenario)
     for topic, found, _ in read(path, [f'{prefix}{topics.CODEBOOK}']):
         try:
             codebook = convert.codebook_from_ros(found)
-        except m.MessageError as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
-        if codebook.id not in posteriors.codebooks:
+            if codebook.id in posteriors.codebooks:
+                continue
             posteriors.add(codebook)
-            view.set_bound(codebook.id, posteriors.bound_m2(codebook))
+        except (m.MessageError, CodebookError) as error:
+            raise RecordingError(f'{path}: {topic}: {error}') from None
+        view.set_bound(codebook.id, posteriors.bound_m2(codebook))
     yield from view.begin()
     kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
     reports = f'{prefix}{topics.DIAGNOSTICS}'

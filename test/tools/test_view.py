@@ -44,7 +44,7 @@ def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, 
     assert main([]) == 1
     assert capsys.readouterr() == ('', (
         'view: error: view needs rerun, which is not installed '
-        "(pip install 'rhs_isac_ros[view]')\n"))
+        "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/_view)\n"))
 
 
 @pytest.mark.parametrize(('arguments', 'reason'), [
@@ -171,12 +171,32 @@ def test_a_recording_without_the_namespace_is_an_error(recording, tmp_path, caps
     assert not list(tmp_path.iterdir())
 
 
+def test_without_a_network_the_view_names_domain_and_namespace_and_writes_no_file(
+        rerun, built_scripts, tmp_path):
+    with subprocess.Popen(
+            [SCRIPT, '--save', 'view.rrd', '--ros-args', '-r', '__ns:=/nowhere'], cwd=tmp_path,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        warning = process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=TIMEOUT_S)
+    reason = f'no cycle in the domain {os.environ["ROS_DOMAIN_ID"]} and the namespace /nowhere'
+    assert warning.endswith(f'{reason}; still waiting\n')
+    assert (process.returncode, out) == (1, '')
+    assert err == f'view: error: view.rrd is not written: {reason}\n'
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_recording_of_another_scenario_is_named(recording, monkeypatch):
     monkeypatch.setattr('rhs_isac_ros.tools.view_posteriors._N_PHASES', 4)
     scenario = dataclasses.replace(
         Scenario.from_yaml(CONFIG / 'quick.yaml'), refractive_index=2.0)
     with pytest.raises(RecordingError, match=f'recorded with scenario .*, expected {scenario.id}'):
         list(entries(recording, '/', scenario, Posteriors(scenario)))
+
+
+def test_a_recording_of_another_surface_is_named(recording):
+    with pytest.raises(RecordingError, match='run.mcap: /codebook: analog: shape .*, expected'):
+        list(entries(recording, '/', Scenario(), Posteriors(Scenario())))
 
 
 def test_a_malformed_codebook_of_a_recording_is_named(tmp_path):
