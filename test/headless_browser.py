@@ -1,12 +1,15 @@
 """A headless Chromium, driven over a pipe in the DevTools protocol.
 
-As a program, it saves a picture of a page::
+As a program, it saves the picture of a view that opens the README, from its address::
 
-    python test/headless_browser.py URL FILE [SECONDS]
+    scripts/record run.mcap       # of scripts/run network
+    scripts/view run.mcap --track --cycles 38
+    python test/headless_browser.py ADDRESS docs/view.png
 """
 
 import base64
 import contextlib
+import io
 import itertools
 import json
 import os
@@ -27,6 +30,7 @@ _OPTIONS = (
 # Chromium reads commands from this file descriptor and writes to the next one.
 _FIRST_DESCRIPTOR = 3
 _TIMEOUT_S = 60.0
+_DRAWING_S = 20.0
 
 
 def executable():
@@ -35,9 +39,9 @@ def executable():
 
 
 class Browser:
-    """A context manager with one page of a width and a height in pixels."""
+    """A context manager with one page of a width and a height in pixels at the scale 1."""
 
-    def __init__(self, width=1600, height=1000):
+    def __init__(self, width=1600, height=1000, scale=1.0):
         self._stack = contextlib.ExitStack()
         folder = self._stack.enter_context(
             tempfile.TemporaryDirectory(prefix='browser-', ignore_cleanup_errors=True))
@@ -53,6 +57,7 @@ class Browser:
         os.close(commands)
         os.close(results)
         self._numbers, self._received, self._session = itertools.count(1), b'', {}
+        self._size = {'width': width, 'height': height, 'deviceScaleFactor': scale}
 
     def __enter__(self):
         try:
@@ -63,6 +68,7 @@ class Browser:
             self.__exit__()
             raise
         self._session = {'sessionId': found['sessionId']}
+        self.call('Emulation.setDeviceMetricsOverride', mobile=False, **self._size)
         return self
 
     def __exit__(self, *details):
@@ -94,9 +100,12 @@ class Browser:
         while self._next().get('method') != 'Page.loadEventFired':
             pass
 
-    def picture(self):
-        """Return a picture of the page as PNG."""
-        return base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
+    def picture(self, top=0):
+        """Return a picture of the page as PNG, without some pixels at the top."""
+        clip = {'x': 0, 'y': top, 'width': self._size['width'],
+                'height': self._size['height'] - top, 'scale': 1}
+        return base64.b64decode(
+            self.call('Page.captureScreenshot', format='png', clip=clip)['data'])
 
     def scroll(self, x, y, distance):
         """Turn the wheel of the mouse at a place; negative distances zoom in."""
@@ -123,12 +132,20 @@ class Browser:
         return json.loads(message)
 
 
-def main(address, file, duration_s='20'):
-    """Save a picture of a page some seconds after it was opened."""
-    with Browser() as browser:
+def main(address, file):
+    """Save a picture of a view, in 256 colours and without the menu of the viewer."""
+    from PIL import Image
+
+    with Browser(1400, 960, scale=1.25) as browser:
         browser.open(address)
-        time.sleep(float(duration_s))
-        Path(file).write_bytes(browser.picture())
+        # The page does not report when it has drawn the data.
+        time.sleep(_DRAWING_S)
+        browser.drag(300, 300, -70, 60)
+        # The viewer describes what the mouse points at; its menu is not in the picture.
+        browser.call('Input.dispatchMouseEvent', type='mouseMoved', x=500, y=10)
+        time.sleep(_DRAWING_S)
+        picture = Image.open(io.BytesIO(browser.picture(top=34)))
+    picture.convert('RGB').quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
 
 
 if __name__ == '__main__':
