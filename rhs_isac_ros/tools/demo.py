@@ -71,20 +71,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
                    {'--record': options.record, '--picture': options.picture})
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
-    except ScenarioError as error:
-        print_error(error, parser.prog)
-        return 2
+        recorder = Recorder(options.record, scenario) if options.record else None
     except CodebookError as error:
         print_error(f'{error}; to create a codebook for a scenario: python -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
         return 2
-    try:
-        recorder = Recorder(options.record, scenario) if options.record else None
-    except RecordingError as error:
+    except (ScenarioError, RecordingError) as error:
         print_error(error, parser.prog)
         return 2
     os.environ.update(private_domain())
     use_discovery_profile()
+    return _run(scenario, codebook_file, recorder, options, together)
+
+
+def _run(
+        scenario: Scenario, codebook_file: Path, recorder: Recorder | None,
+        options: argparse.Namespace, together: bool) -> int:
+    """Run the network until its cycles are complete, and report on them; return the exit code."""
     log = CycleLog()
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         # The log of the cycles is complete when the processes are about to end.

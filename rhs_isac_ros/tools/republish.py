@@ -174,29 +174,19 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if first_codebook:
         first_codebook.check(scenario)
     nodes: list[RepublisherNode] = []
-    with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
-        file = Path(folder) / 'scenario.yaml'
-        file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+    end_s = time.monotonic() + options.timeout
 
-        def create() -> list[Node]:
-            node = RepublisherNode(
-                _messages(options, [*names, topics.CODEBOOK]), names, options.rate)
-            nodes.append(node)
-            if first_codebook and not _optimizer_present(node):
-                node.optimizer = OptimizerNode(parameter_overrides=[
-                    Parameter('scenario_file', value=str(file)), *_parameters(first_codebook)])
-            return [node, *filter(None, [node.optimizer])]
-        begin_s = time.monotonic()
+    def create() -> list[Node]:
+        node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names, options.rate)
+        nodes.append(node)
+        if first_codebook and not _optimizer_present(node):
+            node.optimizer = _optimizer(scenario, first_codebook)
+        return [node, *filter(None, [node.optimizer])]
 
-        def done() -> bool:
-            node = nodes[0]
-            if conflicts := node.conflicts():
-                raise RepublishError(f'{conflicts[0]}: already published by another node')
-            if node.waits_for and time.monotonic() > begin_s + options.timeout:
-                raise RepublishError(f'{node.waits_for}: no subscriber within '
-                                     f'{options.timeout:g} s')
-            return node.finished
-        code = run(create, arguments, done)
+    def done() -> bool:
+        _check(nodes[0], end_s, options.timeout)
+        return nodes[0].finished
+    code = run(create, arguments, done)
     if nodes:
         print(f'{nodes[0].count} messages published')
     return code
@@ -240,6 +230,23 @@ def _first_codebook(options: argparse.Namespace, names: Collection[str]) -> Code
         raise RecordingError(f'codebook {used[0]}: not in the recording, expected its file: '
                              '--codebook FILE')
     return convert.codebook_from_ros(codebooks[used[0]])
+
+
+def _check(node: RepublisherNode, end_s: float, timeout_s: float) -> None:
+    """Raise a RepublishError if the messages cannot be published, or not until `end_s` [s]."""
+    if conflicts := node.conflicts():
+        raise RepublishError(f'{conflicts[0]}: already published by another node')
+    if node.waits_for and time.monotonic() > end_s:
+        raise RepublishError(f'{node.waits_for}: no subscriber within {timeout_s:g} s')
+
+
+def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
+    """Create an optimizer that provides a codebook; it reads the scenario from a file once."""
+    with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
+        file = Path(folder) / 'scenario.yaml'
+        file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+        return OptimizerNode(parameter_overrides=[
+            Parameter('scenario_file', value=str(file)), *_parameters(codebook)])
 
 
 def _optimizer_present(node: Node) -> bool:

@@ -74,6 +74,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (MissingLibraryError, _PortError, _NoCycleError) as error:
         print_error(error, _PROGRAM)
         return 1
+    except KeyboardInterrupt:
+        # The handlers of signals are not installed yet while libraries are imported.
+        return 0
 
 
 class _PortError(RuntimeError):
