@@ -9,7 +9,6 @@ As a program, it saves the picture of a view that opens the README, from its add
 
 import base64
 import contextlib
-import io
 import itertools
 import json
 import os
@@ -133,9 +132,7 @@ class Browser:
 
 
 def main(address, file):
-    """Save a picture of a view, in 256 colours and without the menu of the viewer."""
-    from PIL import Image
-
+    """Save a picture of a view, without the menu of the viewer."""
     with Browser(1400, 960, scale=1.25) as browser:
         browser.open(address)
         # The page does not report when it has drawn the data.
@@ -144,8 +141,7 @@ def main(address, file):
         # The viewer describes what the mouse points at; its menu is not in the picture.
         browser.call('Input.dispatchMouseEvent', type='mouseMoved', x=500, y=10)
         time.sleep(_DRAWING_S)
-        picture = Image.open(io.BytesIO(browser.picture(top=34)))
-    picture.convert('RGB').quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
+        Path(file).write_bytes(browser.picture(top=34))
 
 
 if __name__ == '__main__':

@@ -7,6 +7,7 @@ position of the node that was granted the cycle.
 
 import collections
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -214,13 +215,14 @@ class InvariantChecker:
     def _matches(
             self, feeds: list[np.ndarray], cycle: _CycleMessages, codebook: Codebook) -> bool:
         """Return whether the received signals are those at the feeds, combined, and noise."""
-        expected = receive_feeds(self._scenario, codebook, np.stack(feeds), None)
-        # Signals may be forged and huge: their noise is infinite, which is more than allowed.
-        with np.errstate(over='ignore'):
-            noise = np.abs(cycle.signals[0].signals - expected)**2
-        allowed = (_MAX_NOISE_FACTOR * self._scenario.noise_power_w
-                   + 1e-12 * np.abs(expected).max()**2)
-        return bool(noise.max() <= allowed)
+        # Amplitudes, because the powers of forged signals may overflow. The sums may as well; the
+        # result is then no match.
+        with np.errstate(over='ignore', invalid='ignore'):
+            expected = receive_feeds(self._scenario, codebook, np.stack(feeds), None)
+            noise = np.abs(cycle.signals[0].signals - expected).max()
+            allowed = math.hypot(math.sqrt(_MAX_NOISE_FACTOR * self._scenario.noise_power_w),
+                                 1e-6 * np.abs(expected).max())
+        return bool(noise <= allowed < math.inf)
 
     def _position_faults(self, cycle: _CycleMessages) -> Iterator[_Fault]:
         """Compare the received signals with their distribution at the true position."""

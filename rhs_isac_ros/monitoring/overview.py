@@ -11,6 +11,7 @@ from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
 # Messages that the overview needs.
 RECEIVES = cycle_log.RECEIVES
@@ -19,6 +20,7 @@ RESTING = 'resting'
 _RATE_WINDOW_S = 10.0
 # Nodes report once a second; a node is silent after three missing reports.
 _REPORT_TIMEOUT_S = 3.5
+_MAX_NODES = 4096
 # Longer strings of digits in a report are not counts.
 _MAX_DIGITS = 18
 
@@ -87,9 +89,10 @@ class Overview:
     began_s
         Arrival of the first message [s]; infinite before.
     users
-        Latest fix of each user by id; None before the first.
+        Latest fix of each user by id; None before the first. At most `MAX_USERS`, because the ids
+        come from messages.
     nodes
-        Status of each node by name.
+        Status of each node by name; at most 4096, for the same reason.
     """
 
     def __init__(self) -> None:
@@ -115,17 +118,20 @@ class Overview:
                 if message.outcome:
                     self._end_cycle(message, now_s)
             case m.GroundTruth():
-                self.users.setdefault(message.user, None)
+                if len(self.users) < MAX_USERS:
+                    self.users.setdefault(message.user, None)
             case m.ReceivedSignals():
                 self.codebook_id = message.codebook_id
         self._log.add(message, now_s)
         for cycle in self._log.complete:
-            self.users[cycle.user] = Fix(cycle, now_s)
+            if cycle.user in self.users or len(self.users) < MAX_USERS:
+                self.users[cycle.user] = Fix(cycle, now_s)
         self._log.clear()
 
     def add_report(self, node: str, report: Report, now_s: float) -> None:
         """Add the report of a node that arrived at `now_s` [s]."""
-        self.nodes[node] = NodeStatus(report, now_s)
+        if node in self.nodes or len(self.nodes) < _MAX_NODES:
+            self.nodes[node] = NodeStatus(report, now_s)
 
     def rate_hz(self, now_s: float) -> float:
         """Return the rate of served cycles [Hz].

@@ -92,6 +92,7 @@ CASES = {
                                      'never offered'),
     'mutated band': (of(m.FeedSignals, band=1), {'signals': 2.0},
                        'do not match the feed signals'),
+    'huge band': (of(m.FeedSignals, band=1), {'signals': 1e300}, 'do not match the feed signals'),
     'mutated configuration': (of(m.RhsConfiguration, band=0, **POSITIONING), {'analog': 0.5},
                                'not in the codebook'),
 }

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rhs_isac_ros.monitoring import overview as overview_module
 from rhs_isac_ros.monitoring.overview import RECEIVES, RESTING, Overview
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
@@ -42,6 +43,17 @@ def test_users_have_the_results_of_their_latest_cycle(network, codebooks):
     assert (overview.served, overview.given_up, overview.last_failure) == (4, 0, '')
     assert overview.codebook_id == codebooks[0].id
     assert (overview.phase, overview.cycle_id) == (RESTING, 4)
+
+
+def test_the_numbers_of_users_and_nodes_are_bounded(monkeypatch):
+    monkeypatch.setattr(overview_module, 'MAX_USERS', 2)
+    monkeypatch.setattr(overview_module, '_MAX_NODES', 2)
+    overview = Overview()
+    for number in (1, 2, 3):
+        overview.add(m.GroundTruth(
+            cycle_id=1, user=number, position=np.ones(3), velocity=np.zeros(3)), 0.0)
+        overview.add_report(f'node_{number}', Report(False, '', {}), 0.0)
+    assert (list(overview.users), list(overview.nodes)) == ([1, 2], ['node_1', 'node_2'])
 
 
 def test_phases_follow_each_other_and_have_their_start_times(network):
