@@ -5,6 +5,8 @@ As a program, it saves the picture of a view that opens the README, from its add
     scripts/record run.mcap       # of scripts/run network
     scripts/view run.mcap --track --cycles 38
     python test/headless_browser.py ADDRESS docs/view.png
+
+The colours of the file in the repository are reduced to 256.
 """
 
 import base64
