@@ -5,6 +5,7 @@ import contextlib
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
-from rhs_isac_ros.executables import exit_code_of, print_error
+from rhs_isac_ros.executables import STARTED_S, exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
     ArgumentParser,
@@ -37,6 +38,7 @@ from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo_picture import draw, prepare_drawing
 from rhs_isac_ros.tools.demo_report import summary, table
+from rhs_isac_ros.tools.demo_times import Parts, process_age_s
 from rhs_isac_ros.tools.process_network import (
     add_network_options,
     load_files,
@@ -81,14 +83,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     os.environ.update(private_domain())
     use_discovery_profile()
-    return _run(scenario, codebook_file, recorder, options, together)
+    return _run(scenario, codebook_file, recorder, options, together, _parts())
 
 
 def _run(
         scenario: Scenario, codebook_file: Path, recorder: Recorder | None,
-        options: argparse.Namespace, together: bool) -> int:
+        options: argparse.Namespace, together: bool, parts: Parts) -> int:
     """Run the network until its cycles are complete, and report on them; return the exit code."""
-    log = CycleLog()
+    log, code = CycleLog(), 0
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         # The log of the cycles is complete when the processes are about to end.
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
@@ -99,27 +101,51 @@ def _run(
                         processes, options.users, options.seed, options.config, codebook_file,
                         scenario, together=together,
                         positioner=positioner_parameters(options.prior, scenario))
-                    problem = _observe(log, processes, recorder, options.cycles)
+                    problem = _observe(log, processes, recorder, options.cycles, parts)
             finally:
                 # Also if a signal arrives before the observer exists.
                 if recorder is not None:
                     recorder.close()
             processes.interrupt()
             with contextlib.suppress(KeyboardInterrupt):
-                return _report(log, scenario, options, problem)
-    return 0
+                code = _report(log, scenario, options, problem)
+    if log.complete:
+        parts.end('end', time.monotonic())
+        print(parts.text())
+    return code
+
+
+def _parts() -> Parts:
+    """Return the parts of the run so far: the scripts, and the imports of this process."""
+    now_s, age_s = time.monotonic(), process_age_s()
+    if age_s is None:
+        parts = Parts(STARTED_S)
+    else:
+        parts = Parts(now_s - age_s)
+        parts.end('environment', STARTED_S)
+    parts.end('imports', now_s)
+    return parts
 
 
 def _observe(
-        log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int) -> str:
+        log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int,
+        parts: Parts) -> str:
     """Observe a number of cycles, and return the error that ended them; empty if none did."""
     # The network needs a moment to start.
     prepare_drawing()
     rclpy.init(args=[])
     observer = CycleObserver(recorder, log=log)
+    discovered_s: list[float] = []
     try:
-        return watch(observer, processes, cycles, _show_progress)
+        return watch(observer, processes, cycles, _show_progress,
+                     lambda: discovered_s.append(time.monotonic()))
     finally:
+        if log.complete:
+            begin_s = log.complete[0].began_s
+            # On a busy machine, a cycle may end before this process has discovered all nodes.
+            parts.end('start and discovery of the nodes', min([*discovered_s, begin_s]))
+            parts.end('codebook and tables', begin_s)
+            parts.end('cycles', log.complete[-1].ended_s)
         observer.destroy_node()  # type: ignore[no-untyped-call]
         try_shutdown()
 

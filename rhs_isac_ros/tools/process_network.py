@@ -19,6 +19,8 @@ from rhs_isac_ros.ros.processes import Processes, max_processes
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
+# Time between two looks at the nodes that have been discovered [s].
+_DISCOVERY_PERIOD_S = 0.02
 # Processes that are not users.
 _N_OTHERS = 6
 
@@ -127,7 +129,8 @@ def start_network(
 
 def watch(
         observer: CycleObserver, processes: Processes, cycles: int,
-        on_progress: Callable[[int, int], None]) -> str:
+        on_progress: Callable[[int, int], None],
+        on_discovered: Callable[[], None] | None = None) -> str:
     """Spin an observer until it has received enough complete cycles.
 
     Parameters
@@ -136,6 +139,8 @@ def watch(
         Number of complete cycles to wait for.
     on_progress
         Called with the number of complete cycles and `cycles` when the former changes.
+    on_discovered
+        Called when the observer has discovered all nodes.
 
     Returns
     -------
@@ -144,7 +149,10 @@ def watch(
     """
     seen, changed_s = -1, time.monotonic()
     while seen < cycles:
-        rclpy.spin_once(observer, timeout_sec=0.5)
+        rclpy.spin_once(observer, timeout_sec=_DISCOVERY_PERIOD_S if on_discovered else 0.5)
+        if on_discovered and set(processes.names) <= set(observer.get_node_names()):
+            on_discovered()
+            on_discovered = None
         complete = len(observer.log.complete)
         if complete != seen:
             seen, changed_s = complete, time.monotonic()
