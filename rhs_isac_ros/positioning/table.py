@@ -183,12 +183,17 @@ class TemplateTable:
     def _products(
             self, filters: np.ndarray, cells: np.ndarray, signals: np.ndarray) -> np.ndarray:
         """Products of filters [N_B, G, Q, N_SB F] with signals, complex64 [N, N_B, C, Q]."""
-        n, n_cells = cells.shape
-        products = np.empty((n, len(filters), n_cells * filters.shape[2]), np.complex64)
-        for row, chosen in enumerate(cells):
-            gathered = filters[:, chosen].reshape(len(filters), -1, filters.shape[-1])
-            products[row] = np.matmul(gathered, signals[row, ..., None])[..., 0]
-        return products.reshape(n, len(filters), n_cells, -1)
+        (n, n_cells), (n_bands, _, *shape) = cells.shape, filters.shape
+        products = np.empty((n, n_bands, n_cells * shape[0], 1), np.complex64)
+        # One buffer for all phases remains in the cache.
+        gathered = np.empty((n_bands, n_cells, *shape), np.complex64)
+        rows = gathered.reshape(n_bands, -1, shape[1])
+        for chosen, phase, result in zip(cells, signals[..., None], products, strict=True):
+            for band, target in enumerate(gathered):
+                # The mode without checks needs no copy of the result.
+                filters[band].take(chosen, axis=0, out=target, mode='clip')
+            np.matmul(rows, phase, out=result)
+        return products.reshape(n, n_bands, n_cells, -1)
 
     def _peaks_of_each(
             self, cells: np.ndarray, outputs: np.ndarray
