@@ -16,7 +16,7 @@ from ament_index_python.packages import get_package_prefix
 from rhs_isac_ros.executables import PARENT_ID
 
 # Maximum number of users with nodes of their own, unless more are requested; more share one node,
-# because every beacon and every cycle wakes each node of a user.
+# because every process takes memory and CPU time, also between its cycles.
 MAX_USER_NODES = 16
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
