@@ -16,13 +16,16 @@ class ScenarioError(ValueError):
 
 
 def declare(
-        default: Any, low: float, high: float, text: str, unit: str = '', source: str = '') -> Any:
+        default: Any, low: float, high: float, text: str, unit: str = '', source: str = '', *,
+        label: str) -> Any:
     """Declare a scenario field.
 
     `low` and `high` are inclusive; `text` describes the field, and `source` is the publication
-    from which its model is taken, if that is not the paper.
+    from which its model is taken, if that is not the paper. `label` is the name on an axis, with
+    the symbol as mathtext and without the unit.
     """
-    meta = {'low': low, 'high': high, 'text': text, 'unit': unit, 'source': source}
+    meta = {'low': low, 'high': high, 'text': text, 'unit': unit, 'source': source,
+            'label': label}
     return dataclasses.field(default=default, metadata=meta)
 
 
