@@ -18,6 +18,7 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 from visualization_msgs.msg import MarkerArray
 
+from rhs_isac_ros.experiments.measures import MEASURES
 from rhs_isac_ros.model.deviations import Deviations
 from rhs_isac_ros.model.table1 import Table1
 from rhs_isac_ros.protocol import diagram
@@ -71,6 +72,12 @@ def scenario_table(kind):
         rows.append((code(field.name), declared['unit'], 'null' if default is None else default,
                      f'{declared["low"]:g} to {declared["high"]:g}', declared['text'] + source))
     return table(('field', 'unit', 'default', 'range', 'meaning'), rows, '22 7 11 14 46')
+
+
+def measure_table():
+    """Return a table of the measures of sweeps."""
+    rows = [(code(name), measure.unit, measure.label) for name, measure in MEASURES.items()]
+    return table(('measure', 'unit', 'meaning'), rows, '30 15 55')
 
 
 def topic_table():
@@ -181,7 +188,8 @@ def module_list(package):
 
 
 FUNCTIONS = {function.__name__: function for function in (
-    parameter_table, scenario_table, topic_table, delivery_table, message_list, state_picture,
+    parameter_table, scenario_table, measure_table, topic_table, delivery_table, message_list,
+    state_picture,
     state_table, cycle_sequence, outcome_table, module_list, dependency_table)}
 
 

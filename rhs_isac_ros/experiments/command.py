@@ -45,21 +45,26 @@ def parse_options(
                        help=f'number of trials (default: {trials})')
     if add:
         add(parser)
-    parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
-                        help='number of parallel jobs (default: one per core)')
-    parser.add_argument('--dask', type=_address, metavar='ADDRESS',
-                        help='scheduler of a Dask cluster to use instead of this machine; '
-                             'its workers need this package, and one thread each for '
-                             'accurate timing')
-    parser.add_argument('--output', type=output_folder, default=f'results/{name}', metavar='DIR',
-                        help='folder of the results (default: %(default)s); jobs that have '
-                             'results there are not repeated')
+    add_run_options(parser, f'results/{name}')
     parser.add_argument('--format', choices=PICTURE_FORMATS, default=PICTURE_FORMATS[0],
                         help='format of the picture, and suffix of its name (default: '
                              '%(default)s); drawing again repeats no job')
     options = parser.parse_args(arguments)
     options.trials = quick_trials if options.quick else options.trials or trials
     return options
+
+
+def add_run_options(parser: argparse.ArgumentParser, output: str) -> None:
+    """Add the options of `run_jobs`; `output` is the default folder of the results."""
+    parser.add_argument('--jobs', type=integer(1, 1024), default=-1, metavar='N',
+                        help='number of parallel jobs (default: one per core)')
+    parser.add_argument('--dask', type=_address, metavar='ADDRESS',
+                        help='scheduler of a Dask cluster to use instead of this machine; '
+                             'its workers need this package, and one thread each for '
+                             'accurate timing')
+    parser.add_argument('--output', type=output_folder, default=output, metavar='DIR',
+                        help='folder of the results (default: %(default)s); jobs that have '
+                             'results there are not repeated')
 
 
 def _address(text: str) -> str:

@@ -15,7 +15,7 @@ from rhs_isac_ros.model.optional import optional_import
 
 def run_jobs(
         function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path,
-        n_jobs: int = -1, dask: str | None = None) -> list[dict[str, Any]]:
+        n_jobs: int = -1, dask: str | None = None, label: str = '') -> list[dict[str, Any]]:
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
     Each result is stored as soon as it is available. After an interruption or an error, the same
@@ -31,6 +31,8 @@ def run_jobs(
         Number of parallel jobs on this machine; -1 for one per core.
     dask
         Address of the scheduler of a Dask cluster to use instead.
+    label
+        Label of the progress bar.
 
     Raises
     ------
@@ -54,7 +56,8 @@ def run_jobs(
     known = {job.name: result for job in jobs if (result := store.read(job)) is not None}
     pending = [job for job in jobs if job.name not in known]
     # None disables the bar if stderr is not a terminal.
-    with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None) as bar:
+    with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None,
+              desc=label or None) as bar:
         if pending:
             job_results = (run_on_cluster(function, pending, dask) if dask
                            else run_locally(function, pending, n_jobs))

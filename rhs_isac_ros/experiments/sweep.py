@@ -1,0 +1,247 @@
+"""Sweeps: measures over a product of settings, with one result for each setting and measure."""
+
+import csv
+import dataclasses
+import functools
+import hashlib
+import io
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros import __version__
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.experiments.jobs import Job
+from rhs_isac_ros.experiments.measures import MEASURES, Interval, measured
+from rhs_isac_ros.experiments.sweep_jobs import (
+    BLOCK,
+    BOUND,
+    CRLB,
+    KINDS,
+    OPTIMIZE,
+    RANDOM,
+    design,
+    evaluate,
+    families,
+    plain_codebook,
+    with_power,
+)
+from rhs_isac_ros.experiments.sweep_settings import FIELDS, Setting, plain
+from rhs_isac_ros.experiments.trials import run_jobs
+from rhs_isac_ros.model import Scenario
+
+# A codebook fits only scenarios with the same values of these fields.
+_STRUCTURE = ('center_frequencies_hz', 'n_subbands', 'n_frames', 'elements_per_side', 'n_feeds',
+              'feed_positions_m', 'amplitude_levels')
+
+
+class Results(NamedTuple):
+    """Quantities of a setting at all positions.
+
+    Attributes
+    ----------
+    setting, codebooks
+        The setting and its codebooks.
+    quantities
+        The quantities by name, float64 [codebooks, positions].
+    """
+
+    setting: Setting
+    codebooks: tuple[Codebook, ...]
+    quantities: Mapping[str, np.ndarray]
+
+
+class Point(NamedTuple):
+    """The value of a measure in a setting, and the ids of the codebooks."""
+
+    setting: Setting
+    measure: str
+    interval: Interval
+    codebook_ids: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """What to measure, and where.
+
+    Attributes
+    ----------
+    base
+        Scenario of the values that are not varied.
+    settings
+        The settings, see `settings_of`.
+    measures
+        Keys of `MEASURES`.
+    n_positions
+        Positions of each setting; they are the same in all settings with the same region.
+    seed
+        Seed of positions, signals and codebooks.
+    objective, steps
+        Objective and maximum number of steps of an optimisation.
+    optimize_for
+        Fields whose values the optimisation of a codebook takes from the setting, while other
+        fields have their base values; None for all. Fields that determine which codebooks fit are
+        always included.
+    repeats
+        Codebooks of each setting, with successive seeds, if they are optimised or random.
+
+    Raises
+    ------
+    CodebookError
+        If a file contains no codebook, or one that does not fit a setting.
+    ScenarioError
+        If the base values contradict those that an optimisation takes from a setting.
+    """
+
+    base: Scenario
+    settings: Sequence[Setting]
+    measures: Sequence[str]
+    n_positions: int = 2000
+    seed: int = 0
+    objective: str = 'ambiguity'
+    steps: int = 300
+    optimize_for: Sequence[str] | None = None
+    repeats: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the codebooks of files and the scenarios of the others."""
+        for setting in self.settings:
+            if setting.codebook in KINDS:
+                self.scenario_of_codebook(setting)
+                continue
+            try:
+                _fitted(self._files[setting.codebook], setting)
+            except CodebookError as error:
+                varied = ', '.join(f'{name} = {plain(v)}' for name, v in setting.varied.items())
+                raise CodebookError(f'{setting.codebook}: {error}; setting {varied}') from None
+
+    @functools.cached_property
+    def _files(self) -> dict[str, Codebook]:
+        names = {setting.codebook for setting in self.settings} - {*KINDS}
+        return {name: Codebook.load(name) for name in sorted(names)}
+
+    def scenario_of_codebook(self, setting: Setting) -> Scenario:
+        """Return the scenario that the codebook of a setting is made for."""
+        if self.optimize_for is None or setting.codebook != OPTIMIZE:
+            return setting.scenario
+        taken = {name: getattr(setting.scenario, name)
+                 for name in (*_STRUCTURE, *self.optimize_for) if name in FIELDS}
+        return dataclasses.replace(self.base, **taken)
+
+    def designs(self, setting: Setting) -> list[Job]:
+        """Return the jobs that make the codebooks of a setting, none if it is a file."""
+        if setting.codebook not in KINDS:
+            return []
+        arguments: dict[str, Any] = {
+            'scenario': self.scenario_of_codebook(setting).changes(), 'kind': setting.codebook}
+        if setting.codebook == OPTIMIZE:
+            arguments |= {'objective': self.objective, 'steps': self.steps}
+        repeats = self.repeats if setting.codebook in (OPTIMIZE, RANDOM) else 1
+        return [_job('codebook', {**arguments, 'seed': self.seed + repeat})
+                for repeat in range(repeats)]
+
+    def blocks(self, setting: Setting, codebook: Codebook) -> dict[str, list[Job]]:
+        """Return the jobs that evaluate a codebook in a setting, by family of quantities."""
+        quantities = [MEASURES[measure].quantity for measure in self.measures]
+        common = {'scenario': setting.scenario.changes(), 'codebook': plain_codebook(codebook),
+                  'seed': self.seed}
+        return {family: [_job(family, {
+            **common, 'family': family, 'first': first, 'n': min(BLOCK, self.n_positions - first),
+            **({} if family in (CRLB, BOUND) else {'estimator': setting.estimator})})
+            for first in range(0, self.n_positions, BLOCK)] for family in families(quantities)}
+
+    def codebooks(self, setting: Setting, made: Mapping[str, Mapping[str, Any]]) -> list[Codebook]:
+        """Return the codebooks of a setting, from the results of their jobs by name."""
+        books = [Codebook.from_parameters(dict(made[job.name])) for job in self.designs(setting)]
+        return [_fitted(book, setting)
+                for book in books or [self._files[setting.codebook]]]
+
+
+def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
+              ) -> list[Point]:
+    """Return the measures of the results of `run_blocks`, with their intervals, in order.
+
+    Arguments and errors are those of `run_blocks`.
+    """
+    return [Point(results.setting, name,
+                  measured(MEASURES[name], results.quantities[MEASURES[name].quantity]),
+                  tuple(codebook.id for codebook in results.codebooks))
+            for results in run_blocks(sweep, folder, n_jobs, dask) for name in sweep.measures]
+
+
+def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
+               ) -> list[Results]:
+    """Run the jobs of a sweep that have no stored result, and return the results in order.
+
+    Parameters
+    ----------
+    folder
+        Folder of the stored results, which several sweeps may share.
+    n_jobs, dask
+        See `run_jobs`; errors are the same.
+    """
+    designs = _distinct(job for setting in sweep.settings for job in sweep.designs(setting))
+    made = _results(design, designs, folder, n_jobs, dask, 'codebooks')
+    codebooks = [sweep.codebooks(setting, made) for setting in sweep.settings]
+    blocks = [[sweep.blocks(setting, codebook) for codebook in of_setting]
+              for setting, of_setting in zip(sweep.settings, codebooks, strict=True)]
+    jobs = _distinct(job for of_setting in blocks for of_codebook in of_setting
+                     for of_family in of_codebook.values() for job in of_family)
+    found = _results(evaluate, jobs, folder, n_jobs, dask, 'positions')
+    return [Results(setting, tuple(of_setting), _stacked(of_blocks, found))
+            for setting, of_setting, of_blocks in zip(
+                sweep.settings, codebooks, blocks, strict=True)]
+
+
+def table(sweep: Sweep, points: Sequence[Point]) -> str:
+    """Return the points as CSV: a row for each, with all settings."""
+    stream = io.StringIO()
+    rows = csv.writer(stream, lineterminator='\n')
+    rows.writerow(['measure', 'value', 'low', 'high', 'unit', 'estimator', 'codebook',
+                   'codebook_ids', 'objective', 'steps', 'repeats', 'positions', 'seed',
+                   'version', 'scenario', *FIELDS])
+    for point in points:
+        setting = point.setting
+        optimised = setting.codebook == OPTIMIZE
+        rows.writerow([
+            point.measure, *(f'{number:.9g}' for number in point.interval),
+            MEASURES[point.measure].unit, setting.estimator, setting.codebook,
+            ' '.join(point.codebook_ids), sweep.objective if optimised else '',
+            sweep.steps if optimised else '', len(point.codebook_ids), sweep.n_positions,
+            sweep.seed, __version__, setting.scenario.id,
+            *map(plain, setting.scenario.fields().values())])
+    return stream.getvalue()
+
+
+def _fitted(codebook: Codebook, setting: Setting) -> Codebook:
+    """Return a codebook with the power of a setting, or raise CodebookError if it does not fit."""
+    fitted = with_power(codebook, setting.scenario.max_power_w)
+    fitted.check(setting.scenario)
+    return fitted
+
+
+def _stacked(blocks: Sequence[Mapping[str, Sequence[Job]]],
+             found: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Return the quantities by name, float64 [codebooks, positions], from results of blocks."""
+    return {quantity: np.array([
+        np.concatenate([found[job.name][quantity] for job in of_codebook[family]])
+        for of_codebook in blocks])
+        for family, (first, *_) in blocks[0].items() for quantity in found[first.name]}
+
+
+def _job(kind: str, arguments: dict[str, Any]) -> Job:
+    digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()
+    return Job(f'{kind}-{digest[:24]}', arguments)
+
+
+def _distinct(jobs: Iterable[Job]) -> list[Job]:
+    return list({job.name: job for job in jobs}.values())
+
+
+def _results(function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path,
+             n_jobs: int, dask: str | None, label: str) -> dict[str, dict[str, Any]]:
+    results = run_jobs(function, jobs, folder, n_jobs, dask, label)
+    return {job.name: result for job, result in zip(jobs, results, strict=True)}

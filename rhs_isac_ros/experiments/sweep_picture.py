@@ -1,0 +1,243 @@
+"""The picture of a sweep: a panel for each measure, with intervals on every point."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.experiments.measures import MEASURES
+from rhs_isac_ros.experiments.sweep import Point
+from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, plain
+from rhs_isac_ros.model.gain_pattern import GainPattern
+from rhs_isac_ros.model.pictures import (
+    COLUMN_IN,
+    LOOKS,
+    PAGE_IN,
+    Look,
+    look,
+    new_panels,
+    paper_style,
+)
+
+# Heights of a row of panels, of the legend, and of a further line of labels.
+_PANEL_IN, _LEGEND_IN, _LINE_IN = 2.2, 0.4, 0.13
+# Positive values that span more are drawn on a logarithmic scale, unless they are capacities or
+# shares.
+_WIDE = 8.0
+_LOGARITHMIC = ('m', 'm²')
+# Up to this ratio, a logarithmic axis has more labels than those of the decades.
+_FEW_DECADES = 200
+# Horizontal distance of lines relative to the axis, so that intervals do not cover each other.
+_SHIFT = 0.01
+# With more values, the ticks are not at the values.
+_MAX_TICKS = 8
+
+
+class _Line(NamedTuple):
+    """A line of a panel: its points, and how to draw it."""
+
+    points: Sequence[Point]
+    label: str
+    look: Look
+    fill: str
+    shift: float
+
+
+@paper_style('drawing the sweep')
+def draw(axes: Sequence[Axis], points: Sequence[Point],
+         panels: Sequence[Sequence[str]]) -> Any:
+    """Draw points, and return the `matplotlib.figure.Figure`.
+
+    The first axis is that of the panels, the second one has a line for each value, and each
+    combination of the others has a row of panels. The columns are `panels`, which list measures.
+    """
+    first, *others = [axis.ordered() for axis in axes]
+    lines, rows = others[:1], others[1:]
+    combinations = list(dict.fromkeys(_key(point, rows) for point in points))
+    joined = [names for names in panels if len(names) > 1]
+    n_lines = max(_text(first, values[0]).count(', ') for values in first.values)
+    figure, grid, above = new_panels(
+        COLUMN_IN if len(panels) == 1 else PAGE_IN * max(len(panels) / 3, 1),
+        _PANEL_IN * len(combinations) + _LEGEND_IN * bool(lines or joined) + _LINE_IN * n_lines,
+        len(combinations), len(panels), sharex=True)
+    for panel, top in zip(grid[1:].flat, np.tile(grid[0], len(combinations) - 1), strict=True):
+        panel.sharey(top)
+    for row, combination in zip(grid, combinations, strict=True):
+        inside = [point for point in points if _key(point, rows) == combination]
+        for panel, names in zip(row, panels, strict=True):
+            draw_panel(panel, first, lines, inside, names)
+            if rows:
+                panel.set_title(', '.join(
+                    f'{_label(axis)}: {_text(axis, value)}'
+                    for axis, value in zip(rows, combination, strict=True)))
+    for panel in grid[:-1].flat:
+        panel.set_xlabel('')
+    if lines or joined:
+        add_legend(above, grid[0], lines, joined)
+    return figure
+
+
+def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence[Point],
+               names: Sequence[str]) -> None:
+    """Draw measures of one unit over the first axis, with a line for each value of the others."""
+    values = [entry[0] for entry in first.values]
+    numeric = all(isinstance(value, int | float) for value in values)
+    places = np.array(values if numeric else range(len(values)), float)
+    if numeric:
+        _set_scale(panel, values)
+    results = [point.interval.value for point in points if point.measure in names]
+    finite = [value for value in results if np.isfinite(value)]
+    factor, unit = _scale(MEASURES[names[0]].unit, finite)
+    if unit in _LOGARITHMIC and finite and 0 < min(finite) * _WIDE < max(finite):
+        _set_logarithmic(panel, max(finite) / min(finite))
+    for line in _lines(others, points, names):
+        # Infinite values cannot be drawn.
+        own = [point for point in line.points if np.isfinite(point.interval.value)]
+        ranks = [values.index(point.setting.varied[first.fields[0]]) for point in own]
+        _draw_line(panel, _shifted(panel, places, line.shift)[ranks], factor
+                   * np.array([point.interval for point in own]).reshape(-1, 3), line)
+    if not numeric or len(values) <= _MAX_TICKS:
+        # Lists of numbers would not fit beside each other.
+        panel.set_xticks(places, [_text(first, value).replace(', ', '\n') for value in values])
+        panel.set_xticks([], minor=True)
+    label = MEASURES[names[0]].label if len(names) == 1 else 'error or bound'
+    panel.set(xlabel=_label(first), ylabel=f'{label} [{unit}]')
+    panel.grid(True)
+
+
+def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
+               joined: Sequence[Sequence[str]] = ()) -> None:
+    """Draw the legend of all panels, which share their lines, in other axes.
+
+    `joined` are the measures of the panels that have several.
+    """
+    found: dict[str, Any] = {}
+    for panel in panels:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    if lines:
+        for names in joined:
+            found |= _styles(names)
+    title = ''.join(f'{_label(axis)}; ' for axis in lines)
+    wide = place.figure.get_figwidth() > COLUMN_IN
+    place.legend(found.values(), found, loc='lower center', ncols=4 if wide else 2,
+                 title=f'{title}bars: 95 % intervals')
+
+
+def shown(name: str, value: Any) -> str:
+    """Return a value of a field as a short text for a legend or an axis."""
+    if isinstance(value, GainPattern):
+        return value.name
+    if name == 'center_frequencies_hz':
+        return ', '.join(f'{entry / 1e9:.4g}' for entry in value) + ' GHz'
+    if isinstance(value, float | int):
+        return f'{value:g}'
+    return plain(value).rpartition('/')[2].removesuffix('.yaml')
+
+
+def _text(axis: Axis, value: Any) -> str:
+    text = shown(axis.fields[0], value)
+    return text.replace('-', '−') if isinstance(value, float | int) else text
+
+
+def is_geometric(values: Sequence[float]) -> bool:
+    """Return whether the ratios of ascending values vary less than their differences."""
+    if len(values) < 3 or min(values) <= 0:
+        return False
+    steps, ratios = np.diff(values), np.diff(np.log(values))
+    spread, spread_of_ratios = (float(parts.std() / parts.mean()) for parts in (steps, ratios))
+    return spread_of_ratios < spread
+
+
+def _set_scale(panel: Any, values: Sequence[float]) -> None:
+    """Set the scale of the x axis: logarithmic for geometric values, also if zero precedes."""
+    if is_geometric(values):
+        panel.set_xscale('log')
+    elif values[0] == 0 and is_geometric(values[1:]):
+        panel.set_xscale('symlog', linthresh=values[1], linscale=0.3)
+
+
+def _set_logarithmic(panel: Any, ratio: float) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter
+    panel.set_yscale('log')
+    if ratio < _FEW_DECADES:
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.yaxis.set_major_formatter('{x:g}')
+        panel.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _scale(unit: str, values: Sequence[float]) -> tuple[float, str]:
+    """Return a factor for the values of a panel, and the unit that they then have."""
+    largest = max(map(abs, values), default=0)
+    for size, prefix in ((1e6, 'M'), (1e3, 'k')):
+        if unit == 'bit/s' and largest >= size:
+            return 1 / size, prefix + unit
+    return 1.0, unit
+
+
+def _lines(others: Sequence[Axis], points: Sequence[Point], names: Sequence[str]) -> list[_Line]:
+    """Return the lines of a panel.
+
+    Values of the other axes differ in colour and marker, measures in line style and fill. The
+    line style distinguishes the values, too, if there is one measure.
+    """
+    keys = list(dict.fromkeys(_key(point, others) for point in points))
+    lines = []
+    for rank, key in enumerate(keys):
+        for number, name in enumerate(names):
+            own = [point for point in points
+                   if _key(point, others) == key and point.measure == name]
+            style = look(rank if others else number)
+            if len(names) > 1:
+                style = style._replace(line=LOOKS[number].line)
+            label = ', '.join(map(_text, others, key)) if others else MEASURES[name].label
+            place = rank * len(names) + number - (len(keys) * len(names) - 1) / 2
+            lines.append(_Line(own, label, style, 'white' if number else style.colour,
+                               _SHIFT * place))
+    return lines
+
+
+def _shifted(panel: Any, places: np.ndarray, shift: float) -> np.ndarray:
+    """Move places on the x axis of a panel by a share of their range."""
+    scale = panel.xaxis.get_transform()
+    drawn = scale.transform(places)
+    moved: np.ndarray = scale.inverted().transform(drawn + shift * np.ptp(drawn))
+    return moved
+
+
+def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) -> None:
+    value, low, high = intervals.T
+    bars = panel.errorbar(
+        x, value, np.nan_to_num(np.maximum([value - low, high - value], 0)),
+        color=line.look.colour, linestyle=line.look.line, marker=line.look.marker,
+        markerfacecolor=line.fill, label=line.label)
+    for bar in bars.lines[2]:
+        bar.set_linewidth(0.8)
+
+
+def _styles(names: Sequence[str]) -> dict[str, Any]:
+    """Return marks for the measures of a panel by their labels."""
+    from matplotlib.lines import Line2D
+    handles = {}
+    for number, name in enumerate(names):
+        style: Any = LOOKS[number].line
+        handles[MEASURES[name].label] = Line2D(
+            [], [], color='0.4', linestyle=style, marker='o',
+            markerfacecolor='white' if number else '0.4')
+    return handles
+
+
+def _key(point: Point, axes: Sequence[Axis]) -> tuple[Any, ...]:
+    return tuple(point.setting.varied[axis.fields[0]] for axis in axes)
+
+
+def _unit(name: str) -> str:
+    return str(FIELDS[name].metadata['unit']) if name in FIELDS else ''
+
+
+def _label(axis: Axis) -> str:
+    """Return name and symbol of the first field of an axis, and its unit unless values have it."""
+    name = axis.fields[0]
+    label = str(FIELDS[name].metadata['label']) if name in FIELDS else name
+    unit = _unit(name)
+    return f'{label} [{unit}]' if unit and name != 'center_frequencies_hz' else label

@@ -1,0 +1,141 @@
+"""The command: the same files however the jobs run, and errors before anything runs."""
+
+import csv
+import sys
+
+import pytest
+
+from rhs_isac_ros.experiments import __main__, sweep_command
+from rhs_isac_ros.experiments import sweep as sweep_module
+
+pytest.importorskip('joblib')
+pytest.importorskip('matplotlib')
+
+SMALL = 'elements_per_side: 4\nn_subbands: 2\nn_feeds: 2\nn_frames: 1\n'
+FILES = ('sweep.csv', 'sweep.png')
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """Callable that runs a sweep of two settings in a folder, and returns its exit code."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'small.yaml').write_text(SMALL, encoding='utf-8')
+
+    def run(folder, *options):
+        return __main__.main([
+            'sweep', '--scenario', 'small.yaml', '--vary', 'n_frames=1,2', '--measure',
+            'crlb,mse', '--codebook', 'random', '--positions', '260', '--output', folder,
+            *options])
+    return run
+
+
+def files(folder):
+    return [(folder / name).read_bytes() for name in FILES]
+
+
+def test_processes_a_cluster_and_an_interrupted_run_write_the_same_files(
+        sweep, tmp_path, monkeypatch, capsys):
+    assert sweep('two', '--jobs', '2') == 0
+    shown = capsys.readouterr().out
+    assert 'written: two/sweep.csv and two/sweep.png' in shown
+    assert '| n_frames | ' in shown
+
+    distributed = pytest.importorskip('distributed')
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False,
+                                  dashboard_address=':0') as cluster:
+        # Addresses in the same process are no HOST:PORT.
+        monkeypatch.setattr('rhs_isac_ros.experiments.command._address', str)
+        assert sweep('dask', '--dask', cluster.scheduler_address) == 0
+    assert files(tmp_path / 'dask') == files(tmp_path / 'two')
+
+    done = []
+
+    def stop(**arguments):
+        if len(done) == 5:
+            raise KeyboardInterrupt
+        done.append(arguments)
+        return evaluate(**arguments)
+
+    evaluate = sweep_module.evaluate
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep_module, 'evaluate', stop)
+        assert sweep('again', '--jobs', '1') == 130
+    assert not (tmp_path / 'again' / 'sweep.csv').exists()
+    n_before = len(list((tmp_path / 'again' / 'jobs').iterdir()))
+    assert n_before == 2 + 5
+    assert sweep('again', '--jobs', '1') == 0
+    assert files(tmp_path / 'again') == files(tmp_path / 'two')
+
+
+def test_every_setting_and_measure_has_a_row(sweep, tmp_path):
+    assert sweep('folder', '--jobs', '1', '--codebook', 'optimize', '--objective', 'crlb',
+                 '--steps', '2', '--measure', 'crlb,mse,capacity', '--positions', '20', '--vary',
+                 'multipath_to_los_db=0,-10', '--picture', 'picture.svg') == 0
+    with open('folder/sweep.csv', encoding='utf-8') as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row['n_frames'], row['multipath_to_los_db'], row['measure']) for row in rows] == [
+        (frames, level, measure) for frames in '12' for level in ('-10.0', '0.0')
+        for measure in ('crlb', 'mse', 'capacity')]
+    assert {row['elements_per_side'] for row in rows} == {'4'}
+    assert (tmp_path / 'picture.svg').read_text(encoding='utf-8').startswith('<?xml')
+
+
+def test_without_matplotlib_the_table_is_written(sweep, tmp_path, monkeypatch, capsys):
+    find = sweep_command.importlib.util.find_spec
+    monkeypatch.setattr(sweep_command.importlib.util, 'find_spec', lambda name, *arguments: (
+        None if name == 'matplotlib' else find(name, *arguments)))
+    assert sweep('folder', '--jobs', '1', '--measure', 'crlb') == 0
+    assert 'needs matplotlib, which is not installed (pip install' in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / 'folder').iterdir()} == {'jobs', 'sweep.csv'}
+    with pytest.raises(SystemExit, match='2'):
+        sweep('folder', '--picture', 'a.png')
+    assert 'drawing needs matplotlib' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('options', 'expected'), [
+    ([], 'required: --vary'),
+    (['--vary', 'n_frame=1'], 'argument --vary: n_frame: unknown field, expected one of n_frames'),
+    (['--vary', 'n_frames=1,0'], 'argument --vary: n_frames: 0, expected 1 to 4096'),
+    (['--vary', 'n_frames=1,1'], 'argument --vary: n_frames: 1 more than once'),
+    (['--vary', 'n_frames=1', '--vary', 'n_frames=2'], 'n_frames: varied more than once'),
+    (['--with', 'n_frames=1'], 'argument --with: expected after --vary'),
+    (['--vary', 'n_frames=1,2', '--with', 'n_feeds=1'], 'n_feeds: 1 values, expected 2'),
+    (['--vary', 'n_frames=1', '--measure', 'mse,fame'], "argument --measure: 'fame', expected"),
+    (['--vary', 'n_frames=1', '--measure', 'mse+rmse'], 'expected a measure in m²'),
+    (['--vary', 'roi_size_m=[30,1,1]'], 'reaches behind the surface'),
+    (['--vary', 'n_frames=1', '--estimator', 'neural'], "estimator: 'neural', expected bayes, ml"),
+    (['--vary', 'estimator=bayes,magic'], "estimator: 'magic', expected bayes, ml"),
+    (['--vary', 'codebook=optimize,none.yaml'], "'none.yaml', expected directional"),
+    (['--vary', 'codebook=bad.yaml'], 'bad.yaml: expected ros__parameters'),
+    (['--vary', 'n_frames=1', '--scenario', 'bad.yaml'], 'bad.yaml: colour: unknown field'),
+    (['--vary', 'n_frames=1', '--optimize-for', 'colour'], "invalid choice: 'colour'"),
+    (['--vary', 'n_frames=1', '--picture', 'a.jpg'], 'ends in .png, .pdf, .svg'),
+    (['--vary', 'n_frames=1', '--positions', '0'], 'argument --positions: 0'),
+    (['--vary', 'n_frames=' + ','.join(map(str, range(1, 200))), '--vary',
+      'n_feeds=' + ','.join(map(str, range(1, 200)))], '39601 settings, expected at most 10000'),
+])
+def test_an_error_is_one_line_and_nothing_runs(options, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'bad.yaml').write_text('colour: red\n', encoding='utf-8')
+    with pytest.raises(SystemExit, match='2'):
+        sweep_command.main(options)
+    errors = capsys.readouterr().err
+    assert expected in errors
+    assert len(errors.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ['bad.yaml']
+
+
+def test_the_help_lists_experiments_fields_and_measures(capsys):
+    for arguments, expected in ((['--help'], ['sweep']), (['sweep', '--help'], [
+            'n_frames', 'codebook, estimator', 'global_bound', '--optimize-for'])):
+        with pytest.raises(SystemExit, match='0'):
+            __main__.main(arguments)
+        shown = ' '.join(capsys.readouterr().out.split())
+        assert all(text in shown for text in expected)
+
+
+def test_the_arguments_are_those_of_the_process_by_default(monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', ['experiments', 'fly'])
+    with pytest.raises(SystemExit, match='2'):
+        __main__.main()
+    assert "invalid choice: 'fly'" in capsys.readouterr().err

@@ -1,0 +1,119 @@
+"""The jobs of a sweep: codebooks, and quantities at blocks of positions."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.codebook import Codebook, random_codebook
+from rhs_isac_ros.experiments import sweep_jobs
+from rhs_isac_ros.experiments.sweep_jobs import design, evaluate, families, with_power
+from rhs_isac_ros.link import capacity_report, choose_beam
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+
+SMALL = {'elements_per_side': 4, 'n_subbands': 2, 'n_feeds': 2, 'n_frames': 2}
+WORLD = Scenario(**SMALL)
+
+
+@pytest.fixture(scope='module')
+def codebook():
+    return random_codebook(WORLD, np.random.default_rng(3))
+
+
+@pytest.fixture
+def case(codebook):
+    return {'scenario': SMALL, 'codebook': sweep_jobs.plain_codebook(codebook), 'seed': 5}
+
+
+@pytest.mark.parametrize(('quantities', 'expected'), [
+    (['crlb_m2', 'bound_m2'], ['crlb', 'bound']),
+    (['squared_error_m2', 'inside'], ['error']),
+    (['capacity_bps', 'squared_error_m2'], ['capacity']),
+    (['crlb_m2', 'capacity_bps', 'loss_bps'], ['crlb', 'loss'])])
+def test_one_job_computes_all_quantities_of_the_estimates(quantities, expected):
+    assert families(quantities) == expected
+
+
+def test_results_are_those_of_the_library(case, codebook):
+    positions, received = simulate_pairs(WORLD, codebook, 6, 5, 10)
+    found = make_estimator('bayes', WORLD, codebook).estimate(received)
+    result = evaluate('loss', **case, first=10, n=6, estimator='bayes')
+    assert result['squared_error_m2'] == pytest.approx(
+        np.sum((found.mean - positions)**2, axis=1))
+    beam = choose_beam(WORLD, found.mean[2], found.covariance[2]).beam
+    report = capacity_report(WORLD, beam, positions[2])
+    assert [result[name][2] for name in ('capacity_bps', 'perfect_bps', 'loss_bps')] == (
+        pytest.approx([report.actual_bps, report.perfect_bps, report.loss_bps]))
+    assert result['fix'] == [1.0] * 6
+    assert evaluate('crlb', **case, first=10, n=6)['crlb_m2'] == pytest.approx(
+        crlb(WORLD, codebook, positions))
+    short = evaluate('capacity', **case, first=10, n=6, estimator='bayes')
+    assert short == {name: result[name] for name in short}
+    json.dumps(result)
+
+
+def test_settings_share_their_positions(case, monkeypatch):
+    seen = []
+    monkeypatch.setattr(sweep_jobs, 'crlb', lambda world, book, positions: seen.append(
+        positions) or positions[:, 0])
+    evaluate('crlb', **case, first=0, n=4)
+    evaluate('crlb', **case | {'scenario': {**SMALL, 'multipath_to_los_db': -20.0}}, first=0, n=4)
+    evaluate('crlb', **case | {'seed': 6}, first=0, n=4)
+    assert np.array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0], seen[2])
+
+
+def test_a_position_without_fix_counts_with_the_region(case, monkeypatch):
+    class Nothing:
+        name = 'nothing'
+
+        def estimate(self, received):
+            n = len(received)
+            return Estimate(np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), ('weak',) * n)
+
+    monkeypatch.setattr(sweep_jobs, 'make_estimator', lambda *_: Nothing())
+    positions, _ = simulate_pairs(WORLD, Codebook.from_parameters(case['codebook']), 3, 5)
+    result = evaluate('capacity', **case, first=0, n=3, estimator='nothing')
+    assert result['fix'] == result['inside'] == [0.0] * 3
+    assert result['squared_error_m2'] == pytest.approx(
+        np.sum((np.array(WORLD.roi_center_m) - positions)**2, axis=1))
+    assert min(result['capacity_bps']) > 0
+
+
+def test_the_global_bound_of_a_coarse_lattice_is_missing(case, monkeypatch):
+    found = evaluate('bound', **case, first=0, n=4)['bound_m2']
+    assert len(found) == 4
+    assert np.isfinite(found).all()
+    assert found != evaluate('bound', **case, first=250, n=4)['bound_m2']
+    monkeypatch.setattr(sweep_jobs, '_MAX_COARSENESS', 0.5)
+    assert np.isnan(evaluate('bound', **case, first=0, n=4)['bound_m2']).all()
+
+
+def test_codebooks_of_every_kind_fit_their_scenario():
+    arguments = {'optimize': {'objective': 'crlb', 'steps': 2}}
+    books = {}
+    for kind in sweep_jobs.KINDS:
+        made = design(SMALL, kind, 1, **arguments.get(kind, {}))
+        books[kind] = Codebook.from_parameters(json.loads(json.dumps(made)))
+        books[kind].check(WORLD)
+    assert len({book.id for book in books.values()}) == 3
+    assert design(SMALL, 'random', 2)['codebook.id'] != books['random'].id
+
+
+def test_an_interrupted_optimisation_is_no_result(monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    # The package has a function of the same name.
+    module = sys.modules['rhs_isac_ros.codebook.optimize']
+    monkeypatch.setattr(module, '_minimizer', lambda *_: stop)
+    with pytest.raises(KeyboardInterrupt):
+        design(SMALL, 'optimize', 1, 'crlb', 2)
+
+
+def test_the_power_of_a_codebook_can_be_changed(codebook):
+    louder = Scenario(**SMALL, max_power_w=0.5)
+    with_power(codebook, 0.5).check(louder)

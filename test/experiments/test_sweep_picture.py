@@ -1,0 +1,152 @@
+"""The picture of a sweep: panels, lines, scales and intervals."""
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.experiments.measures import Interval
+from rhs_isac_ros.experiments.sweep import Point
+from rhs_isac_ros.experiments.sweep_picture import draw, is_geometric, shown
+from rhs_isac_ros.experiments.sweep_settings import FIELDS, parse_axis, settings_of
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.pictures import write_picture
+
+pytest.importorskip('matplotlib')
+
+
+def drawn(*texts, panels=(('mse',),), value=lambda point: 1.0, base=Scenario()):  # noqa: B008
+    axes = [parse_axis(text) for text in texts]
+    points = []
+    for setting in settings_of(base, axes, 'optimize', 'bayes'):
+        for measure in [name for panel in panels for name in panel]:
+            number = value(setting.scenario)
+            points.append(Point(setting, measure, Interval(number, 0.8 * number, 1.3 * number),
+                                ()))
+    return draw(axes, points, panels)
+
+
+def panels_of(figure):
+    return [axes for axes in figure.axes if axes.get_ylabel()]
+
+
+def test_a_panel_for_each_measure_and_a_line_for_each_value():
+    figure = drawn('n_frames=1,2,4', 'multipath_to_los_db=0,-10', panels=[['mse'], ['capacity']])
+    left, right = panels_of(figure)
+    assert left.get_ylabel() == 'mean squared error [m²]'
+    assert right.get_ylabel() == 'capacity [bit/s]'
+    assert left.get_xlabel() == 'frames $F$'
+    assert left.get_xscale() == 'log'
+    assert [tick.get_text() for tick in left.get_xticklabels()] == ['1', '2', '4']
+    labels = [bars.get_label() for bars in left.containers]
+    assert labels == ['−10', '0']
+    (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+    assert legend.get_title().get_text() == (
+        'multipath / direct path [dB]; bars: 95 % intervals')
+
+
+def test_every_point_has_its_interval():
+    (panel,) = panels_of(drawn('n_frames=1,2,3,4', value=lambda scenario: scenario.n_frames))
+    (bars,) = panel.containers
+    ends = [segment[:, 1].tolist() for segment in bars.lines[2][0].get_segments()]
+    assert ends == [pytest.approx([0.8 * n, 1.3 * n]) for n in (1, 2, 3, 4)]
+    assert panel.get_xscale() == 'linear'
+
+
+def test_lines_differ_in_colour_marker_and_style():
+    (panel,) = panels_of(drawn('n_frames=1,2', 'n_feeds=1,2,3'))
+    lines = [bars.lines[0] for bars in panel.containers]
+    for look in (lambda line: line.get_color(), lambda line: line.get_marker(),
+                 lambda line: line.get_linestyle()):
+        assert len({look(line) for line in lines}) == 3
+    # Intervals at the same place do not cover each other.
+    assert len({line.get_xdata()[0] for line in lines}) == 3
+
+
+def legend_of(figure):
+    (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_measures_of_one_panel_differ_in_style():
+    figure = drawn('n_frames=1,2', 'n_feeds=1,2', panels=[['rmse', 'root_crlb'], ['capacity']])
+    panel, _ = panels_of(figure)
+    assert len({bars.lines[0].get_linestyle() for bars in panel.containers}) == 2
+    assert len({bars.lines[0].get_color() for bars in panel.containers}) == 2
+    assert legend_of(figure) == ['1', '2', 'root mean squared error', 'root of the average CRLB']
+
+
+def test_measures_alone_differ_in_everything():
+    figure = drawn('n_frames=1,2', panels=[['rmse', 'root_crlb']])
+    (panel,) = panels_of(figure)
+    assert len({bars.lines[0].get_color() for bars in panel.containers}) == 2
+    assert legend_of(figure) == ['root mean squared error', 'root of the average CRLB']
+
+
+def test_further_fields_have_rows_of_panels():
+    figure = drawn('n_frames=1,2', 'n_feeds=1,2', 'elements_per_side=4,6,8', 'n_subbands=1,2')
+    titles = [panel.get_title() for panel in panels_of(figure)]
+    assert len(titles) == 6
+    assert titles[1] == r'elements along a side $\sqrt{N_\mathrm{E}}$: 4, sub-bands ' \
+        r'$N_\mathrm{SB}$: 2'
+
+
+def test_lists_and_names_are_places_in_their_order():
+    (panel,) = panels_of(drawn(
+        'center_frequencies_hz=[3e9],[2.5e9,3e9]', 'codebook=random,a/b.yaml'))
+    assert [tick.get_text() for tick in panel.get_xticklabels()] == ['3 GHz', '2.5\n3 GHz']
+    assert panel.get_xlabel() == 'centre frequencies $f_{c,i}$'
+    assert [bars.get_label() for bars in panel.containers] == ['random', 'b']
+
+
+@pytest.mark.parametrize(('largest', 'scale', 'unit'), [
+    (2e5, 'linear', 'kbit/s'), (2e8, 'linear', 'Mbit/s')])
+def test_capacities_have_a_prefix(largest, scale, unit):
+    (panel,) = panels_of(drawn('n_frames=1,100', panels=[['capacity']],
+                               value=lambda scenario: largest / scenario.n_frames))
+    assert panel.get_ylabel() == f'capacity [{unit}]'
+    assert panel.get_yscale() == scale
+
+
+@pytest.mark.parametrize('ratio', [10, 10_000])
+def test_errors_of_different_sizes_have_a_logarithmic_scale(ratio, tmp_path):
+    figure = drawn('n_frames=1,2', value=lambda scenario: ratio**(scenario.n_frames - 1))
+    assert panels_of(figure)[0].get_yscale() == 'log'
+    write_picture(tmp_path / 'a.svg', figure)
+
+
+def test_infinite_and_missing_values_are_left_out(tmp_path):
+    for number in (np.inf, np.nan):
+        figure = drawn('n_frames=1,2,3', value=lambda scenario, number=number: (
+            number if scenario.n_frames == 2 else 1.0))
+        assert len(panels_of(figure)[0].containers[0].lines[0].get_xdata()) == 2
+        write_picture(tmp_path / 'a.png', figure)
+    write_picture(tmp_path / 'b.png', drawn('n_frames=1,2', value=lambda _: np.nan))
+
+
+@pytest.mark.parametrize(('values', 'expected'), [
+    ([1, 2, 4, 8], True), ([1, 3, 10, 30], True), ([1, 2, 3, 4], False), ([-10, 0, 10], False),
+    ([1, 2], False), ([0, 1, 10], False)])
+def test_values_with_constant_ratios_are_geometric(values, expected):
+    assert is_geometric(values) == expected
+
+
+def test_every_label_of_a_field_can_be_drawn(tmp_path):
+    from matplotlib.figure import Figure
+    figure = Figure()
+    for field in FIELDS.values():
+        figure.text(0, 0, field.metadata['label'])
+    write_picture(tmp_path / 'labels.svg', figure)
+
+
+def test_zero_may_precede_geometric_values(tmp_path):
+    figure = drawn('timing_std_s=0,1e-9,1e-8,1e-7', 'n_feeds=1,2')
+    (panel,) = panels_of(figure)
+    assert panel.get_xscale() == 'symlog'
+    write_picture(tmp_path / 'a.png', figure)
+
+
+def test_texts_of_values():
+    assert shown('n_frames', 4) == '4'
+    assert shown('max_power_w', 1e-3) == '0.001'
+    assert shown('subband_width_hz', 125e3) == '125000'
+    assert shown('roi_center_m', (10.0, 0.0, 0.0)) == '[10.0, 0.0, 0.0]'
+    assert shown('feed_positions_m', None) == 'null'
