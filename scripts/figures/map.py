@@ -21,13 +21,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts import plan_curves
-from parts.plan_curves import BLOCK, SEED, Changes, Sizes
+from parts.plans import SEED, add_plan_options, read_plans
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments import Job, markdown_table, parse_options, run_command, run_jobs
+from rhs_isac_ros.experiments.sweep import Sweep, run_blocks
+from rhs_isac_ros.experiments.sweep_jobs import BLOCK, plain_codebook
+from rhs_isac_ros.experiments.sweep_settings import Setting
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.pictures import PAGE_IN, new_figure, paper_style, write_picture
@@ -41,7 +43,8 @@ TITLES = {'crlb': 'root of the CRLB', 'bound': 'root of the global bound',
           'error': 'root mean squared error'}
 
 
-def bound_map(scenario: Changes, codebook: Changes, phases: int) -> dict[str, Any]:
+def bound_map(scenario: Mapping[str, Any], codebook: dict[str, Any], phases: int
+              ) -> dict[str, Any]:
     """Return maps of both bounds [m^2], from the phases of the global bound."""
     world, book = Scenario(**scenario), Codebook.from_parameters(codebook)
     bound = global_bound(world, book, streams.generator(SEED, streams.HELD_OUT), phases)
@@ -61,31 +64,28 @@ def mean_map(scenario: Scenario, positions: np.ndarray, values: np.ndarray) -> n
     return means
 
 
-def maps_of(options: argparse.Namespace, sizes: Sizes) -> dict[str, dict[str, np.ndarray]]:
+def maps_of(options: argparse.Namespace, phases: int, steps: int
+            ) -> dict[str, dict[str, np.ndarray]]:
     """Run the jobs that have no results, and return the maps [m^2] and corners of each plan."""
-    plans = plan_curves.read_plans(options.plan)
-
-    def run(function: Any, jobs: Sequence[Job]) -> list[dict[str, Any]]:
-        return run_jobs(function, jobs, options.output / 'jobs', options.jobs, options.dask)
-
-    cases = {}
-    for name, plan in plans.items():
-        key = Scenario(**plan.changes).id
-        book = plan.codebook or run(plan_curves.optimise, [Job(
-            f'codebook-{key}', {'scenario': plan.changes, 'steps': sizes.steps})])[0]
-        cases[name] = {'scenario': plan.changes, 'codebook': book}
+    plans = read_plans(options.plan)
+    folder = options.output / 'jobs'
+    sweep = Sweep(
+        Scenario(),
+        [Setting({'plan': name}, Scenario(**plan.changes), plan.codebook, 'bayes')
+         for name, plan in plans.items()],
+        ['mse'], options.trials * BLOCK, SEED, steps=steps)
     maps = {}
-    for name, case in cases.items():
-        world, book = Scenario(**case['scenario']), Codebook.from_parameters(case['codebook'])
-        slug = f'{world.id}-{book.id}'
-        (bounds,) = run(bound_map, [Job(f'map-{slug}', {**case, 'phases': sizes.phases})])
-        errors = np.concatenate([entry['squared_errors_m2'] for entry in run(
-            plan_curves.locate, [Job(f'errors-{slug}-{trial}', {**case, 'trial': trial})
-                                 for trial in range(sizes.trials)])])
-        positions, _ = simulate_pairs(world, book, sizes.trials * BLOCK, SEED)
-        maps[name] = {key: np.array(bounds[key]) for key in ('crlb', 'bound')}
-        maps[name]['corners'] = world.roi_bounds_m[:, :2]
-        maps[name]['error'] = mean_map(world, positions, errors)
+    for setting, (codebook,), errors in run_blocks(sweep, folder, options.jobs, options.dask):
+        world = setting.scenario
+        case = {'scenario': world.changes(), 'codebook': plain_codebook(codebook)}
+        (bounds,) = run_jobs(
+            bound_map, [Job(f'map-{world.id}-{codebook.id}', {**case, 'phases': phases})],
+            folder, options.jobs, options.dask)
+        positions, _ = simulate_pairs(world, codebook, options.trials * BLOCK, SEED)
+        maps[setting.varied['plan']] = {
+            **{key: np.array(bounds[key]) for key in ('crlb', 'bound')},
+            'corners': world.roi_bounds_m[:, :2],
+            'error': mean_map(world, positions, errors['squared_error_m2'][0])}
     return maps
 
 
@@ -116,17 +116,17 @@ def picture(maps: Mapping[str, Mapping[str, np.ndarray]]) -> Any:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment."""
-    plan_curves.add_plan_options(parser, STEPS, QUICK_STEPS)
+    add_plan_options(parser, STEPS, QUICK_STEPS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse_options(__doc__, 'map', TRIALS, QUICK_TRIALS, arguments, add_options)
-    sizes = Sizes(options.trials, QUICK_PHASES if options.quick else PHASES,
-                  options.steps or (QUICK_STEPS if options.quick else STEPS))
+    phases = QUICK_PHASES if options.quick else PHASES
+    steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
 
     def reproduce() -> None:
-        maps = maps_of(options, sizes)
+        maps = maps_of(options, phases, steps)
         rows = [[name, *('{:.3g} to {:.3g}'.format(*np.sqrt(
             [np.nanmin(own[key]), np.nanmax(own[key])])) for key in TITLES)]
             for name, own in maps.items()]

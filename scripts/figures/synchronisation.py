@@ -22,46 +22,59 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from parts.plan_curves import Curve, Sizes, add_plan_options, evaluate, read_plans
-from parts.plan_report import write
+from parts.plans import SEED, Plan, add_plan_options, read_plans
 
-from rhs_isac_ros.experiments import parse_options, run_command
+from rhs_isac_ros.experiments import markdown_table, parse_options, run_command
+from rhs_isac_ros.experiments.sweep import Point, Sweep, run_sweep, table
+from rhs_isac_ros.experiments.sweep_jobs import BLOCK
+from rhs_isac_ros.experiments.sweep_picture import add_legend, draw_panel
+from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, Setting
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.pictures import PAGE_IN, new_panels, paper_style, write_picture
 
 TRIALS, QUICK_TRIALS = 20, 1
 STEPS, QUICK_STEPS = 600, 100
-CURVES = {
-    'band_phase_std_rad': Curve(
-        'phase of each band, standard deviation [rad]', (0, 0.1, 0.2, 0.4, 0.8, 1.6, 6.2832),
-        lambda value, plan: {'band_phase_std_rad': value}, bounds=False),
-    'timing_std_s': Curve(
-        'timing offset, standard deviation [ns]', (0, 10, 100, 1000),
-        lambda value, plan: {'timing_std_s': 1e-9 * value}, bounds=False),
-    'carrier_offset_std_hz': Curve(
-        'carrier offset, standard deviation [kHz]', (0, 0.3, 1, 3, 10),
-        lambda value, plan: {'carrier_offset_std_hz': 1e3 * value}, bounds=False)}
+CURVES: Mapping[str, Sequence[float]] = {
+    'band_phase_std_rad': (0, 0.1, 0.2, 0.4, 0.8, 1.6, 6.2832),
+    'timing_std_s': (0, 10e-9, 100e-9, 1000e-9),
+    'carrier_offset_std_hz': (0, 300, 1000, 3000, 10_000)}
+PLAN = 'plan'
+MEASURES = ('mse', 'error_median', 'rmse')
 
 
-def advice(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+def sweep_of(plans: Mapping[str, Plan], trials: int, steps: int) -> Sweep:
+    """Return the sweep of all curves; codebooks are optimised without the errors."""
+    settings = [
+        Setting({PLAN: name, field: value}, Scenario(**{**plan.changes, field: value}),
+                plan.codebook, 'bayes')
+        for field, values in CURVES.items() for name, plan in plans.items() for value in values]
+    return Sweep(Scenario(), settings, MEASURES, trials * BLOCK, SEED, steps=steps,
+                 optimize_for=())
+
+
+def points_of(points: Sequence[Point], plan: str, field: str, measure: str) -> list[Point]:
+    """Return the points of a measure on one line of a curve, in the order of its values."""
+    return [point for point in points if point.measure == measure
+            and field in point.setting.varied and point.setting.varied[PLAN] == plan]
+
+
+def advice(points: Sequence[Point], plans: Sequence[str]) -> list[str]:
     """Return for each plan the deviations at which its squared error doubles, and the check."""
-    lines = list(dict.fromkeys(entry['line'] for entry in entries))
-    sentences = []
-    for line in lines:
+    sentences, uniform = [], []
+    for plan in plans:
         limits = []
-        for name, curve in CURVES.items():
-            errors = [entry['mse_m2'] for entry in entries
-                      if (entry['line'], entry['curve']) == (line, name)]
-            unit = curve.label.rpartition('[')[2].rstrip(']')
-            at = doubling(curve.values, errors)
-            quantity = curve.label.partition(',')[0]
+        for field, values in CURVES.items():
+            errors = [point.interval for point in points_of(points, plan, field, 'mse')]
+            at = doubling(values, [error.value for error in errors])
+            label, unit = (FIELDS[field].metadata[key] for key in ('label', 'unit'))
+            quantity = label.partition(',')[0]
             limits.append(f'a {quantity} of {at:.3g} {unit}' if np.isfinite(at) else
-                          f'no {quantity} up to {curve.values[-1]:.4g} {unit}')
-        sentences.append(f'{line}: the squared error doubles at {", ".join(limits)}.')
-    uniform = [next(entry for entry in reversed(entries)
-                    if (entry['line'], entry['curve']) == (line, 'band_phase_std_rad'))
-               for line in lines]
-    numbers = ', '.join(f'{entry["mse_m2"]:.2f} ± {2 * entry["mse_error_m2"]:.2f} m² ({line})'
-                        for line, entry in zip(lines, uniform, strict=True))
-    return [*sentences, f'With a uniform phase of each band, the error is {numbers}.']
+                          f'no {quantity} up to {values[-1]:.4g} {unit}')
+        sentences.append(f'{plan}: the squared error doubles at {", ".join(limits)}.')
+        last = points_of(points, plan, 'band_phase_std_rad', 'mse')[-1].interval
+        uniform.append('{:.2f} [{:.2f}, {:.2f}] m² ({})'.format(*last, plan))
+    return [*sentences, f'With a uniform phase of each band, the error is {", ".join(uniform)}.']
 
 
 def doubling(values: Sequence[float], errors: Sequence[float]) -> float:
@@ -74,6 +87,35 @@ def doubling(values: Sequence[float], errors: Sequence[float]) -> float:
     return np.inf
 
 
+def report_of(points: Sequence[Point], plans: Sequence[str]) -> str:
+    """Return a table for each curve, and the advice."""
+    parts = []
+    for field, values in CURVES.items():
+        rows = []
+        for plan in plans:
+            columns = [points_of(points, plan, field, measure) for measure in MEASURES[:2]]
+            rows += [[plan, f'{value:g}', *(
+                '{:.3g} [{:.3g}, {:.3g}]'.format(*point.interval) for point in line)]
+                for value, *line in zip(values, *columns, strict=True)]
+        parts += [field, markdown_table([PLAN, 'value', 'MSE [m²]', 'median error [m]'], rows)]
+    return '\n\n'.join([*parts, *advice(points, plans)])
+
+
+@paper_style('drawing the figure')
+def picture(points: Sequence[Point], plans: Sequence[str]) -> Any:
+    """Draw a panel for each curve, with a line for each plan."""
+    figure, (panels,), above = new_panels(PAGE_IN, 2.8, 1, len(CURVES), sharey=True)
+    lines = Axis((PLAN,), tuple((plan,) for plan in plans))
+    for panel, (field, values) in zip(panels, CURVES.items(), strict=True):
+        own = [point for point in points if field in point.setting.varied]
+        draw_panel(panel, Axis((field,), tuple((value,) for value in values)), [lines], own,
+                   ['rmse'])
+    for panel in panels[1:]:
+        panel.set_ylabel('')
+    add_legend(above, panels, [lines])
+    return figure
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment."""
     add_plan_options(parser, STEPS, QUICK_STEPS)
@@ -83,13 +125,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse_options(
         __doc__, 'synchronisation', TRIALS, QUICK_TRIALS, arguments, add_options)
-    sizes = Sizes(options.trials, 0, options.steps or (QUICK_STEPS if options.quick else STEPS))
+    plans = read_plans(options.plan)
+    sweep = sweep_of(plans, options.trials,
+                     options.steps or (QUICK_STEPS if options.quick else STEPS))
 
     def reproduce() -> None:
-        entries = evaluate(CURVES, read_plans(options.plan), sizes, options.output / 'jobs',
-                           options.jobs, options.dask)
-        write('synchronisation', CURVES, entries, advice(entries), options.output,
-              options.format)
+        points = run_sweep(sweep, options.output / 'jobs', options.jobs, options.dask)
+        report, name = report_of(points, list(plans)), f'synchronisation.{options.format}'
+        write_picture(options.output / name, picture(points, list(plans)))
+        write_whole(options.output / 'synchronisation.csv', table(sweep, points))
+        write_whole(options.output / 'synchronisation.md',
+                    f'# Synchronisation\n\n![synchronisation]({name})\n\n{report}\n')
+        print(f'{report}\n\nwritten: {options.output}/{name}, synchronisation.csv and '
+              'synchronisation.md')
 
     return run_command(reproduce)
 

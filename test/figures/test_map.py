@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.experiments import sweep
 from rhs_isac_ros.model import Scenario
 
 pytest.importorskip('joblib')
@@ -38,11 +39,9 @@ def test_all_maps_share_one_scale_with_a_unit(figure):
 
 
 def test_the_command_maps_each_plan(figure, tmp_path, monkeypatch, capsys):
-    parts = figure.plan_curves
-    monkeypatch.setattr(parts, 'optimise', lambda scenario, steps: parts.plain(
+    monkeypatch.setattr(sweep, 'design', lambda scenario, **_: sweep.plain_codebook(
         random_codebook(Scenario(**scenario), np.random.default_rng(0))))
-    monkeypatch.setattr(parts, 'locate', lambda scenario, codebook, trial: {
-        'squared_errors_m2': [0.25] * figure.BLOCK})
+    monkeypatch.setattr(sweep, 'evaluate', lambda n, **_: {'squared_error_m2': [0.25] * n})
     monkeypatch.setattr(figure, 'bound_map', lambda scenario, codebook, phases: {
         key: np.full((figure.SQUARES, figure.SQUARES), 0.04).tolist()
         for key in ('crlb', 'bound')})

@@ -1,0 +1,84 @@
+"""Errors of synchronisation: plans, advice, and the command with jobs replaced."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.experiments import sweep
+from rhs_isac_ros.experiments.measures import Interval
+from rhs_isac_ros.experiments.sweep import Point
+from rhs_isac_ros.model import Scenario
+
+pytest.importorskip('joblib')
+pytest.importorskip('matplotlib')
+
+
+@pytest.fixture(scope='module')
+def figure(load_figure):
+    return load_figure('synchronisation')
+
+
+@pytest.fixture
+def located(monkeypatch):
+    """The blocks that were located, with the jobs replaced by formulas."""
+    def evaluate(family, scenario, codebook, seed, first, n, estimator):
+        made.append((Scenario(**scenario).id, first))
+        return {'squared_error_m2': [0.1 + Scenario(**scenario).band_phase_std_rad] * n}
+
+    made = []
+    monkeypatch.setattr(sweep, 'design', lambda scenario, **_: sweep.plain_codebook(
+        random_codebook(Scenario(**scenario), np.random.default_rng(0))))
+    monkeypatch.setattr(sweep, 'evaluate', evaluate)
+    return made
+
+
+def test_plans_have_the_same_spectrum_and_pilots(figure):
+    for plan in figure.read_plans([]).values():
+        scenario = Scenario(**plan.changes)
+        assert scenario.n_bands * scenario.n_frames == 8
+        assert 2.5e9 == min(scenario.center_frequencies_hz)
+        assert 3.0e9 == max(scenario.center_frequencies_hz)
+
+
+def test_the_error_doubles_between_the_values(figure):
+    assert figure.doubling((0, 1, 2), (1.0, 1.5, 2.5)) == 1.5
+    assert figure.doubling((0, 1), (1.0, 1.9)) == np.inf
+
+
+def test_codebooks_are_optimised_without_the_errors(figure):
+    planned = figure.sweep_of(figure.read_plans([]), 1, 10)
+    designs = {job.name for setting in planned.settings for job in planned.designs(setting)}
+    assert len(designs) == 3
+    for setting in planned.settings:
+        assert planned.scenario_of_codebook(setting).changes().keys() <= {
+            'center_frequencies_hz', 'n_frames'}
+
+
+def test_the_command_gives_advice_and_repeats_no_job(figure, located, tmp_path, capsys):
+    call = ['--quick', '--jobs', '1', '--output', str(tmp_path)]
+    assert figure.main(call) == 0
+    out = capsys.readouterr().out
+    assert 'Table I): the squared error doubles at a phase of a band of 0.1 rad, no' in out
+    assert 'With a uniform phase of each band, the error is 6.38 [6.38, 6.38] m²' in out
+    n = len(located)
+    # The point without errors is the same on all curves.
+    assert n == len(set(located)) == 3 * (7 + 3 + 4)
+    assert figure.main([*call, '--format', 'pdf']) == 0
+    assert len(located) == n
+    with open(tmp_path / 'synchronisation.csv', encoding='utf-8') as stream:
+        assert len([*csv.DictReader(stream)]) == 3 * (7 + 4 + 5) * len(figure.MEASURES)
+    assert {path.name for path in tmp_path.glob('*.p*')} == {
+        'synchronisation.png', 'synchronisation.pdf'}
+
+
+def test_the_picture_has_a_panel_for_each_error(figure):
+    points = [Point(setting, 'rmse', Interval(0.5, 0.4, 0.6), ())
+              for setting in figure.sweep_of(figure.read_plans([]), 1, 1).settings]
+    *panels, above = figure.picture(points, [*figure.read_plans([])]).axes
+    assert [panel.get_xlabel() for panel in panels] == [
+        'phase of a band, standard deviation [rad]', 'timing offset, standard deviation [s]',
+        'carrier offset, standard deviation [Hz]']
+    assert [text.get_text() for text in above.get_legend().get_texts()] == [
+        *figure.read_plans([])]
