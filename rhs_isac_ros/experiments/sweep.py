@@ -94,6 +94,8 @@ class Sweep:
         If a file contains no codebook, or one that does not fit a setting.
     ScenarioError
         If the base values contradict those that an optimisation takes from a setting.
+    ValueError
+        If a measure is unknown, or a number is out of range.
     """
 
     base: Scenario
@@ -107,7 +109,13 @@ class Sweep:
     repeats: int = 1
 
     def __post_init__(self) -> None:
-        """Check the codebooks of files and the scenarios of the others."""
+        """Check names, numbers, the codebooks of files and the scenarios of the others."""
+        for name in self.measures:
+            if name not in MEASURES:
+                raise ValueError(f'measures: {name!r}, expected some of {", ".join(MEASURES)}')
+        for name, low in (('n_positions', 1), ('repeats', 1), ('steps', 1), ('seed', 0)):
+            if getattr(self, name) < low:
+                raise ValueError(f'{name}: {getattr(self, name)}, expected at least {low}')
         for setting in self.settings:
             if setting.codebook in KINDS:
                 self.scenario_of_codebook(setting)
@@ -201,17 +209,19 @@ def table(sweep: Sweep, points: Sequence[Point]) -> str:
     stream = io.StringIO()
     rows = csv.writer(stream, lineterminator='\n')
     rows.writerow(['measure', 'value', 'low', 'high', 'unit', 'estimator', 'codebook',
-                   'codebook_ids', 'objective', 'steps', 'repeats', 'positions', 'seed',
-                   'version', 'scenario', *FIELDS])
+                   'codebook_ids', 'codebook_scenario', 'objective', 'steps', 'repeats',
+                   'positions', 'seed', 'version', 'scenario', *FIELDS])
     for point in points:
         setting = point.setting
         optimised = setting.codebook == OPTIMIZE
+        origin = sweep.scenario_of_codebook(setting).changes()
         rows.writerow([
             point.measure, *(f'{number:.9g}' for number in point.interval),
             MEASURES[point.measure].unit, setting.estimator, setting.codebook,
-            ' '.join(point.codebook_ids), sweep.objective if optimised else '',
-            sweep.steps if optimised else '', len(point.codebook_ids), sweep.n_positions,
-            sweep.seed, __version__, setting.scenario.id,
+            ' '.join(point.codebook_ids), plain(origin) if setting.codebook in KINDS else '',
+            sweep.objective if optimised else '', sweep.steps if optimised else '',
+            len(point.codebook_ids), sweep.n_positions, sweep.seed, __version__,
+            setting.scenario.id,
             *map(plain, setting.scenario.fields().values())])
     return stream.getvalue()
 

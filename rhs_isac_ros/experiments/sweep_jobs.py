@@ -29,6 +29,8 @@ _SAMPLES = 64
 _RADIUS = float(chdtri(3, 0.05))
 # A global bound from a coarser lattice is too loose.
 _MAX_COARSENESS = 3.0
+# Relative deviation of the power that needs no scaling, below that of `Codebook.check`.
+_POWER_TOLERANCE = 1e-9
 # Families of quantities that one job computes. Each of the last three includes those before it.
 CRLB, BOUND, ERROR, CAPACITY, LOSS = 'crlb', 'bound', 'error', 'capacity', 'loss'
 _QUANTITIES = {
@@ -52,8 +54,13 @@ def plain_codebook(codebook: Codebook) -> dict[str, Any]:
 
 
 def with_power(codebook: Codebook, power_w: float) -> Codebook:
-    """Scale the combining vectors of a codebook so that each frame has a power."""
+    """Scale the combining vectors of a codebook so that each frame has a power.
+
+    A codebook that has this power remains the same, with its id.
+    """
     power = np.sum(np.abs(codebook.digital)**2, axis=(1, 3), keepdims=True)
+    if np.allclose(power, power_w, rtol=_POWER_TOLERANCE, atol=0):
+        return codebook
     return Codebook(codebook.analog, codebook.digital * np.sqrt(power_w / power))
 
 

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+import json
 
 import numpy as np
 import pytest
@@ -92,6 +93,29 @@ def test_the_table_has_every_field_of_the_scenario(tmp_path, file):
         assert float(row['low']) < float(row['value']) < float(row['high'])
         assert (row['measure'], row['unit'], row['estimator']) == ('crlb', 'm²', 'bayes')
         assert (row['positions'], row['seed'], row['objective']) == ('300', '7', '')
+
+
+def test_the_table_names_the_origin_of_the_codebooks(tmp_path, file, monkeypatch):
+    monkeypatch.setattr(sweep_module, 'design', lambda scenario, **_: sweep_module.plain_codebook(
+        random_codebook(Scenario(**scenario), np.random.default_rng(0))))
+    sweep = sweep_over('multipath_to_los_db=-10', f'codebook=optimize,random,{file}',
+                       optimize_for=[], n_positions=4)
+    rows = list(csv.DictReader(io.StringIO(table(sweep, run_sweep(sweep, tmp_path / 'a', 1)))))
+    origins = [row['codebook_scenario'] for row in rows]
+    assert Scenario(**json.loads(origins[0])) == BASE
+    assert Scenario(**json.loads(origins[1])) == dataclasses.replace(
+        BASE, multipath_to_los_db=-10.0)
+    assert origins[2] == ''
+    assert [row['steps'] for row in rows] == ['300', '', '']
+
+
+@pytest.mark.parametrize(('options', 'expected'), [
+    ({'measures': ['fame']}, "measures: 'fame', expected some of crlb"),
+    ({'n_positions': 0}, 'n_positions: 0, expected at least 1'),
+    ({'repeats': 0}, 'repeats: 0, expected at least 1')])
+def test_an_error_names_what_is_wrong(options, expected):
+    with pytest.raises(ValueError, match=expected):
+        sweep_over('n_frames=1', **options)
 
 
 def test_more_positions_repeat_only_the_new_blocks(tmp_path, monkeypatch):

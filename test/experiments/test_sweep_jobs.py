@@ -117,3 +117,6 @@ def test_an_interrupted_optimisation_is_no_result(monkeypatch):
 def test_the_power_of_a_codebook_can_be_changed(codebook):
     louder = Scenario(**SMALL, max_power_w=0.5)
     with_power(codebook, 0.5).check(louder)
+    # Rounding of the power does not change a codebook.
+    optimised = Codebook(codebook.analog, codebook.digital * (1 + 1e-12))
+    assert with_power(optimised, WORLD.max_power_w).id == optimised.id
