@@ -24,7 +24,7 @@ _STYLE: dict[Any, object] = {
     'legend.framealpha': 0.9, 'legend.edgecolor': '0.7', 'legend.fancybox': False,
     'axes.linewidth': 0.6, 'axes.axisbelow': True,
     'grid.color': '0.88', 'grid.linewidth': 0.5,
-    'lines.linewidth': 1.1, 'lines.markersize': 4.0, 'errorbar.capsize': 2.0,
+    'lines.linewidth': 1.1, 'lines.markersize': 4.0, 'errorbar.capsize': 2.8,
     'patch.linewidth': 0.6, 'hatch.linewidth': 0.5,
     'boxplot.medianprops.color': 'black', 'boxplot.medianprops.linewidth': 1.4,
     'image.cmap': COLOUR_MAP,
