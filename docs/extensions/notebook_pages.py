@@ -28,7 +28,7 @@ _FOLDER = 'notebooks'
 def run(source, target):
     """Execute a notebook in a process of its own; ExtensionError if it prints an error."""
     done = subprocess.run(
-        [sys.executable, '-W', 'error', run_notebook.__file__, source, target],
+        [sys.executable, run_notebook.__file__, source, target],
         stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
         env={**os.environ, 'OPENBLAS_NUM_THREADS': '1'})
     if done.returncode or done.stderr:

@@ -3,8 +3,8 @@
     python docs/extensions/run_notebook.py docs/notebooks/first_fix.md first_fix.ipynb
 
 Jupyter itself is not needed. Outputs are those of Jupyter: printed text, the value of a cell's
-last expression unless a semicolon follows, and the figures that are open at its end. An error in a
-cell is reported with the line of the source; with ``python -W error``, a warning is an error.
+last expression unless a semicolon follows, and the figures that are open at its end. A warning in
+a cell is an error, and errors are reported with the line of the source.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import io
 import json
 import re
 import sys
+import warnings
 from pathlib import Path
 
 _FRONT_MATTER = re.compile(r'---\n.*?\n---\n', re.DOTALL)
@@ -47,14 +48,19 @@ def execute(path):
     import matplotlib
 
     matplotlib.use('Agg')
+    # Imported first: warnings of the libraries that it loads do not concern the notebook.
+    import matplotlib.pyplot  # noqa: F401
+
     namespace, cells = {'__name__': '__main__'}, []
     for number, (kind, text, line) in enumerate(read(path)):
         cell = {'cell_type': kind, 'id': f'cell-{number}', 'metadata': {},
                 'source': text.splitlines(keepends=True)}
         if kind == 'code':
             count = 1 + sum(cell['cell_type'] == 'code' for cell in cells)
-            cell |= {'execution_count': count,
-                     'outputs': _run(path, text, line, count, namespace)}
+            with warnings.catch_warnings():
+                warnings.simplefilter('error')
+                outputs = _run(path, text, line, count, namespace)
+            cell |= {'execution_count': count, 'outputs': outputs}
         cells.append(cell)
     kernel = {'display_name': 'Python 3', 'language': 'python', 'name': 'python3'}
     return {'cells': cells, 'metadata': {'kernelspec': kernel}, 'nbformat': 4, 'nbformat_minor': 5}

@@ -119,6 +119,13 @@ def test_an_error_names_the_line_of_the_source(tmp_path):
     assert raised.traceback[-1].lineno + 1 == 6
 
 
+def test_a_warning_is_an_error(tmp_path):
+    source = tmp_path / 'bad.md'
+    source.write_text('```{code-cell}\nimport warnings\nwarnings.warn("bad")\n```\n')
+    with pytest.raises(UserWarning, match='bad'):
+        run_notebook().execute(source)
+
+
 def test_outputs_are_those_of_jupyter(tmp_path):
     source = tmp_path / 'short.md'
     source.write_text('---\nkernelspec:\n---\n\nText\n\n```{code-cell}\nprint(1)\n2\n```\n\n'
