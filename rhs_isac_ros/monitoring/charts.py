@@ -19,7 +19,7 @@ TITLES: Mapping[str, str] = {
     'drops': 'Drops and given-up cycles',
 }
 # Number of users and of nodes with a series of their own: a longer legend hides the chart.
-_MAX_SERIES = 8
+_MAX_SERIES = 4
 # Number of nodes whose messages are counted; their names come from messages.
 _MAX_NODES = 4096
 _MEGA = 1e6
@@ -75,7 +75,7 @@ class Charts:
     def dropped(self, node: str, count: int) -> Iterator[Sample]:
         """Yield the number of messages that a node dropped since its start, and that of all.
 
-        Only the first eight nodes that dropped a message have a series of their own.
+        Only the first four nodes that dropped a message have a series of their own.
         """
         self._n_dropped.put(node, count)
         yield Sample('drops/all', sum(self._n_dropped.values()), Series('all nodes', _WHITE))
@@ -94,7 +94,7 @@ class Charts:
     def of_cycle(self, cycle: CompleteCycle) -> Iterator[Sample]:
         """Yield the samples of a complete cycle.
 
-        Only the first eight users have a series of their own; the others share one.
+        Only the first four users have a series of their own; the others share one.
         """
         if len(self._users) < _MAX_SERIES:
             self._users.add(cycle.user)

@@ -30,6 +30,8 @@ TRANSMISSION = 'surface/transmission'
 LOG = 'log'
 # Further users are in the charts only, because the ids come from messages.
 _MAX_USERS = 64
+# Names of more users hide the scene.
+_MAX_NAMES = 8
 # Number of latest cycles whose messages may still arrive.
 _MAX_CYCLES = 64
 _MAX_PATH_LENGTH = 200
@@ -62,6 +64,7 @@ class NetworkView:
         self._cycles: NewestDict[int, int] = NewestDict(_MAX_CYCLES)
         self._n_cycles = self.n_ended = 0
         self._users: set[int] = set()
+        self._named: set[int] = set()
         self._tracks: dict[int, collections.deque[np.ndarray]] = {}
         self._configurations: dict[int, np.ndarray] = {}
         # True position of the user in each cycle, the origin of the chart of the modes.
@@ -140,7 +143,8 @@ class NetworkView:
                 path = self._path(message.user)
                 ball, name = scene.truth(message)
                 yield f'{path}/truth', ball
-                yield f'{path}/name', name
+                if message.user in self._named:
+                    yield f'{path}/name', name
                 if message.cycle_id:
                     self._origins.put(message.cycle_id, message.position)
                 yield f'{path}/true_path', scene.path(
@@ -185,6 +189,8 @@ class NetworkView:
     def _shows(self, user: int) -> bool:
         if len(self._users) < _MAX_USERS:
             self._users.add(user)
+        if len(self._named) < _MAX_NAMES:
+            self._named.add(user)
         return user in self._users
 
     def _count(self, cycle_id: int) -> int:

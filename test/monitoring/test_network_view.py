@@ -179,7 +179,7 @@ def test_few_nodes_that_drop_messages_have_a_series_of_their_own(scenario):
     entries = [entry for number in range(20) for entry in view.add_report(
         f'node_{number}', Report(True, '', {'dropped.duplicate': '1'}))]
     series = [entry.path for entry in entries if isinstance(entry.entity, Series)]
-    assert series == ['drops/all', *(f'drops/node_{number}' for number in range(8))]
+    assert series == ['drops/all', *(f'drops/node_{number}' for number in range(4))]
     assert on(entries, 'drops/all')[-1][1].value == 20
 
 
@@ -210,3 +210,11 @@ def test_the_number_of_users_is_bounded(scenario):
     shown = [user for user in range(1, 200) if view.add(m.GroundTruth(
         cycle_id=0, user=user, position=np.ones(3), velocity=np.zeros(3)), 0.0)]
     assert shown == list(range(1, 65))
+
+
+def test_the_names_of_few_users_are_shown(scenario):
+    view = NetworkView(scenario)
+    named = [entry.path for user in range(1, 20) for entry in view.add(m.GroundTruth(
+        cycle_id=0, user=user, position=np.ones(3), velocity=np.zeros(3)), 0.0)
+        if entry.path.endswith('/name')]
+    assert named == [f'{network_view.WORLD}/user_{user}/name' for user in range(1, 9)]
