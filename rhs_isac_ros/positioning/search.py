@@ -235,10 +235,12 @@ class SearchEstimator(abc.ABC):
 
     def _found(self, whitened: np.ndarray, modes: Modes) -> Found:
         """Return the result of a search; continue it if it has not reached a maximum."""
-        if self._test.residual_test(-modes.roi_log_likelihood.max()):
+        residuals = -modes.roi_log_likelihood
+        if self._test.residual_test(residuals.min()):
             # Strong signals may need more steps to reach the maximum.
             modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
-        return self._with_evidence(whitened, modes, -modes.roi_log_likelihood)
+            residuals = -modes.roi_log_likelihood
+        return self._with_evidence(whitened, modes, residuals)
 
     def _with_evidence(
             self, whitened: np.ndarray, modes: Modes, residuals: np.ndarray) -> Found:
