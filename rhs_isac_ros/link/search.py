@@ -18,12 +18,12 @@ _MAX_DRIFT_RAD = 1.0
 _MAX_SUBBANDS = 16
 # Number of random starts, and of those that remain after the first step.
 _N_STARTS = 256
-_N_DIRECT = 96
+_N_DIRECT = 64
 # Number of steps with the strongest modes of the multipath, of these modes, and of configurations
 # that are then improved with all modes. A selection after fewer steps would lose the best starts
 # if the multipath is as strong as the line of sight.
 _N_STEPS = 4
-_N_STRONGEST = 5
+_N_STRONGEST = 4
 _N_KEPT = 12
 # Number of configurations for the multipath alone, of their random starts and of steps.
 _N_SCATTERED = 8

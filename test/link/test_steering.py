@@ -61,7 +61,7 @@ def test_the_same_position_gives_the_same_beam(table1, positions):
 
 
 @pytest.mark.parametrize('band', [0, 1])
-def test_beams_are_never_worse_than_the_matched_filter(table1, positions, reference_link, band):
+def test_beams_are_better_than_the_matched_filter(table1, positions, reference_link, band):
     scenario, link = table1.scenario, reference_link(table1, band)
     gained = []
     for position in positions:
