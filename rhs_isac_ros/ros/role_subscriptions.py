@@ -11,6 +11,8 @@ from rhs_isac_ros.protocol.delivery import DELIVERIES, USER, deliveries_to
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.subscriptions import subscribe
 
+# The senders are examined in each of the first polls, and then in one of several.
+_OFTEN_POLLS, _RARE_POLLS = 10, 5
 # Number of messages kept to recognise copies; those of a cycle are fewer.
 _MAX_RECENT = 32
 
@@ -37,7 +39,13 @@ class RoleSubscriptions:
             on_message: Callable[[type[m.Message], bytes], None]) -> None:
         self._node, self._instance, self._on_message = node, instance, on_message
         self._deliveries = deliveries_to(recipient)
-        self._delivery_topics = {one.kind: _delivery_topics(one.kind) for one in self._deliveries}
+        # By message: the topic for all nodes, and topics on which each node that delivers has one
+        # publisher. The counts do not apply remapping rules.
+        self._names = {one.kind: (
+            node.resolve_topic_name(topics.NAMES[one.kind]),
+            [*map(node.resolve_topic_name, _delivery_topics(one.kind))])
+            for one in self._deliveries}
+        self._polls = 0
         self._subscribed: set[type[m.Message]] = set()
         # Messages that are received on the topics for all nodes as well, and the latest of them.
         self._both: set[type[m.Message]] = set()
@@ -68,17 +76,21 @@ class RoleSubscriptions:
             self._recent.append(content)
         self._on_message(kind, content)
 
+    def poll_senders(self) -> None:
+        """Examine the senders in some of the calls, one a second: often at first, then rarely."""
+        if self._polls < _OFTEN_POLLS or not self._polls % _RARE_POLLS:
+            self.examine_senders()
+        self._polls += 1
+
     def examine_senders(self) -> None:
         """Subscribe to the topics for all nodes if a publisher uses no others."""
-        for kind in {one.kind for one in self._deliveries} & self._subscribed - self._both:
-            n_delivering = sum(self._n_publishers(name) for name in self._delivery_topics[kind])
-            if self._n_publishers(topics.NAMES[kind]) > n_delivering:
+        for kind, (documented, deliveries) in self._names.items():
+            if kind not in self._subscribed or kind in self._both:
+                continue
+            n_delivering = sum(map(self._node.count_publishers, deliveries))
+            if self._node.count_publishers(documented) > n_delivering:
                 self._both.add(kind)
                 self._create(kind, topics.NAMES[kind])
-
-    def _n_publishers(self, name: str) -> int:
-        # The counts do not apply remapping rules.
-        return self._node.count_publishers(self._node.resolve_topic_name(name))
 
 
 def _delivery_topics(kind: type[m.Message]) -> frozenset[str]:
