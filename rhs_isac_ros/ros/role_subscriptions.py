@@ -47,6 +47,8 @@ class RoleSubscriptions:
             for one in self._deliveries}
         self._polls = 0
         self._subscribed: set[type[m.Message]] = set()
+        # Messages with a publisher that the last examination found to use no other topic.
+        self._suspected: set[type[m.Message]] = set()
         # Messages that are received on the topics for all nodes as well, and the latest of them.
         self._both: set[type[m.Message]] = set()
         self._recent: collections.deque[bytes] = collections.deque(maxlen=_MAX_RECENT)
@@ -78,19 +80,23 @@ class RoleSubscriptions:
 
     def poll_senders(self) -> None:
         """Examine the senders in some of the calls, one a second: often at first, then rarely."""
-        if self._polls < _OFTEN_POLLS or not self._polls % _RARE_POLLS:
+        if self._suspected or self._polls < _OFTEN_POLLS or not self._polls % _RARE_POLLS:
             self.examine_senders()
         self._polls += 1
 
     def examine_senders(self) -> None:
-        """Subscribe to the topics for all nodes if a publisher uses no others."""
-        for kind, (documented, deliveries) in self._names.items():
-            if kind not in self._subscribed or kind in self._both:
-                continue
-            n_delivering = sum(map(self._node.count_publishers, deliveries))
-            if self._node.count_publishers(documented) > n_delivering:
-                self._both.add(kind)
-                self._create(kind, topics.NAMES[kind])
+        """Subscribe to the topics for all nodes if a publisher uses no others.
+
+        Two examinations in a row must find it, because nodes appear and disappear gradually.
+        """
+        found = {kind for kind, (documented, deliveries) in self._names.items()
+                 if kind in self._subscribed - self._both
+                 and self._node.count_publishers(documented) > sum(
+                     map(self._node.count_publishers, deliveries))}
+        for kind in found & self._suspected:
+            self._both.add(kind)
+            self._create(kind, topics.NAMES[kind])
+        self._suspected = found
 
 
 def _delivery_topics(kind: type[m.Message]) -> frozenset[str]:
