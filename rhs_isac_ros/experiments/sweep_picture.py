@@ -14,6 +14,7 @@ from rhs_isac_ros.model.pictures import (
     LOOKS,
     PAGE_IN,
     Look,
+    label_decades,
     look,
     new_panels,
     paper_style,
@@ -88,14 +89,17 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
     results = [point.interval.value for point in points if point.measure in names]
     finite = [value for value in results if np.isfinite(value)]
     factor, unit = _scale(MEASURES[names[0]].unit, finite)
-    if unit in _LOGARITHMIC and finite and 0 < min(finite) * _WIDE < max(finite):
-        _set_logarithmic(panel, max(finite) / min(finite))
+    logarithmic = unit in _LOGARITHMIC and finite and 0 < min(finite) * _WIDE < max(finite)
+    if logarithmic:
+        panel.set_yscale('log')
     for line in _lines(others, points, names):
         # Infinite values cannot be drawn.
         own = [point for point in line.points if np.isfinite(point.interval.value)]
         ranks = [values.index(point.setting.varied[first.fields[0]]) for point in own]
         _draw_line(panel, _shifted(panel, places, line.shift)[ranks], factor
                    * np.array([point.interval for point in own]).reshape(-1, 3), line)
+    if logarithmic and max(finite) < _FEW_DECADES * min(finite):
+        label_decades(panel.yaxis)
     if not numeric or len(values) <= _MAX_TICKS:
         # Lists of numbers would not fit beside each other.
         panel.set_xticks(places, [_text(first, value).replace(', ', '\n') for value in values])
@@ -155,15 +159,6 @@ def _set_scale(panel: Any, values: Sequence[float]) -> None:
         panel.set_xscale('log')
     elif values[0] == 0 and is_geometric(values[1:]):
         panel.set_xscale('symlog', linthresh=values[1], linscale=0.3)
-
-
-def _set_logarithmic(panel: Any, ratio: float) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-    panel.set_yscale('log')
-    if ratio < _FEW_DECADES:
-        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        panel.yaxis.set_major_formatter('{x:g}')
-        panel.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _scale(unit: str, values: Sequence[float]) -> tuple[float, str]:

@@ -30,7 +30,7 @@ def scripts(pytestconfig):
 
 def test_the_help_describes_every_experiment_and_its_duration(reproduce, scripts):
     text = reproduce('--help')
-    assert len(scripts) >= 5
+    assert len(scripts) >= 4
     for name, description in scripts.items():
         first = description.splitlines()[0]
         duration = re.search(r'^Duration on two cores: (.*--quick.*)$', description, re.M)[1]
