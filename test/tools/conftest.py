@@ -29,7 +29,9 @@ def shared_session(network):
     with Session() as session:
         def present():
             assert not network.ended()
-            return session.node.count_publishers('capacity')
+            # Transmission and positioner connect to their topics last.
+            return (session.node.count_publishers('capacity')
+                    and session.node.count_subscribers('received_signals'))
         assert session.spin_until(present, TIMEOUT_S)
         session.discover(TIMEOUT_S)
         yield session
