@@ -21,7 +21,7 @@ from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.fields import check
-from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros import convert, topics
 
 # Outside tests, warnings are only printed.
 pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
@@ -46,6 +46,10 @@ class NodeUnderTest:
         self._bench = bench
         probe = bench.add(Node, 'probe')
         self._publishers = {kind: bench.publisher(probe, kind) for kind in inputs}
+        # Nodes subscribe to some documented topics only when they have discovered the publisher.
+        bench.until(lambda: all(self.node.get_name() in {
+            info.node_name for info in probe.get_subscriptions_info_by_topic(
+                f'/{topics.NAMES[kind]}')} for kind in inputs), 'the subscriptions')
         self._cycles = itertools.count(1)
         self._dispatched, self._dispatch = 0, self.node.dispatch
         self.node.dispatch = self._count
