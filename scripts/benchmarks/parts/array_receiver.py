@@ -86,11 +86,19 @@ class ArrayReceiver:
         return np.stack([self._gains(los_gain, positions, band) @ response
                          for band, response in enumerate(self._responses)], axis=1)
 
-    def mean_and_jacobian(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute mean signals and their derivative, [N, N_B, r] and [N, 3, N_B, r] [1/m]."""
-        return self.mean(positions), np.stack(
+    def mean_and_jacobian(
+            self, positions: np.ndarray, by_coordinate: np.ndarray | None = None, *,
+            whitened: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Compute mean signals and their derivative, [N, N_B, r] and [N, 3, N_B, r] [1/m].
+
+        The signals are white in any case; `by_coordinate` is as in `MeasurementModel`.
+        """
+        jacobian = np.stack(
             [self._gains(los_derivative, positions, band) @ response
              for band, response in enumerate(self._responses)], axis=2)
+        if by_coordinate is not None:
+            jacobian = np.einsum('nxq,nx...->nq...', by_coordinate, jacobian)
+        return self.mean(positions), jacobian
 
     def crlb(self, positions: np.ndarray) -> np.ndarray:
         """Compute the Cramer-Rao bound at positions, float64 [N] [m^2]."""
