@@ -59,7 +59,7 @@ class Permissions(NamedTuple):
 
 
 def permissions(users: int) -> dict[str, Permissions]:
-    """Return the permissions that the nodes of a network need, and no others.
+    """Return the permissions that the nodes of a network may need, and no others.
 
     Parameters
     ----------
@@ -98,15 +98,14 @@ def _of_messages(
         role: str, sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
         publishes: Iterable[str]) -> Permissions:
     """Return permissions for messages of a role, and for publishing other topics by name."""
-    deliveries = deliveries_to(role)
-    delivered = {one.kind for one in deliveries}
+    # A node also subscribes to the topics for all nodes if a publisher uses no others.
     return Permissions(
         publish=(*sorted([*(topics.NAMES[kind] for kind in sends),
                           *_delivery_topics(deliveries_from(role)), *publishes]),
                  *_RCLPY_TOPICS),
         subscribe=tuple(sorted([
-            *(topics.NAMES[kind] for kind in receives if kind not in delivered),
-            *_delivery_topics(deliveries)])))
+            *(topics.NAMES[kind] for kind in receives),
+            *_delivery_topics(deliveries_to(role))])))
 
 
 def _delivery_topics(deliveries: Iterable[Delivery]) -> set[str]:

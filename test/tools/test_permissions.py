@@ -1,4 +1,4 @@
-"""The policy allows exactly what the nodes of a running network use."""
+"""The policy allows exactly what the nodes of a network use."""
 
 import importlib.util
 import re
@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station import BaseStation
+from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.delivery import deliveries_to
+from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.tools import permissions
 
@@ -49,6 +53,12 @@ def test_a_user_may_not_publish_messages_of_another_role():
     for number in (1, 2, 3):
         assert allowed[f'/user_{number}']['publish'] == own | common
         assert not allowed[f'/user_{number}']['request']
+
+
+def test_nodes_may_receive_messages_of_publishers_that_do_not_deliver():
+    for path, role in (('/user_1', User), ('/channel', Channel), ('/bs', BaseStation)):
+        assert rules(permissions.policy())[path]['subscribe'] >= {
+            f'/{topics.NAMES[kind]}' for kind in role.RECEIVES}
 
 
 def test_only_the_operator_may_set_parameters_of_other_nodes():
@@ -94,6 +104,10 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
     del allowed[f'{space}/operator']
     # Beacons to single nodes require more users.
     allowed[f'{space}/bs']['publish'].remove(f'{space}/{topics.delivery(m.Beacon, "user_*")}')
+    # These subscriptions require a publisher that does not deliver.
+    for path, rights in allowed.items():
+        role = re.sub(r'_\d+$', '', path.rpartition('/')[2])
+        rights['subscribe'] -= {f'{space}/{topics.NAMES[one.kind]}' for one in deliveries_to(role)}
     if not importlib.util.find_spec('tf2_msgs'):
         allowed[f'{space}/visualizer']['publish'] -= {topics.TF, topics.TF_STATIC}
 
