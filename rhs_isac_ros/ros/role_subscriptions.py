@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import DELIVERIES, USER, deliveries_to
+from rhs_isac_ros.protocol.delivery import DELIVERIES, USER, Recipient, deliveries_to
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.subscriptions import subscribe
 
@@ -49,9 +49,11 @@ class RoleSubscriptions:
         self._subscribed: set[type[m.Message]] = set()
         # Messages with a publisher that the last examination found to use no other topic.
         self._suspected: set[type[m.Message]] = set()
-        # Messages that are received on the topics for all nodes as well, and the latest of them.
+        # Messages that are received on the topics for all nodes as well. Of the latest, by topic
+        # for all nodes or not, those whose copy on the other topic has not arrived.
         self._both: set[type[m.Message]] = set()
-        self._recent: collections.deque[bytes] = collections.deque(maxlen=_MAX_RECENT)
+        self._single: collections.deque[tuple[bool, bytes]] = collections.deque(
+            maxlen=_MAX_RECENT)
 
     def subscribe(self, kinds: Iterable[type[m.Message]]) -> None:
         """Create the subscriptions to messages that have none."""
@@ -61,21 +63,30 @@ class RoleSubscriptions:
             self._subscribed.add(kind)
             delivery = next((one for one in self._deliveries if one.kind is kind), None)
             if delivery is None:
-                self._create(kind, topics.NAMES[kind])
+                self._create(kind)
                 continue
-            self._create(kind, topics.delivery(kind, delivery.recipient))
+            self._create(kind, delivery.recipient)
             if delivery.recipient == USER:
-                self._create(kind, topics.delivery(kind, self._instance))
+                self._create(kind, self._instance)
 
-    def _create(self, kind: type[m.Message], name: str) -> None:
+    def _create(self, kind: type[m.Message], recipient: Recipient | None = None) -> None:
+        """Subscribe to the topic for a recipient; None: for all nodes."""
+        name = topics.NAMES[kind] if recipient is None else topics.delivery(kind, recipient)
         subscribe(self._node, convert.ros_type(kind), name,
-                  functools.partial(self._receive, kind), qos.profile_for(kind), raw=True)
+                  functools.partial(self._receive, kind, recipient is None),
+                  qos.profile_for(kind), raw=True)
 
-    def _receive(self, kind: type[m.Message], content: bytes) -> None:
+    def _receive(self, kind: type[m.Message], to_all: bool, content: bytes) -> None:
+        """Pass a message on, unless it is a copy of one that came on the other topic.
+
+        Messages that are equal on one topic are not copies: a sender by hand may repeat them.
+        """
         if kind in self._both:
-            if content in self._recent:
+            other = not to_all, content
+            if other in self._single:
+                self._single.remove(other)
                 return
-            self._recent.append(content)
+            self._single.append((to_all, content))
         self._on_message(kind, content)
 
     def poll_senders(self) -> None:
@@ -95,7 +106,7 @@ class RoleSubscriptions:
                      map(self._node.count_publishers, deliveries))}
         for kind in found & self._suspected:
             self._both.add(kind)
-            self._create(kind, topics.NAMES[kind])
+            self._create(kind)
         self._suspected = found
 
 
