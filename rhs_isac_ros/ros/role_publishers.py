@@ -17,7 +17,13 @@ _SETTLE_S = 0.2
 
 
 class _Line(NamedTuple):
-    """A publisher to a single node of users, and the time of its first subscription [s]."""
+    """A publisher to a single node of users.
+
+    Attributes
+    ----------
+    since_s
+        Time of its creation or, if later, when it last had no subscription [s].
+    """
 
     publisher: Publisher
     since_s: float
@@ -99,9 +105,11 @@ class RolePublishers:
                 return None
             self._remove_unused()
             line = self._lines[kind, instance] = _Line(self._create(kind, name), now_s)
-        if now_s < line.since_s + _SETTLE_S or not line.publisher.get_subscription_count():
+        if not line.publisher.get_subscription_count():
+            # The connection may have been interrupted; both sides then discover each other anew.
+            self._lines[kind, instance] = line._replace(since_s=now_s)
             return None
-        return line.publisher
+        return line.publisher if now_s >= line.since_s + _SETTLE_S else None
 
     def _remove_unused(self) -> None:
         """Destroy the publishers to nodes that have gone."""

@@ -1,11 +1,13 @@
 """Messages to single recipients, between nodes in this process."""
 
+import math
+
 import pytest
 from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.delivery import DELIVERIES, OBSERVERS, USER
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import convert, role_publishers, topics
 from rhs_isac_ros.ros.role_publishers import RolePublishers
 from rhs_isac_ros.ros.role_subscriptions import RoleSubscriptions
 
@@ -90,6 +92,24 @@ def test_an_unknown_instance_makes_a_message_reach_all_nodes_once(bench, station
     assert [sorted(one.received) for one in recipients] == [[1, 2, 3]] * 2
     assert f'/{topics.delivery(m.Grant, 13)}' not in dict(
         station._node.get_topic_names_and_types())
+
+
+def test_a_node_that_returns_has_time_to_discover_its_publisher(
+        bench, station, recipients, monkeypatch):
+    connect(bench, station, recipients)
+    monkeypatch.setattr(role_publishers, '_SETTLE_S', 60.0)
+    for key, line in station._lines.items():
+        station._lines[key] = line._replace(since_s=-math.inf)
+    one, lost = recipients
+    bench.remove(lost.node)
+    (publisher,) = (line.publisher for (_, instance), line in station._lines.items()
+                    if instance == lost.instance)
+    bench.until(lambda: not publisher.get_subscription_count(), 'the end of the node')
+    send(station, 1, to=(lost.instance,))
+    Recipient(bench, lost.instance)
+    bench.until(publisher.get_subscription_count, 'the node')
+    send(station, 2, to=(lost.instance,))
+    bench.until(lambda: one.received == [1, 2], 'both messages')
 
 
 def test_publishers_to_nodes_that_have_gone_are_removed(bench, station, recipients):
