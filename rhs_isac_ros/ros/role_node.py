@@ -138,7 +138,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             report, fault=True, summary='; '.join(conflicts), values=values)
 
     def _report_regularly(self) -> Report:
-        self._role_subscriptions.poll_senders()
+        self._role_subscriptions.examine_senders()
         return self.report()
 
     @property
