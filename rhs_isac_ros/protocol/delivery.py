@@ -1,7 +1,7 @@
 """Messages that wake only the nodes to which they are addressed.
 
-Every message of the protocol has a topic. Nodes that all subscribed to it would also receive the
-messages for others, and to receive a message often takes longer than to handle it. The messages
+Every message of the protocol has a topic. If all nodes subscribed to it, each would also receive
+the messages for others, and receiving a message often takes longer than handling it. The messages
 in `DELIVERIES` therefore have further topics, to which only their recipients subscribe.
 """
 

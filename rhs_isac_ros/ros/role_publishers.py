@@ -70,7 +70,7 @@ class RolePublishers:
 
     def publish(self, kind: type[m.Message], content: bytes, to: tuple[Recipient, ...]) -> None:
         """Publish a serialized message; `to` is as in `Send`."""
-        # Deliveries come first, because most other subscribers observe.
+        # Deliveries come first, because most subscribers of the other topic are observers.
         for one, publisher in self._deliveries[kind].items():
             lines = self._lines_to(kind, to) if one.recipient == USER else None
             if lines:
