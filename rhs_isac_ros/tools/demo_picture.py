@@ -18,7 +18,7 @@ from rhs_isac_ros.model.pictures import (
     write_picture,
 )
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
-from rhs_isac_ros.tools.ellipses import ellipse_95
+from rhs_isac_ros.tools.ellipses import ellipse_95, limits_with_ellipses
 
 # Height of the errors and of all that surrounds the panels [in], and the share of the width that
 # the view from above has.
@@ -79,19 +79,17 @@ def compose(cycles: Sequence[CompleteCycle], scenario: Scenario) -> Any:
     return figure
 
 
-def _limits_m(cycles: Sequence[CompleteCycle], scenario: Scenario) -> tuple[Any, Any]:
-    """Return the corners of the view from above, float64 [2] [m] each."""
+def _limits_m(cycles: Sequence[CompleteCycle], scenario: Scenario) -> np.ndarray:
+    """Return the corners of the view from above, float64 [2, 2] [m]."""
     region = scenario.roi_bounds_m[:, :2]
     surface = element_positions(scenario)[:, :2]
-    low = np.minimum(region[0], surface.min(axis=0)) - _MARGIN_M
-    high = np.maximum(region[1], surface.max(axis=0)) + _MARGIN_M
-    means = np.array([cycle.estimate.position[:2] for cycle in cycles])
-    # Half the extent of the ellipses, whose quantile the ellipse of the unit covariance has.
-    radius = ellipse_95(np.eye(2))[0] / 2
-    spreads = radius * np.sqrt([cycle.estimate.covariance_m2.diagonal()[:2] for cycle in cycles])
+    limits = np.stack([np.minimum(region[0], surface.min(axis=0)) - _MARGIN_M,
+                       np.maximum(region[1], surface.max(axis=0)) + _MARGIN_M])
     margin = _MAX_MARGIN * (region[1] - region[0])
-    return (np.minimum(low, np.maximum((means - spreads).min(axis=0), region[0] - margin)),
-            np.maximum(high, np.minimum((means + spreads).max(axis=0), region[1] + margin)))
+    return limits_with_ellipses(
+        limits, region + np.stack([-margin, margin]),
+        [cycle.estimate.position[:2] for cycle in cycles],
+        [cycle.estimate.covariance_m2[:2, :2] for cycle in cycles])
 
 
 def _draw_scenario(view: Any, scenario: Scenario) -> None:

@@ -14,10 +14,11 @@ from rhs_isac_ros.monitoring.scene_shapes import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
 from rhs_isac_ros.protocol.messages import Mode
-from rhs_isac_ros.tools.ellipses import ellipse_95
+from rhs_isac_ros.tools.ellipses import ellipse_95, limits_with_ellipses
 
 _HEIGHT_IN = 5.7
-_MARGIN_M = 0.8
+# Space around the region and the surface [m]; ellipses may need more, up to a share of the region.
+_MARGIN_M, _MAX_MARGIN = 0.8, 0.25
 # Height of the row of the legend, apart from the legend, relative to the views.
 _LEGEND_ROW = 0.001
 # Line width of the surface: to scale, a surface of some decimetres would be too thin to see.
@@ -44,15 +45,16 @@ def compose(scene: SceneState, scenario: Scenario) -> Any:
     figure = new_figure(PAGE_IN, _HEIGHT_IN)
     # Both views have the same scale, so that their x axes are aligned. The layout adds the height
     # of the legend to the last row.
-    limits_m = [_limit_m(scenario, axis) for axis in (1, 2)]
+    limits_m = _limits_m(scene, scenario)
+    heights = np.diff(limits_m, axis=0)[0, 1:]
     grid = figure.add_gridspec(3, 2, width_ratios=(1.75, 1),
-                               height_ratios=[*limits_m, _LEGEND_ROW * sum(limits_m)])
+                               height_ratios=[*heights, _LEGEND_ROW * heights.sum()])
     pattern = _pattern(scene.shown_beam, scenario)
     above, side = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
-    _draw_view(above, [0, 1], scene, scenario, pattern)
-    _draw_view(side, [0, 2], scene, scenario, pattern)
-    above.set_title('from above', loc='left')
-    side.set_title('from the side', loc='left')
+    for axes, plane, name in ((above, [0, 1], 'from above'), (side, [0, 2], 'from the side')):
+        _draw_view(axes, plane, scene, scenario, pattern)
+        axes.set_title(name, loc='left')
+        axes.set(xlim=limits_m[:, 0], ylim=limits_m[:, plane[1]])
     right = grid[:2, 1].subgridspec(2, 1, height_ratios=(1.2, 1))
     _draw_surface(figure.add_subplot(right[0]), scene, scenario)
     _draw_pattern(figure.add_subplot(right[1], projection='polar'), scene.shown_beam, pattern)
@@ -79,9 +81,18 @@ def _pattern(beam: BeamMessage | None, scenario: Scenario) -> BeamPattern | None
                         math.hypot(*scenario.roi_center_m), _PATTERN_STEP_DEG)
 
 
-def _limit_m(scenario: Scenario, axis: int) -> float:
-    """Return the half-width of a view along y or z [m]."""
-    return float(np.abs(scenario.roi_bounds_m)[:, axis].max()) + _MARGIN_M
+def _limits_m(scene: SceneState, scenario: Scenario) -> np.ndarray:
+    """Return the corners of the views, float64 [2, 3] [m], symmetric along y and z."""
+    region = scenario.roi_bounds_m
+    estimates = [user.estimate for user in scene.users.values() if user.estimate]
+    margin = _MAX_MARGIN * (region[1] - region[0])
+    limits = limits_with_ellipses(
+        np.stack([np.minimum(region[0], 0) - _MARGIN_M, region[1] + _MARGIN_M]),
+        region + np.stack([-margin, margin]), [estimate.position for estimate in estimates],
+        [estimate.covariance_m2 for estimate in estimates])
+    limits[1, 1:] = np.abs(limits[:, 1:]).max(axis=0)
+    limits[0, 1:] = -limits[1, 1:]
+    return limits
 
 
 def _draw_view(
@@ -107,9 +118,6 @@ def _draw_view(
     for user in scene.users.values():
         _draw_user(axes, plane, user)
     axes.set(xlabel='$x$ [m]', ylabel=f'${"xyz"[plane[1]]}$ [m]', aspect='equal')
-    axes.set_xlim(min(-_MARGIN_M, low[0] - _MARGIN_M), high[0] + _MARGIN_M)
-    limit_m = _limit_m(scenario, plane[1])
-    axes.set_ylim(-limit_m, limit_m)
     axes.grid()
 
 

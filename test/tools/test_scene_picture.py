@@ -96,6 +96,33 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
     assert [text.get_text() for text in figure.texts] == ['cycle 103, user 3']
 
 
+def test_both_views_contain_the_ellipses_up_to_a_quarter_of_the_region():
+    scenario = Scenario()
+    scene = make_scene(scenario, 3)
+    without = [(axes.get_xlim(), axes.get_ylim()) for axes in compose(scene, scenario).axes[:2]]
+    at_the_edge = np.array([14.5, 4.5, 0.8])
+    for variances, expected in (((0.6, 0.4, 0.1), None), ((1e6, 1e6, 1e6), (17.5, 7.5))):
+        scene.add(m.PositionEstimate(
+            cycle_id=200, user=1, codebook_id='cb', position=at_the_edge,
+            covariance_m2=np.diag(variances), crlb_m2=0.1, estimator='bayes', latency_s=0.01), 0.0)
+        views = compose(scene, scenario).axes[:2]
+        # The same scale, and room for the whole region and the surface.
+        assert views[0].get_xlim() == views[1].get_xlim()
+        for axes, (xlim, ylim) in zip(views, without, strict=True):
+            assert axes.get_aspect() == 1.0
+            assert axes.get_xlim()[0] == xlim[0] and axes.get_xlim()[1] > xlim[1]
+            assert axes.get_ylim()[0] <= ylim[0] and axes.get_ylim()[1] >= ylim[1]
+        if expected:
+            assert (views[0].get_xlim()[1], views[0].get_ylim()[1]) == pytest.approx(expected)
+            continue
+        for axes in views:
+            for patch in [patch for patch in axes.patches if isinstance(patch, Ellipse)]:
+                box = patch.get_path().transformed(patch.get_transform()).transformed(
+                    axes.transData.inverted()).get_extents()
+                assert axes.viewLim.padded(1e-6).contains(*box.min)
+                assert axes.viewLim.padded(1e-6).contains(*box.max)
+
+
 def test_title_beam_and_lobe_are_of_one_user():
     """Even if the estimate of another user is more recent than the beam."""
     scenario = Scenario()
