@@ -116,12 +116,13 @@ class Sweep:
         for name, low in (('n_positions', 1), ('repeats', 1), ('steps', 1), ('seed', 0)):
             if getattr(self, name) < low:
                 raise ValueError(f'{name}: {getattr(self, name)}, expected at least {low}')
+        files = self._files
         for setting in self.settings:
             if setting.codebook in KINDS:
                 self.scenario_of_codebook(setting)
                 continue
             try:
-                _fitted(self._files[setting.codebook], setting)
+                _fitted(files[setting.codebook], setting)
             except CodebookError as error:
                 varied = ', '.join(f'{name} = {plain(v)}' for name, v in setting.varied.items())
                 raise CodebookError(f'{setting.codebook}: {error}; setting {varied}') from None

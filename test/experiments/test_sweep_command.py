@@ -106,7 +106,7 @@ def test_without_matplotlib_the_table_is_written(sweep, tmp_path, monkeypatch, c
     (['--vary', 'n_frames=1', '--estimator', 'neural'], "estimator: 'neural', expected bayes, ml"),
     (['--vary', 'estimator=bayes,magic'], "estimator: 'magic', expected bayes, ml"),
     (['--vary', 'codebook=optimize,none.yaml'], "'none.yaml', expected directional"),
-    (['--vary', 'codebook=bad.yaml'], 'bad.yaml: expected ros__parameters'),
+    (['--vary', 'codebook=bad.yaml'], 'error: bad.yaml: expected ros__parameters'),
     (['--vary', 'n_frames=1', '--scenario', 'bad.yaml'], 'bad.yaml: colour: unknown field'),
     (['--vary', 'n_frames=1', '--optimize-for', 'colour'], "invalid choice: 'colour'"),
     (['--vary', 'n_frames=1', '--picture', 'a.jpg'], 'ends in .png, .pdf, .svg'),
