@@ -72,14 +72,16 @@ class Interval(NamedTuple):
 def measured(measure: Measure, results: np.ndarray) -> Interval:
     """Return a measure of results, float64 [codebooks, positions], with its interval.
 
-    The interval is that of the bootstrap over codebooks and positions, or that of Wilson for the
-    share of a single codebook. The value is NaN if a result is, and its interval is NaN if the
-    value is infinite.
+    The interval is that of the bootstrap over codebooks and positions. A share of a single
+    codebook or of equal results has the interval of Wilson, because the bootstrap of equal
+    results has no width. The value is NaN if a result is, and the interval of an infinite mean
+    is NaN.
     """
     if np.isnan(results).any():
         return Interval(np.nan, np.nan, np.nan)
-    if measure.share and len(results) == 1:
-        return Interval(*share_percent(int(results.sum()), results.size))
+    if measure.share and (len(results) == 1 or np.ptp(results) == 0):
+        # Codebooks share their positions, so that they do not count as further samples.
+        return Interval(*share_percent(int(results[0].sum()), len(results[0])))
     if measure.quantile is None and np.isinf(results).any():
         return Interval(np.inf, np.nan, np.nan)
     finite = np.minimum(results, _INFINITE)

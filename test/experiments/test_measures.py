@@ -38,14 +38,18 @@ def test_a_share_of_all_positions_has_an_interval_too():
     value, low, high = measured(MEASURES['coverage'], np.ones((1, 100)))
     assert (value, high) == (100, pytest.approx(100))
     assert 96 < low < 97
+    # Codebooks that agree everywhere have no more positions than one of them.
+    assert measured(MEASURES['coverage'], np.ones((3, 100))) == (value, low, high)
     apart = measured(MEASURES['coverage'], np.repeat([[0.0], [1.0]], 20, axis=1))
     assert apart == (50, 0, 100)
 
 
 def test_infinite_and_missing_results_are_not_left_out():
     results = np.array([[1.0, 2.0, 3.0, np.inf]])
-    assert measured(MEASURES['crlb'], results)[0] == np.inf
-    assert measured(MEASURES['crlb_median'], results)[0] == 2
+    value, *ends = measured(MEASURES['crlb'], results)
+    assert value == np.inf and np.isnan(ends).all()
+    value, low, high = measured(MEASURES['crlb_median'], results)
+    assert (value, high) == (2, np.inf) and low < 2
     assert measured(MEASURES['crlb_p95'], results)[0] == np.inf
     assert np.isnan(measured(MEASURES['global_bound'], np.array([[1.0, np.nan]]))).all()
 
