@@ -202,12 +202,18 @@ def _shifted(panel: Any, places: np.ndarray, shift: float) -> np.ndarray:
 
 def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) -> None:
     value, low, high = intervals.T
+    sides = np.nan_to_num(np.maximum([value - low, high - value], 0), posinf=0.0)
     bars = panel.errorbar(
-        x, value, np.nan_to_num(np.maximum([value - low, high - value], 0)),
-        color=line.look.colour, linestyle=line.look.line, marker=line.look.marker,
+        x, value, sides, color=line.look.colour, linestyle=line.look.line, marker=line.look.marker,
         markerfacecolor=line.fill, label=line.label)
     for bar in bars.lines[2]:
         bar.set_linewidth(0.8)
+    # An interval without upper end has an arrow to the edge of the panel.
+    for place in np.flatnonzero(np.isposinf(high)):
+        panel.annotate('', (x[place], 1), (x[place], value[place]),
+                       xycoords=panel.get_xaxis_transform(), textcoords='data',
+                       arrowprops={'arrowstyle': '->', 'color': line.look.colour,
+                                   'linewidth': 0.8, 'shrinkA': 0, 'shrinkB': 0})
 
 
 def _styles(names: Sequence[str]) -> dict[str, Any]:

@@ -122,6 +122,19 @@ def test_infinite_and_missing_values_are_left_out(tmp_path):
     write_picture(tmp_path / 'b.png', drawn('n_frames=1,2', value=lambda _: np.nan))
 
 
+def test_an_interval_without_upper_end_has_an_arrow_to_the_edge(tmp_path):
+    axes = [parse_axis('n_frames=1,2')]
+    points = [Point(setting, 'crlb_p95', interval, ()) for setting, interval in zip(
+        settings_of(Scenario(), axes, 'random', 'bayes'),
+        (Interval(3.0, 2.0, np.inf), Interval(1.0, 0.8, 1.2)), strict=True)]
+    figure = draw(axes, points, [['crlb_p95']])
+    write_picture(tmp_path / 'a.png', figure)
+    (panel,) = panels_of(figure)
+    (arrow,) = panel.texts
+    assert (arrow.xy[1], arrow.xyann[1]) == (1, 3.0)
+    assert panel.get_ylim()[1] < 4
+
+
 @pytest.mark.parametrize(('values', 'expected'), [
     ([1, 2, 4, 8], True), ([1, 3, 10, 30], True), ([1, 2, 3, 4], False), ([-10, 0, 10], False),
     ([1, 2], False), ([0, 1, 10], False)])
