@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import random_codebook
+from rhs_isac_ros.codebook import default_codebook_file, random_codebook
 from rhs_isac_ros.experiments import sweep
 from rhs_isac_ros.experiments.measures import Interval
 from rhs_isac_ros.experiments.sweep import Point
@@ -82,3 +82,19 @@ def test_the_picture_has_a_panel_for_each_error(figure):
         'carrier offset, standard deviation [Hz]']
     assert [text.get_text() for text in above.get_legend().get_texts()] == [
         *figure.read_plans([])]
+
+
+@pytest.mark.parametrize(('plans', 'expected'), [
+    ([('quick', 'codebook')], 'codebook.yaml: analog: shape'),
+    ([('codebook', 'codebook')], 'codebook.yaml: /**/optimizer: unknown field'),
+    ([('bandplan', 'quick')], 'quick.yaml: expected ros__parameters'),
+    ([('bandplan', 'codebook_bandplan')] * 2, 'bandplan more than once')])
+def test_a_plan_is_checked_before_anything_runs(figure, plans, expected, capsys):
+    config = default_codebook_file().parent
+    options = [part for plan in plans for part in (
+        '--plan', *(str(config / f'{name}.yaml') for name in plan))]
+    with pytest.raises(SystemExit, match='2'):
+        figure.main(options)
+    errors = capsys.readouterr().err
+    assert 'argument --plan: ' in errors and expected in errors
+    assert len(errors.splitlines()) == 1
