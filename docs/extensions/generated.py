@@ -189,8 +189,7 @@ def module_list(package):
 
 FUNCTIONS = {function.__name__: function for function in (
     parameter_table, scenario_table, measure_table, topic_table, delivery_table, message_list,
-    state_picture,
-    state_table, cycle_sequence, outcome_table, module_list, dependency_table)}
+    state_picture, state_table, cycle_sequence, outcome_table, module_list, dependency_table)}
 
 
 class Generated(SphinxDirective):

@@ -1,9 +1,9 @@
-"""How well bands, sampling times and carriers have to be synchronised for a band plan to pay.
+"""Errors of band plans with imperfect synchronisation of phases, sampling times and carriers.
 
 Problem: with the same spectrum, power and number of pilots, bands at unequal distances resolve the
 range ambiguities that two bands, or equally spaced ones, leave. They compare phases of different
-bands, so that the oscillator must keep its phase when it is retuned. Which errors of phase, timing
-and carrier does the gain survive? The scenario declares the standard deviations, and `bayes`
+bands, so that the oscillator must keep its phase when it is retuned. Up to which errors of phase,
+timing and carrier does the gain remain? The scenario declares the standard deviations, and `bayes`
 averages over the unknowns. Codebooks are optimised without them.
 
 A trial is a block of 250 positions. The phase of each band is uniform, in effect, at 6.28 rad.
