@@ -8,8 +8,14 @@ the posterior relative to the mixture of all Gaussians, so that modes may overla
 
 import numpy as np
 
-from rhs_isac_ros.positioning.joint_modes import JointModes, local_model, with_band_phases
-from rhs_isac_ros.positioning.polar import jacobian, to_polar
+from rhs_isac_ros.positioning.band_phases import BandPhases
+from rhs_isac_ros.positioning.joint_modes import (
+    JointModes,
+    band_outputs,
+    local_model,
+    with_band_phases,
+)
+from rhs_isac_ros.positioning.polar import jacobian, to_polar, to_positions
 from rhs_isac_ros.positioning.samples import Samples, draw_samples
 from rhs_isac_ros.positioning.unknowns import Unknowns
 from rhs_isac_ros.positioning.whitened import WhitenedModel
@@ -18,11 +24,13 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 _SPREAD = 1.3
 # Newton steps of the nuisance parameters at each sample.
 _N_STEPS = 2
+# Samples whose log-weight is lower than the best by more have no effect, whatever their phases.
+_LIKELY_MARGIN = 20.0
 
 
 def draw_broad_samples(
-        model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, joint: JointModes,
-        normal: np.ndarray) -> Samples:
+        model: WhitenedModel, unknowns: Unknowns, phases: BandPhases, received: np.ndarray,
+        joint: JointModes, normal: np.ndarray) -> Samples:
     """Represent modes by samples with the weights of the posterior.
 
     The prior is uniform on the region of interest.
@@ -40,19 +48,30 @@ def draw_broad_samples(
     points = to_polar(samples.positions[inside])
     values = np.repeat(joint.values, n_samples, axis=0)[inside.reshape(-1)]
     log_weights = np.full(inside.shape, -np.inf)
+    evidence, values = _log_evidence(model, unknowns, received, points, values)
     log_weights[inside] = (
-        _log_evidence(model, unknowns, received, points, values)
+        evidence
         + np.log(np.linalg.det(jacobian(points))) - 1.5 * np.log(2 * np.pi)
         - _log_density(points, joint))
-    return samples._replace(log_weights=log_weights)
+    if not phases.is_informative:
+        return samples._replace(log_weights=log_weights)
+    likely = log_weights[inside] >= log_weights.max() - _LIKELY_MARGIN
+    outputs = band_outputs(model, unknowns, received, points[likely], values[likely])
+    log_factors, offsets_m = np.zeros(len(points)), np.zeros(len(points))
+    log_factors[likely], offsets_m[likely] = phases.factors(outputs.T)
+    log_weights[inside] += log_factors
+    positions = samples.positions.copy()
+    positions[inside] = to_positions(points + offsets_m[:, None] * [1, 0, 0])
+    return samples._replace(positions=positions, log_weights=log_weights)
 
 
 def _log_evidence(
         model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, points: np.ndarray,
-        values: np.ndarray) -> np.ndarray:
+        values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood of points [P, 3], with the nuisance parameters integrated out, [P].
 
     Takes approximate values of the parameters [P, Q]; those of the bands' phases are replaced.
+    Also returns the values that it has found.
     """
     values = with_band_phases(model, unknowns, received, points, values)
     for _ in range(_N_STEPS):
@@ -63,7 +82,7 @@ def _log_evidence(
     evidence: np.ndarray = (
         value + np.sum(slope * step, axis=1) / 2 - np.linalg.slogdet(nuisance)[1] / 2
         - np.sum(np.log(unknowns.std)))
-    return evidence
+    return evidence, values
 
 
 def _log_density(points: np.ndarray, joint: JointModes) -> np.ndarray:

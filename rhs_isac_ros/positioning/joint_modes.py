@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.bounds.fisher import quadratic_form
-from rhs_isac_ros.positioning.joint_search import COARSE_STD_RAD, find_starts
+from rhs_isac_ros.positioning.joint_search import find_starts
 from rhs_isac_ros.positioning.modes import (
     MAX_MODES,
     MIN_GAIN,
@@ -118,7 +118,7 @@ def _step(
 
     If it does not move the points, the result is the likelihood there, and the gain is 0.
     """
-    coarse = unknowns.band_phase_std_rad >= COARSE_STD_RAD
+    coarse = unknowns.is_coarse
     if coarse:
         # Steps of the range turn the phases many times.
         values = with_band_phases(model, unknowns, received, points, values)
@@ -155,11 +155,22 @@ def with_band_phases(
     """Replace the phases of the bands, in values [M, Q], by the most likely ones at points."""
     phases = [q for q, name in enumerate(unknowns.names) if name == 'band_phase']
     values = values.copy()
-    values[:, phases] = 0.0
-    mean = model.mean(to_positions(points))
-    whitened = model.whiten(received * unknowns.factors(values))
-    values[:, phases] = np.angle(np.sum(mean.conj() * whitened, axis=2))
+    values[:, phases] = np.angle(band_outputs(model, unknowns, received, points, values))
     return values
+
+
+def band_outputs(
+        model: WhitenedModel, unknowns: Unknowns, received: np.ndarray, points: np.ndarray,
+        values: np.ndarray) -> np.ndarray:
+    """Compute the outputs of the matched filters at points, complex128 [M, N_B].
+
+    They contain the phases of the bands, but not the effect of the other values [M, Q].
+    """
+    others = np.array([name != 'band_phase' for name in unknowns.names])
+    mean = model.mean(to_positions(points))
+    whitened = model.whiten(received * unknowns.factors(values * others))
+    outputs: np.ndarray = np.sum(mean.conj() * whitened, axis=2)
+    return outputs
 
 
 def local_model(

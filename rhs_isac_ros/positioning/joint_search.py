@@ -13,8 +13,6 @@ from rhs_isac_ros.positioning.separation import separate
 from rhs_isac_ros.positioning.table import TemplateTable
 from rhs_isac_ros.positioning.unknowns import Unknowns
 
-# Standard deviation of the bands' phases from which they carry no information about the range.
-COARSE_STD_RAD = 0.75
 # Number of peaks to compare, and of points on which the profile over the gain is tabulated.
 _MAX_PEAKS = 768
 _N_GAIN = 161
@@ -62,7 +60,7 @@ def find_starts(
     The whitened signals are those of one positioning phase, complex128 [N_B, N_SB F].
     """
     outputs = table.band_outputs(whitened)
-    coarse = unknowns.band_phase_std_rad >= COARSE_STD_RAD
+    coarse = unknowns.is_coarse
     offsets = np.zeros(1) if coarse else table.range_offsets_m
     amplitude = _amplitude(unknowns, outputs, table.rotations(offsets))
     energy = float(np.sum(np.abs(whitened)**2))

@@ -4,17 +4,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.positioning.band_phases import BandPhases
 from rhs_isac_ros.positioning.broad_modes import draw_broad_samples
 from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
 from rhs_isac_ros.positioning.joint_modes import find_joint_modes
-from rhs_isac_ros.positioning.joint_search import COARSE_STD_RAD
 from rhs_isac_ros.positioning.modes import Modes
 from rhs_isac_ros.positioning.samples import Samples
 from rhs_isac_ros.positioning.surroundings import Surroundings
 from rhs_isac_ros.positioning.table import TemplateTable
+from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.positioning.unknowns import Alignment, Unknowns
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
+# Samples of a mode if the phases of the bands carry information: their density has several peaks
+# within a mode, so that fewer samples have most of the weight.
+_N_INFORMATIVE = 512
 # Quadrature over the gain outside of the region: spacing [nepers], and reach in standard
 # deviations.
 _GAIN_STEP = 0.04
@@ -60,7 +64,11 @@ class MarginalSearch:
         self._model, self._table, self._surroundings = model, table, surroundings
         self.unknowns = Unknowns(model)
         self._alignment = Alignment(model, self.unknowns, table.filters)
-        self._is_broad = error is None and self.unknowns.band_phase_std_rad >= COARSE_STD_RAD
+        self._is_broad = error is None and self.unknowns.is_coarse
+        self._phases = BandPhases(model, self.unknowns)
+        self._normal = table.normal
+        if self._is_broad and self._phases.is_informative:
+            self._normal = standard_normal(_N_INFORMATIVE)
 
     def find(self, received: np.ndarray) -> Found:
         """Find the modes for the signals of one positioning phase, [N_B, N_SB F]."""
@@ -72,7 +80,7 @@ class MarginalSearch:
             divided = received * self.unknowns.factors(joint.values)
             modes, residuals = self._error.refine(modes, divided, step=False)
         samples = (draw_broad_samples(
-            self._model, self.unknowns, received, joint, self._table.normal)
+            self._model, self.unknowns, self._phases, received, joint, self._normal)
             if self._is_broad else None)
         outside = (-np.inf, 1.0)
         if self._surroundings:

@@ -46,7 +46,7 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
         'energy': np.empty(n, np.float32),
         'energy_slope': np.empty((n, 3)),
         'curvature': np.empty((n, 3, 3)),
-        'normal': _standard_normal(),
+        'normal': standard_normal(_N_NORMAL),
     }
     wavenumbers = carrier_wavenumbers(model.scenario)
 
@@ -68,13 +68,14 @@ def tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
     return table
 
 
-def _standard_normal() -> np.ndarray:
+def standard_normal(n: int) -> np.ndarray:
+    """Return points that represent a standard Gaussian, float64 [n, 3], for a power of two."""
     # The points are kept with the table because these imports take longer than loading a table.
     from scipy.special import ndtri
     from scipy.stats import qmc
 
     points: np.ndarray = ndtri(
-        np.clip(qmc.Sobol(3, seed=0).random(_N_NORMAL), 1e-6, 1 - 1e-6))
+        np.clip(qmc.Sobol(3, seed=0).random(n), 1e-6, 1 - 1e-6))
     return points
 
 

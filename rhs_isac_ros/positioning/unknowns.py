@@ -14,6 +14,10 @@ from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 # Standard deviation from which a wrapped phase is treated as uniform [rad].
 UNIFORM_STD_RAD = 2.0
+# Standard deviation from which the search treats the phases of the bands as uniform. Their joint
+# density then has many peaks along the range, too narrow for Gaussians; `band_phases` adds its
+# information afterwards.
+COARSE_STD_RAD = 0.75
 # Standard deviation of a Gaussian whose density at its centre is that of the uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # Smallest standard deviation, in the unit of the parameter: without effect, but its inverse
@@ -31,8 +35,8 @@ _N_POLISH = 4
 class Unknowns:
     """The nuisance parameters of a scenario.
 
-    A phase of all bands is omitted if the phases of the bands are uniform, because it has then no
-    effect.
+    Phases of the bands whose standard deviation reaches `COARSE_STD_RAD` are uniform here. A
+    phase of all bands is then omitted, because it has no effect.
 
     Attributes
     ----------
@@ -50,13 +54,19 @@ class Unknowns:
         timing, but no phase.
     phase_std_rad, band_phase_std_rad
         Standard deviations of the phases; infinite if uniform.
+    prior_phase_std_rad, prior_band_phase_std_rad
+        Those that the scenario declares, infinite if they carry no information.
     """
 
     def __init__(self, model: WhitenedModel) -> None:
         scenario = model.scenario
         parameters = nuisance_parameters(scenario)
         self.phase_std_rad = _phase_std(scenario.phase_std_rad)
-        self.band_phase_std_rad = _phase_std(scenario.band_phase_std_rad)
+        self.prior_phase_std_rad = self.phase_std_rad
+        self.prior_band_phase_std_rad = _phase_std(scenario.band_phase_std_rad)
+        self.band_phase_std_rad = (
+            self.prior_band_phase_std_rad
+            if self.prior_band_phase_std_rad < COARSE_STD_RAD else np.inf)
         kept = [q for q, parameter in enumerate(parameters)
                 if parameter.name != 'phase' or np.isfinite(self.band_phase_std_rad)]
         self.names = [parameters[q].name for q in kept]
@@ -64,6 +74,8 @@ class Unknowns:
         std = np.array([max(parameters[q].std, _MIN_STD) for q in kept])
         uniform = np.array([name in ('phase', 'band_phase') for name in self.names], bool)
         uniform &= std > UNIFORM_STD_RAD
+        if self.is_coarse:
+            uniform |= np.array([name == 'band_phase' for name in self.names], bool)
         self.std = np.where(uniform, _UNIFORM_EQUIVALENT, std)
         self.precision = np.where(uniform, 0.0, 1 / std**2)
         self.gain = self.names.index('gain') if 'gain' in self.names else None
@@ -72,6 +84,11 @@ class Unknowns:
         self._operators = model.whitened_operators(self.patterns)
         both = self._operators + np.conj(np.swapaxes(self._operators, 2, 3))
         self.information: np.ndarray = np.einsum('aimn,binm->ab', both, both).real
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether the phases of the bands are uniform, so that the range is known coarsely."""
+        return bool(np.isinf(self.band_phase_std_rad))
 
     def whitened_slopes(self, whitened: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
