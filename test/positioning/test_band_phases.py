@@ -14,9 +14,9 @@ from rhs_isac_ros.positioning.unknowns import Unknowns
 from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 SCENARIO = Scenario(
-    center_frequencies_hz=(2.5e9, 2.56e9, 2.6e9), elements_per_side=6, angular_spread_deg=2.0,
-    roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1), band_phase_std_rad=0.8)
-N_PHASES, LOG2_POINTS, N_HARMONICS = 25, 15, 10
+    center_frequencies_hz=(2.5e9, 2.54e9, 2.6e9), elements_per_side=6, angular_spread_deg=2.0,
+    roi_center_m=(8, 0, 0), roi_size_m=(8, 2, 1), band_phase_std_rad=0.8)
+N_PHASES, LOG2_POINTS, N_HARMONICS = 15, 14, 6
 UNIFORM_RAD = 2 * np.pi
 
 
@@ -53,9 +53,8 @@ def posterior_means(scenario, codebook, received):
     return np.array(means)
 
 
-@pytest.mark.parametrize('std', [0.8, 1.2])
-def test_the_mean_is_that_of_the_posterior_with_the_prior_of_the_phases(codebook, std):
-    scenario, rng = dataclasses.replace(SCENARIO, band_phase_std_rad=std), np.random.default_rng(3)
+def test_the_mean_is_that_of_the_posterior_with_the_prior_of_the_phases(codebook):
+    scenario, rng = SCENARIO, np.random.default_rng(3)
     positions = scenario.sample_positions(N_PHASES, rng)
     received = MeasurementModel(scenario, codebook).sample(positions, rng)
     uniform = dataclasses.replace(scenario, band_phase_std_rad=UNIFORM_RAD)
@@ -63,13 +62,12 @@ def test_the_mean_is_that_of_the_posterior_with_the_prior_of_the_phases(codebook
     declared, silent = (
         np.mean(np.sum((make_estimator('bayes', one, codebook).estimate(received).mean
                         - reference)**2, axis=1)) for one in (scenario, uniform))
-    print(std, declared, silent, np.mean(np.sum((reference - positions)**2, axis=1)))
-    assert declared < 0.3 * silent
+    assert declared < 0.2 * silent
 
 
 @pytest.mark.parametrize('phase_std_rad', [0.0, 0.5, UNIFORM_RAD])
 def test_the_factors_average_the_series_over_a_wavelength(codebook, phase_std_rad):
-    """The band width is small here, so that a phase of all bands has nearly no effect."""
+    """The carriers are close, so that the average nearly removes a phase that all bands share."""
     scenario = dataclasses.replace(SCENARIO, phase_std_rad=phase_std_rad)
     model = WhitenedModel(scenario, codebook)
     rng = np.random.default_rng(4)
@@ -80,5 +78,5 @@ def test_the_factors_average_the_series_over_a_wavelength(codebook, phase_std_ra
     ranges = np.linspace(-0.5, 0.5, 200, endpoint=False) * wavelength
     turned = outputs.T[:, None] * np.exp(1j * ranges[:, None] * wavenumbers)
     expected = np.log(np.mean(np.exp(log_factors(turned, 0.8).sum(axis=2)), axis=1))
-    np.testing.assert_allclose(found, expected, atol=0.25)
+    np.testing.assert_allclose(found, expected, atol=0.25 if phase_std_rad else 0.05)
     assert np.all(np.abs(offsets_m) < wavelength / 2)
