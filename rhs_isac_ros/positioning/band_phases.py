@@ -76,7 +76,8 @@ class BandPhases:
         concentration = 2 * np.maximum(magnitude, 1e-9)
         variance: np.ndarray = (
             self._std**2 - 2 * np.log(i1e(concentration) / i0e(concentration)))
-        return np.minimum(np.sqrt(variance), _MAX_STD_RAD)
+        std: np.ndarray = np.minimum(np.sqrt(variance), _MAX_STD_RAD)
+        return std
 
 
 def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
