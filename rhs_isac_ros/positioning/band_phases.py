@@ -27,13 +27,13 @@ class BandPhases:
     Attributes
     ----------
     is_informative
-        Whether the phases of the bands carry information about the range; otherwise, the factors
-        of all positions are one.
+        Whether the search has left out information in the phases of the bands; otherwise, there
+        are no factors.
     """
 
     def __init__(self, model: WhitenedModel, unknowns: Unknowns) -> None:
         self._std = unknowns.prior_band_phase_std_rad
-        self.is_informative = bool(np.isfinite(self._std))
+        self.is_informative = unknowns.is_coarse and bool(np.isfinite(self._std))
         if not self.is_informative:
             return
         wavenumbers = carrier_wavenumbers(model.scenario)
