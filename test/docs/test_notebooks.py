@@ -85,7 +85,7 @@ def test_the_first_fix_is_between_its_bounds_and_its_modes_are_ambiguities(noteb
     local, _ = numbers(r'Cramér-Rao bound +(\S+) ± (\S+) m²', text)
     assert error > 5 * local
     assert abs(error - bound) < 2 * (margin + bound_margin)
-    assert abs(numbers(r'loss to the position error (\S+) %', text)[0]) < 5
+    assert abs(numbers(r'loss due to the position error (\S+) %', text)[0]) < 5
 
 
 def test_the_band_plan_has_the_smallest_error(notebooks):
