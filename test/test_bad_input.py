@@ -108,7 +108,7 @@ PROCESSES = [
     (['run', 'demo', '--users', '100000'], 'demo: error: argument --users: 100000'),
     (['run', 'user', 'seed:=1'], 'user: error: unrecognized arguments: seed:=1'),
     (['run', '../setup'], 'no executable named ../setup'),
-    (['reproduce', 'fig5'], 'no figure named fig5'),
+    (['reproduce', 'fig5'], 'no experiment named fig5'),
     (['benchmark', ''], 'no benchmark named'),
 ]
 
