@@ -87,6 +87,9 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
     finite = np.minimum(results, _INFINITE)
     (replicates,) = replicate(finite, 0, () if measure.quantile is None else [measure.quantile])
     ends = np.array(replicates.interval())
+    if measure.quantile is None:
+        # The replicates have single precision, fewer digits than the table of a sweep.
+        ends[0] = results.mean()
     ends = np.where(ends > _INFINITE / 2, np.inf, ends)
     if measure.root:
         ends = np.sqrt(np.maximum(ends, 0.0))

@@ -14,7 +14,7 @@ def squares():
 def test_a_mean_has_the_interval_of_its_standard_error(squares):
     value, low, high = measured(MEASURES['mse'], squares)
     error = squares.std() / np.sqrt(squares.size)
-    assert value == pytest.approx(squares.mean(), rel=1e-6)
+    assert value == pytest.approx(squares.mean(), rel=1e-12)
     assert low == pytest.approx(value - 1.96 * error, abs=0.25 * error)
     assert high == pytest.approx(value + 1.96 * error, abs=0.25 * error)
 
