@@ -21,9 +21,13 @@ MAX_USER_NODES = 16
 # Memory of the process of a node [bytes], and the number of nodes that a core can run.
 _MEMORY_BYTES = 67_000_000
 _PROCESSES_PER_CORE = 40
+# In the range LOCALHOST, participants announce themselves to as many ports of this machine; later
+# ones are not discovered by all others.
+_MAX_LOCAL_PARTICIPANTS = 32
 # Above domain 101, the ports may collide with the ephemeral ports of Linux.
 _DOMAINS = 101
 _MEMORY_FILE = Path('/proc/meminfo')
+_RANGE, _LOCALHOST = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'
 # Signals sent in order to end a process, each with the time to wait for its exit [s].
 _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 
@@ -38,9 +42,12 @@ def private_domain() -> dict[str, str]:
     """
     return {
         'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID') or claim_domain(),
-        'ROS_AUTOMATIC_DISCOVERY_RANGE':
-            os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'),
+        _RANGE: _discovery_range(),
     }
+
+
+def _discovery_range() -> str:
+    return os.environ.get(_RANGE, _LOCALHOST)
 
 
 def claim_domain() -> str:
@@ -66,12 +73,18 @@ def claim_domain() -> str:
 
 
 def max_processes() -> int:
-    """Return the number of nodes that this machine can run as processes of their own."""
+    """Return the number of nodes that this machine can run as processes of their own.
+
+    The process that observes them counts as one where discovery limits the number.
+    """
     fields = dict(line.split(':') for line in
                   _MEMORY_FILE.read_text(encoding='ascii').splitlines())
     available_bytes = 1024 * int(fields['MemAvailable'].split()[0])
-    return min(available_bytes // _MEMORY_BYTES,
-               _PROCESSES_PER_CORE * len(os.sched_getaffinity(0)))
+    limits = [available_bytes // _MEMORY_BYTES,
+              _PROCESSES_PER_CORE * len(os.sched_getaffinity(0))]
+    if _discovery_range() == _LOCALHOST:
+        limits.append(_MAX_LOCAL_PARTICIPANTS - 1)
+    return min(limits)
 
 
 class Processes:

@@ -42,7 +42,7 @@ def main() -> int:
                         help='number of users of the network to compare with')
     parser.add_argument('--separate', type=positive_int, default=64,
                         help='number of users as processes of their own; fewer if this machine '
-                        'cannot run as many')
+                        'cannot run as many, and at most 25 in the discovery range LOCALHOST')
     parser.add_argument('--users', type=positive_int, default=1000,
                         help='number of users that share one process')
     parser.add_argument('--only', choices=('separate', 'together'),
@@ -54,7 +54,7 @@ def main() -> int:
     separate = min(options.separate, max_user_processes())
     if separate < options.separate and options.only != 'together':
         print(f'{separate} instead of {options.separate} users as processes, because this '
-              'machine cannot run more')
+              'machine cannot run or discover more')
     networks = {'separate': (separate, False), 'together': (options.users, True)}
     chosen = {name: networks[name] for name in ([options.only] if options.only else networks)}
     os.environ.update(private_domain())

@@ -66,14 +66,19 @@ def test_a_child_whose_parent_has_already_died_ends_before_it_starts(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, b'', b'')
 
 
-@pytest.mark.parametrize(('cores', 'available_kb', 'expected'), [
-    (2, 23_000_000, 80), (1, 23_000_000, 40), (64, 1_000_000, 15)])
-def test_cores_and_memory_limit_the_number_of_processes(
-        cores, available_kb, expected, monkeypatch, tmp_path):
+@pytest.mark.parametrize(('cores', 'available_kb', 'discovery', 'expected'), [
+    (2, 23_000_000, 'SUBNET', 80), (1, 23_000_000, 'SUBNET', 40), (64, 1_000_000, 'SUBNET', 15),
+    (2, 23_000_000, 'LOCALHOST', 31), (2, 23_000_000, None, 31), (1, 1_000_000, None, 15)])
+def test_cores_memory_and_discovery_limit_the_number_of_processes(
+        cores, available_kb, discovery, expected, monkeypatch, tmp_path):
     (tmp_path / 'meminfo').write_text(
         f'MemTotal:       99999999 kB\nMemAvailable:   {available_kb} kB\n', encoding='ascii')
     monkeypatch.setattr(processes, '_MEMORY_FILE', tmp_path / 'meminfo')
     monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: set(range(cores)))
+    if discovery:
+        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', discovery)
+    else:
+        monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
     assert processes.max_processes() == expected
 
 
