@@ -39,7 +39,8 @@ def test_every_line_states_its_unit(name):
 def test_yaml_reads_all_values_as_numbers(name):
     content = yaml.safe_load((CONFIG / f'{name}.yaml').read_text(encoding='utf-8'))
     for value in content.values():
-        for number in value if isinstance(value, list) else [value]:
+        entries = value.values() if isinstance(value, dict) else value
+        for number in entries if isinstance(value, dict | list) else [value]:
             assert isinstance(number, int | float | None)
 
 

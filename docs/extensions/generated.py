@@ -19,8 +19,7 @@ from sphinx.util.nodes import nested_parse_with_titles
 from visualization_msgs.msg import MarkerArray
 
 from rhs_isac_ros.experiments.measures import MEASURES
-from rhs_isac_ros.model.deviations import Deviations
-from rhs_isac_ros.model.table1 import Table1
+from rhs_isac_ros.model.scenario import Extensions, Table1
 from rhs_isac_ros.protocol import diagram
 from rhs_isac_ros.protocol.delivery import DELIVERIES, USER
 from rhs_isac_ros.protocol.outcomes import Kind, Outcome
@@ -63,9 +62,9 @@ def parameter_table():
 
 
 def scenario_table(kind):
-    """Return a table of the scenario fields of `Table1` or `Deviations`."""
+    """Return a table of the scenario fields of `Table1` or `Extensions`."""
     rows = []
-    for field in dataclasses.fields({'table1': Table1, 'deviations': Deviations}[kind]):
+    for field in dataclasses.fields({'table1': Table1, 'extensions': Extensions}[kind]):
         declared = field.metadata
         default = list(field.default) if isinstance(field.default, tuple) else field.default
         source = f' Source: {declared["source"]}.' if declared['source'] else ''
@@ -178,12 +177,14 @@ def module_list(package):
         parts.append(f'``from {package} import`` one of:\n\n' + '\n'.join(entries) + '\n')
     parts += [f'.. autofunction:: {package}.{item.__name__}\n' for item in public
               if getattr(item, '__module__', '') == package]
-    for info in pkgutil.iter_modules(home.__path__):
-        if info.ispkg or info.name.startswith('_'):
+    for info in pkgutil.walk_packages(home.__path__, f'{package}.'):
+        name = info.name.removeprefix(f'{package}.')
+        if name.startswith('_'):
             continue
-        name = f'{package}.{info.name}'
-        parts.append(f'``{info.name}``\n{"-" * (len(info.name) + 4)}\n\n'
-                     f'.. automodule:: {name}\n')
+        # The modules of a package within describe its members.
+        members = '   :no-members:\n' if info.ispkg else ''
+        parts.append(f'``{name}``\n{"-" * (len(name) + 4)}\n\n'
+                     f'.. automodule:: {info.name}\n{members}')
     return '\n'.join(parts)
 
 

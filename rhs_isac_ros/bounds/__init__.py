@@ -1,6 +1,6 @@
 """Local and global bounds of positioning, and gradients of the local ones."""
 
-from rhs_isac_ros.bounds.average_crlb import AverageCrlb, average_crlb
+from rhs_isac_ros.bounds.average import AverageCrlb, average_crlb
 from rhs_isac_ros.bounds.fisher import crlb, crlb_of, fisher_information, fisher_information_of
 from rhs_isac_ros.bounds.global_bound import GlobalBound, global_bound
 from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost

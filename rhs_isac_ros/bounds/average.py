@@ -1,14 +1,18 @@
-"""Averages of losses that depend on a codebook through quadratic forms, with gradients."""
+"""Averages of losses that depend on a codebook through quadratic forms, with gradients.
+
+The average Cramer-Rao bound is one of them.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.compressed_rows import CompressedRows
-from rhs_isac_ros.bounds.fisher import quadratic_form
-from rhs_isac_ros.bounds.measurement_rows import (
+from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form, region_information
+from rhs_isac_ros.bounds.gradient import quadratic_gradients
+from rhs_isac_ros.bounds.rows import (
     PLAIN,
+    CompressedRows,
     Evaluation,
     ExactRows,
     MeasurementRows,
@@ -16,8 +20,10 @@ from rhs_isac_ros.bounds.measurement_rows import (
     RowSource,
     blocks,
 )
-from rhs_isac_ros.bounds.quadratic_gradient import quadratic_gradients
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import marginalise
+from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.model.los import checked_positions, los_and_derivative, los_derivative
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import one_blas_thread
@@ -155,6 +161,104 @@ class Average:
         if self._combination is None:
             return whitened
         return [self._combination.forward(band, rows) for band, rows in enumerate(whitened)]
+
+
+def average_crlb(
+        scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> Gradient:
+    """Compute the average bound, Eq. (17), with its gradients by Propositions 2 and 3.
+
+    Takes positions of the user, float64 [N, 3] [m]. The value is in m^2, as is the derivative
+    with respect to C; that with respect to S is in m^2/sqrt(W).
+
+    Raises
+    ------
+    ValueError
+        If `positions` is not a finite [N, 3] array, or holds no position.
+    """
+    return AverageCrlb(scenario, positions)(codebook)
+
+
+class AverageCrlb(Average):
+    """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
+
+    Nuisance parameters and errors of the elements are taken into account as `crlb` does.
+
+    Parameters
+    ----------
+    tolerance
+        Relative error of the rows, see `CompressedRows`; 0 selects exact ones.
+    region_prior
+        Whether to add the information of the region of interest, as `crlb` does.
+
+    Raises
+    ------
+    ValueError
+        If `positions` is not a finite [N, 3] array or holds no position, or the tolerance is
+        neither 0 nor large enough.
+    """
+
+    def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
+                 region_prior: bool = False) -> None:
+        self.positions = checked_positions(positions)
+        if not len(self.positions):
+            raise ValueError('positions: none given, expected at least one')
+        self._prior = region_information(scenario) if region_prior else np.zeros((3, 3))
+        if not len(nuisance_of(scenario)):
+            super().__init__(
+                scenario,
+                lambda block, band: los_derivative(scenario, self.positions[block], band),
+                len(self.positions), 3, self._trace_of_inverse, tolerance)
+            return
+        patterns, combination = _structure(scenario)
+
+        def source(block: slice, band: int) -> np.ndarray:
+            gain, derivative = los_and_derivative(scenario, self.positions[block], band)
+            return np.concatenate([derivative, *[gain[:, None]] * len(patterns)], axis=1)
+
+        super().__init__(
+            scenario, source, len(self.positions), 3 + len(patterns), self._marginal_trace,
+            tolerance, patterns, combination)
+
+    def _trace_of_inverse(
+            self, block: slice, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Trace of the inverse [n] and its negative derivative [n, 3, 3]."""
+        inverse = inverse_information(information + self._prior)
+        values = np.trace(inverse, axis1=1, axis2=2)
+        # Where the signals do not determine the position, the value is infinite and the slope
+        # zero.
+        finite = np.where(np.isfinite(values)[:, None, None], inverse, 0.0)
+        return values, np.matmul(finite, finite)
+
+    def _marginal_trace(
+            self, block: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Trace of the bound [n] and its negative derivative [n, 3 + Q, 3 + Q]."""
+        prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
+        marginal = marginalise(joint + prior, np.zeros(joint.shape[:2]))
+        values, by_marginal = self._trace_of_inverse(block, marginal.information)
+        # The Schur complement is W^T J W with W = [I; regression] held fixed, because W minimises
+        # it.
+        identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
+        whole = np.concatenate([identity, marginal.regression], axis=1)
+        return values, whole @ by_marginal @ np.swapaxes(whole, 1, 2)
+
+
+def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination]:
+    """Rows of position and nuisance parameters from those of the derivative and of the gain.
+
+    A parameter whose pattern is constant in each band multiplies the row of the gain; any other
+    one has a row of its own.
+    """
+    scaled = nuisance_of(scenario).scaled_patterns
+    patterns: list[Pattern] = [(slice(0, 4), None)]
+    index, scale = [0, 1, 2], np.ones((scenario.n_bands, 3 + len(scaled)), complex)
+    for row, pattern in enumerate(scaled, 3):
+        if np.ptp(pattern, axis=1).any():
+            index.append(3 + len(patterns))
+            patterns.append((slice(index[-1], index[-1] + 1), pattern))
+        else:
+            index.append(3)
+            scale[:, row] = pattern[:, 0]
+    return patterns, Combination(np.array(index), scale)
 
 
 def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:

@@ -2,14 +2,10 @@
 
 import numpy as np
 
-from rhs_isac_ros.bounds.nuisance import (
-    marginal_information,
-    region_information,
-    scaled_directions,
-)
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import marginalise
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.nuisance import nuisance_parameters
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
@@ -60,9 +56,27 @@ def position_information_of(model: MeasurementModel, positions: np.ndarray) -> n
     Without nuisance parameters, this is `fisher_information_of`. Returns float64 [N, 3, 3]
     [1/m^2].
     """
-    if not nuisance_parameters(model.scenario):
+    if not len(nuisance_of(model.scenario)):
         return fisher_information_of(model, positions)
     return marginal_information(joint_information_of(model, positions))
+
+
+def marginal_information(joint: np.ndarray) -> np.ndarray:
+    """Compute the information about the position that remains without the nuisance parameters.
+
+    Takes the joint information of position and scaled nuisance parameters, whose prior
+    information is the identity matrix, float64 [N, 3 + Q, 3 + Q]. Returns float64 [N, 3, 3].
+    """
+    prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
+    return marginalise(joint + prior, np.zeros(joint.shape[:2])).information
+
+
+def region_information(scenario: Scenario) -> np.ndarray:
+    """Return the information of the region of interest as a prior, float64 [3, 3] [1/m^2].
+
+    The uniform distribution is replaced by a Gaussian of the same covariance, size^2 / 12.
+    """
+    return np.diag(12 / np.array(scenario.roi_size_m)**2)
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:
@@ -130,14 +144,16 @@ def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Compute the information about position and nuisance parameters, without any prior.
 
-    Returns float64 [N, 3 + Q, 3 + Q]; nuisance parameters are scaled to unit deviation.
+    Returns float64 [N, 3 + Q, 3 + Q]; nuisance parameters are scaled so that their prior is
+    standard normal, and units do not matter.
     """
     positions = checked_positions(positions)
-    size = 3 + len(nuisance_parameters(model.scenario))
+    patterns = nuisance_of(model.scenario).scaled_patterns
+    size = 3 + len(patterns)
     information = np.zeros((len(positions), size, size))
     for start in range(0, len(positions), _BLOCK):
         block = slice(start, start + _BLOCK)
-        directions = scaled_directions(model.scenario, model.mean(positions[block]))
+        directions = patterns * model.mean(positions[block])[:, None]
         for band, whitener in enumerate(model.whitener):
             rows = np.concatenate(
                 [model.band_jacobian(positions[block], band), directions[:, :, band]], axis=1)

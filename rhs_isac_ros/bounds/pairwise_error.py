@@ -1,13 +1,18 @@
-"""Error by confusion of distant positions, which the local Cramer-Rao bound does not include."""
+"""Error by confusion of distant positions, which the local Cramer-Rao bound does not include.
+
+The phases of the bands may be unknown: theta = A z, with standard normal z. The distance of two
+signals is then the smallest over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For small
+deviations it is what the marginalisation of the Fisher information leaves; for large ones it
+vanishes if the signals differ in the phases of their bands alone.
+"""
 
 import copy
 
 import numpy as np
 
 from rhs_isac_ros.bounds.average import Average, Combination
-from rhs_isac_ros.bounds.compressed_rows import CompressedRows
-from rhs_isac_ros.bounds.measurement_rows import PLAIN
-from rhs_isac_ros.bounds.unknown_phases import best_phases, phase_scales
+from rhs_isac_ros.bounds.rows import PLAIN, CompressedRows
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming
@@ -15,6 +20,8 @@ from rhs_isac_ros.model.surface import Beamforming
 # Share of a sample that is drawn uniformly. It bounds the weight of a pair whose cost grows while
 # the codebook changes.
 _UNIFORM_SHARE = 0.05
+# Steps of the minimisation over the phases, each of which lowers the distance.
+_STEPS = 40
 
 
 class PairwiseErrorCost(Average):
@@ -24,8 +31,8 @@ class PairwiseErrorCost(Average):
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
     cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. The quadratic
     form is that of Eq. (12), with the difference h(p) - h(p') instead of the derivative. If the
-    scenario declares phases as unknown, the form is the smallest over the phases, see
-    `unknown_phases`; other nuisance parameters are not included.
+    scenario declares phases as unknown, the form is the smallest over the phases; other nuisance
+    parameters are not included.
 
     Parameters
     ----------
@@ -58,7 +65,7 @@ class PairwiseErrorCost(Average):
             raise ValueError(
                 f'weights: shape {weights.shape}, expected {(n,)}, none negative or NaN')
         self._costs = weights * np.sum((first_positions - second_positions)**2, axis=1)
-        self._scales = phase_scales(scenario)
+        self._scales = nuisance_of(scenario).scaled_phases
 
         def gains(block: slice, band: int) -> list[np.ndarray]:
             return [_repeated_gain(scenario, first_positions[block], band),
@@ -138,6 +145,42 @@ class PairwiseErrorCost(Average):
         slopes[:, turned, second] = slopes[:, second, turned] = -np.sin(phases)
         squares = np.einsum('nab,nab->n', slopes, forms) + penalties
         return np.maximum(squares, 0.0), slopes
+
+
+def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the phases theta with which signals a are the closest to signals b, almost always.
+
+    Parameters
+    ----------
+    products
+        Twice the inner products a_i^H b_i of the whitened signals, complex128 [n, N_B].
+    scales
+        The matrix A, float64 [N_B, Q] [rad].
+
+    Returns
+    -------
+    phases : numpy.ndarray
+        Theta, float64 [n, N_B] [rad].
+    penalties : numpy.ndarray
+        The cost ``|z|^2`` of these phases, float64 [n].
+    """
+    magnitude, angle = np.abs(products), np.angle(products)
+    # The cosines have curvatures up to the magnitudes, so that steps with these do not overshoot.
+    curvature = np.einsum('bq,nb,bp->nqp', scales, magnitude, scales) + np.eye(scales.shape[1])
+    inverse = np.linalg.inv(curvature)
+    candidates = []
+    # Small deviations keep the minimum near 0, large ones near the angles of the products.
+    for z in (np.zeros((len(products), scales.shape[1])), angle @ np.linalg.pinv(scales).T):
+        for _ in range(_STEPS):
+            slope = (magnitude * np.sin(z @ scales.T - angle)) @ scales + z
+            z = z - np.einsum('nqp,np->nq', inverse, slope)
+        penalty = np.sum(z**2, axis=1)
+        phases = z @ scales.T
+        cost = penalty - 2 * np.sum(magnitude * np.cos(phases - angle), axis=1)
+        candidates.append((cost, phases, penalty))
+    first, second = candidates
+    better = first[0] <= second[0]
+    return np.where(better[:, None], first[1], second[1]), np.where(better, first[2], second[2])
 
 
 def _rows_of_bands(n_bands: int) -> Combination:

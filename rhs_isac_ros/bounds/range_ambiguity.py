@@ -8,8 +8,10 @@ plans in little time.
 
 import numpy as np
 
-from rhs_isac_ros.bounds.unknown_phases import best_phases, phase_scales
+from rhs_isac_ros.bounds.pairwise_error import best_phases
 from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model.gaussian import eliminate
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
@@ -120,7 +122,7 @@ def _differences(
     """
     means, jacobians = model.mean_and_jacobian(confused)
     means, jacobians, target = model.whiten(means), model.whiten(jacobians), model.whiten(mean)
-    scales, penalties = phase_scales(model.scenario), np.zeros(len(confused))
+    scales, penalties = nuisance_of(model.scenario).scaled_phases, np.zeros(len(confused))
     slopes = jacobians
     if scales.size:
         products = 2 * np.sum(np.conj(means) * target, axis=2)
@@ -135,9 +137,8 @@ def _differences(
     information = np.einsum('nur,nvr->nuv', directions, directions)
     # The phases have a prior; the information of real parts is half the curvature.
     information[:, 3:, 3:] += np.eye(scales.shape[1]) / 2
-    displacement = np.linalg.solve(information, by_position[..., None])[..., 0]
-    remaining: np.ndarray = difference - np.einsum('nu,nur->nr', displacement, directions)
-    return remaining, penalties
+    _, displacement = eliminate(information, information[..., :0], by_position)
+    return difference - np.einsum('nu,nur->nr', displacement, directions), penalties
 
 
 def _lags(highest_hz: float, max_lag_m: float) -> np.ndarray:

@@ -5,12 +5,12 @@ from rhs_isac_ros.calibration.calibration import (
     CalibrationError,
     calibrate,
     load_surface,
+    report,
 )
-from rhs_isac_ros.calibration.estimate import estimate_surface, prior_of
+from rhs_isac_ros.calibration.estimate import Pilots, estimate_surface, prior_of
 from rhs_isac_ros.calibration.mixture import SurfacePrior
-from rhs_isac_ros.calibration.pilots import Pilots
 
 __all__ = [
     'Calibration', 'CalibrationError', 'Pilots', 'SurfacePrior', 'calibrate', 'estimate_surface',
-    'load_surface', 'prior_of',
+    'load_surface', 'prior_of', 'report',
 ]

@@ -7,6 +7,7 @@ of the beams, in which the errors are visible, gain weight: the estimation alter
 posterior for a covariance, and the covariance for a posterior.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -17,9 +18,17 @@ from rhs_isac_ros.calibration.mixture import (
     surface_posterior,
     without_data,
 )
-from rhs_isac_ros.calibration.pilots import Pilots, PilotStatistics
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model import Beamforming, Scenario
+from rhs_isac_ros.model.gaussian import eliminate
+from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.measurement import signal_covariance
+from rhs_isac_ros.model.surface_estimate import (
+    SurfaceEstimate,
+    direct_design,
+    element_radiation,
+    scattered_errors,
+)
 from rhs_isac_ros.model.threads import one_blas_thread
 
 # Prior of scenarios that declare no errors or failures.
@@ -32,6 +41,44 @@ TOLERANCE = 0.02
 _UNIFORM_STD_RAD = 2.0
 # Share of the largest variance below which a direction of the covariance is dropped.
 _MIN_VARIANCE = 1e-12
+# Pilots evaluated at a time.
+_BLOCK = 64
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pilots:
+    """Signals of a reference user at known positions, received with one codebook.
+
+    Attributes
+    ----------
+    beams
+        The codebook.
+    positions
+        Float64 [N, 3] [m].
+    received
+        Complex128 [N, N_B, N_SB F], sub-band-major.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong or a number is not finite.
+    """
+
+    beams: Beamforming
+    positions: np.ndarray
+    received: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check the arrays."""
+        checked_positions(self.positions)
+        n_bands, n_subbands, n_frames, _ = self.beams.digital.shape
+        expected = len(self.positions), n_bands, n_subbands * n_frames
+        if np.shape(self.received) != expected:
+            raise ValueError(
+                f'received: shape {np.shape(self.received)}, expected [N, N_B, N_SB F] = '
+                f'{expected}')
+        if not np.isfinite(self.received).all():
+            raise ValueError('received: not finite, expected finite numbers')
 
 
 def prior_of(scenario: Scenario) -> SurfacePrior:
@@ -89,12 +136,13 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
     the bands, which is then fixed: pilots of one user reveal the sum only.
     """
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
-    if scenario.user_gain_std_db > 0:
-        rms[0, 0] = 0.0
-    if scenario.band_phase_std_rad > _UNIFORM_STD_RAD:
-        rms[1] = 0.0
-    elif scenario.phase_std_rad > _UNIFORM_STD_RAD:
-        rms[1, 0] = 0.0
+    nuisance = nuisance_of(scenario)
+    phases = nuisance.phases
+    uniform = phases[:, np.abs(phases).max(axis=0, initial=0) > _UNIFORM_STD_RAD]
+    for part, directions in zip(rms, (nuisance.scaled_patterns.real.mean(axis=2).T, uniform),
+                                strict=True):
+        # NumPy 1.26 has no rank of an empty matrix.
+        part[:np.linalg.matrix_rank(directions) if directions.size else 0] = 0.0
     return rms
 
 
@@ -114,3 +162,175 @@ def _result(posterior: Posterior, band_gains: np.ndarray) -> SurfaceEstimate:
     return SurfaceEstimate(
         mean[:n], mean[n:2 * n], band_gains, vectors[:, kept] * np.sqrt(values[kept]),
         posterior.failed_probability)
+
+
+class PilotStatistics:
+    """Information of pilots about the parameters, given the covariance of their noise.
+
+    The P = 2 N_E + N_B parameters are gains and offsets of the elements, and relative errors of
+    the bands' gains. Nuisance parameters that the scenario declares have other values for
+    each pilot: each round improves the values by a scoring step and integrates over the rest.
+    """
+
+    def __init__(self, scenario: Scenario, pilots: Sequence[Pilots]) -> None:
+        self._scenario, self._pilots = scenario, pilots
+        self._radiation = [element_radiation(scenario, group.beams) for group in pilots]
+        self._size = 2 * scenario.n_elements + scenario.n_bands
+        # Values are standard normal a priori.
+        nuisance = nuisance_of(scenario)
+        self._patterns = nuisance.scaled_patterns
+        self._phases = nuisance.phases
+        self._is_sharp = nuisance.moves_multipath
+        self._values: list[np.ndarray] = []
+
+    def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute information [2 P, 2 P] and shift [2 P] for real and then imaginary parts.
+
+        Parameters
+        ----------
+        gains
+            Gains of the bands about which the model is linear, complex128 [N_B].
+        mean, covariance
+            Of gains and offsets of the elements, complex128 [2 N_E] and [2 N_E, 2 N_E].
+        """
+        size = self._size
+        normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
+        lost, moved = np.zeros((2 * size, 2 * size)), np.zeros(2 * size)
+        is_first = not self._values
+        for index, (group, radiation) in enumerate(
+                zip(self._pilots, self._radiation, strict=True)):
+            if is_first:
+                self._values.append(np.zeros((len(group.positions), len(self._patterns))))
+            whiteners = self._whiteners(radiation, gains, mean, covariance)
+            for start in range(0, len(group.positions), _BLOCK):
+                block = slice(start, start + _BLOCK)
+                part = _Block(self._scenario, radiation, whiteners, group.positions[block], mean)
+                signals = group.received[block] / gains[:, None]
+                values = self._values[index][block]
+                if len(self._patterns):
+                    if is_first:
+                        self._align(part, signals, values)
+                    signals, slopes = self._step(part, signals, values)
+                    of_values = self._integrated(part, signals, slopes)
+                    lost, moved = lost + of_values[0], moved + of_values[1]
+                whitened = part.whiten(signals)
+                for columns, white in zip(part.columns, np.swapaxes(whitened, 0, 1), strict=True):
+                    flat = columns.reshape(-1, size)
+                    normal += np.conj(flat.T) @ flat
+                    product += np.conj(flat.T) @ white.reshape(-1)
+        return _real_matrix(normal) - lost, _real_vector(product) - moved
+
+    def _whiteners(self, radiation: np.ndarray, gains: np.ndarray, mean: np.ndarray,
+                   covariance: np.ndarray) -> np.ndarray:
+        """Whiteners of the signals divided by the bands' gains [N_B, N_SB F, N_SB F]."""
+        scenario, n = self._scenario, self._scenario.n_elements
+        expected = radiation[..., :n] * mean[:n] + radiation[..., n:] * mean[n:]
+        total = signal_covariance(scenario, expected)
+        total += scattered_errors(scenario, radiation, covariance)
+        # Thermal noise is not subject to the gain.
+        excess = scenario.noise_power_w * (1 / np.abs(gains)**2 - 1)
+        total += excess[:, None, None] * np.eye(total.shape[1])
+        whiteners: np.ndarray = np.linalg.inv(np.linalg.cholesky(total))
+        return whiteners
+
+    def _factors(self, values: np.ndarray) -> np.ndarray:
+        factors: np.ndarray = np.exp(-np.tensordot(values, self._patterns, axes=1))
+        return factors
+
+    def _align(self, part: '_Block', signals: np.ndarray, values: np.ndarray) -> None:
+        """Set the phases to those of the expected signals."""
+        outputs = np.sum(np.conj(part.mean) * part.whiten(signals), axis=2)
+        for q in np.flatnonzero(self._phases.any(axis=0)):
+            turns = self._phases[:, q]
+            output = outputs[:, turns != 0].sum(axis=1)
+            turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
+            values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
+            outputs *= np.exp(-1j * values[:, q, None] * turns)
+
+    def _step(self, part: '_Block', signals: np.ndarray, values: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """Improve the values; return the signals, linear in the values, and their slopes.
+
+        The signals are those of a linear model with the values themselves as parameters, so that
+        the prior applies to these.
+        """
+        aligned = signals * self._factors(values)
+        slopes = part.whiten(self._directions(part, aligned))
+        residual = part.whiten(aligned) - part.mean
+        gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real
+        gradient -= values
+        curvature = self._curvature(slopes)
+        values += eliminate(curvature, curvature[..., :0], gradient)[1]
+        aligned = signals * self._factors(values)
+        directions = self._directions(part, aligned)
+        linear: np.ndarray = aligned + np.einsum('nq,nqir->nir', values, directions)
+        return linear, part.whiten(directions)
+
+    def _directions(self, part: '_Block', aligned: np.ndarray) -> np.ndarray:
+        """Derivatives with respect to the values [N, Q, N_B, N_SB F].
+
+        Offsets of carrier and timing move the multipath out of the nulls of its covariance, and
+        are visible there. Their derivatives are therefore those of the signals, not of the mean.
+        """
+        sources = np.where(self._is_sharp[:, None, None], aligned[:, None], part.plain[:, None])
+        directions: np.ndarray = self._patterns * sources
+        return directions
+
+    def _curvature(self, slopes: np.ndarray) -> np.ndarray:
+        n, n_values = slopes.shape[:2]
+        flat = np.ascontiguousarray(slopes.reshape(n, n_values, -1)).view(float)
+        curvature: np.ndarray = (
+            2 * np.matmul(flat, np.swapaxes(flat, 1, 2)) + np.eye(n_values))
+        return curvature
+
+    def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray]:
+        """Information [2 P, 2 P] and shift [2 P] that the unknown values take."""
+        coupling = sum(np.einsum('nqr,nrp->nqp', np.conj(slopes[:, :, band]), columns)
+                       for band, columns in enumerate(part.columns))
+        coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
+        of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
+        regression, _ = eliminate(self._curvature(slopes), coupling, of_signals)
+        flat = -regression.reshape(-1, regression.shape[2])
+        return coupling.reshape(flat.shape).T @ flat, of_signals.reshape(-1) @ flat
+
+
+class _Block:
+    """Linear model of several pilots.
+
+    Attributes
+    ----------
+    columns
+        Whitened derivatives of each band's signals, complex128 [N, N_SB F, P].
+    plain, mean
+        Expected signals before and after whitening, complex128 [N, N_B, N_SB F].
+    """
+
+    def __init__(self, scenario: Scenario, radiation: np.ndarray, whiteners: np.ndarray,
+                 positions: np.ndarray, mean: np.ndarray) -> None:
+        self._whiteners = whiteners
+        self.columns: list[np.ndarray] = []
+        self.plain = np.empty((len(positions), *radiation.shape[:2]), complex)
+        n = 2 * scenario.n_elements
+        for band, whitener in enumerate(whiteners):
+            design = direct_design(scenario, radiation, band, positions)
+            self.plain[:, band] = design @ mean
+            columns = np.zeros((*design.shape[:2], n + scenario.n_bands), complex)
+            columns[..., :n] = np.matmul(whitener, design)
+            columns[..., n + band] = self.plain[:, band] @ whitener.T
+            self.columns.append(columns)
+        self.mean = self.whiten(self.plain)
+
+    def whiten(self, signals: np.ndarray) -> np.ndarray:
+        """Whiten signals [..., N_B, N_SB F]."""
+        whitened: np.ndarray = np.einsum('irs,...is->...ir', self._whiteners, signals)
+        return whitened
+
+
+def _real_matrix(matrix: np.ndarray) -> np.ndarray:
+    return 2 * np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
+
+
+def _real_vector(vector: np.ndarray) -> np.ndarray:
+    return 2 * np.concatenate([vector.real, vector.imag])

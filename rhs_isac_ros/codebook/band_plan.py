@@ -19,7 +19,7 @@ from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.optimize import INTERRUPTED, OptimizeResult, optimize
 from rhs_isac_ros.codebook.start import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
-from rhs_isac_ros.model.nuisance import nuisance_parameters
+from rhs_isac_ros.model.impairments import nuisance_of
 
 DEFAULT_RASTER_HZ = 10e6
 # Energies of a codebook relative to a random one, for each of which the screening proposes plans:
@@ -228,7 +228,7 @@ def expected_error(
     region as prior, plus the squared error by confusion of ranges.
     """
     rng = streams.generator(seed, streams.PLANS, 1)
-    if not nuisance_parameters(scenario):
+    if not len(nuisance_of(scenario)):
         return global_bound(scenario, codebook, rng, n_phases).value
     model = MeasurementModel(scenario, codebook)
     positions = scenario.sample_positions(_POSITIONS, rng)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rhs_isac_ros.model import plugins
 from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
 from rhs_isac_ros.model.plugins import PluginError
 
@@ -42,6 +43,8 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
         return None if value is None else _vectors(field, value)
     if name in ('element_gain', 'user_gain'):
         return _gain(field, value)
+    if name == 'impairments':
+        return _strengths(field, value)
     if field.type is int or isinstance(field.default, int):
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
             raise ScenarioError(f'{name}: {value!r}, expected an integer')
@@ -62,6 +65,20 @@ def _gain(field: dataclasses.Field[Any], value: Any) -> float | GainPattern:
     except (PatternError, PluginError) as error:
         raise ScenarioError(f'{field.name}: {error}') from None
     return _number(field, value)
+
+
+def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, float], ...]:
+    try:
+        pairs = sorted(dict(value).items())
+    except (TypeError, ValueError):
+        raise ScenarioError(
+            f'{field.name}: {value!r}, expected a mapping of names to strengths') from None
+    for name, _ in pairs:
+        try:
+            plugins.load(plugins.IMPAIRMENTS, name)
+        except PluginError as error:
+            raise ScenarioError(f'{field.name}: {error}') from None
+    return tuple((name, _number(field, strength)) for name, strength in pairs)
 
 
 def _is_number(text: str) -> bool:

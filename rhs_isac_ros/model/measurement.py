@@ -2,44 +2,52 @@
 
 The signals of band i are complex Gaussian with a mean that depends on the user's position and a
 covariance Lambda_i that does not. Bands are independent of each other. Element errors that the
-scenario declares add to the covariance; `nuisance` describes unknown gains and phases.
+scenario declares add to the covariance; `impairments` describes unknown gains and phases.
 """
 
 import functools
-from typing import Protocol
 
 import numpy as np
 
-from rhs_isac_ros.model import element_error
-from rhs_isac_ros.model.covariance import scattered_covariance, signal_covariance
 from rhs_isac_ros.model.element_sums import ElementSums
-from rhs_isac_ros.model.imperfections import (
-    SurfaceImperfection,
-    draw_deviations,
-    has_element_errors,
-)
+from rhs_isac_ros.model.impairments.elements import DeclaredElements, ElementErrors, SurfaceModel
+from rhs_isac_ros.model.impairments.factors import draw_impairments
 from rhs_isac_ros.model.los import checked_positions, los_derivative, los_gain
-from rhs_isac_ros.model.multipath import complex_normal, square_root
+from rhs_isac_ros.model.multipath import (
+    complex_normal,
+    measurement_correlation,
+    multipath_covariance,
+    square_root,
+)
 from rhs_isac_ros.model.receive import received_signal
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
-# What may be known of the elements: their errors, or an estimate of them.
-Surface = SurfaceImperfection | SurfaceEstimate
+# Knowledge of the elements of one surface: their errors, or an estimate of them.
+Surface = ElementErrors | SurfaceEstimate
 # Positions evaluated at a time.
 _BLOCK = 256
 
 
-class _Errors(Protocol):
-    """The distribution of errors of the elements: that of a scenario, or of an estimate."""
+def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
+    """Implements Eq. (14). Covariance of the received signals, independent of the position.
 
-    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray: ...
+    Returns Lambda_i, complex128 [N_B, N_SB F, N_SB F] [W], for the radiation matrices T_i of all
+    bands, complex128 [N_B, N_SB F, N_E].
+    """
+    noise = scenario.noise_power_w * np.eye(radiation.shape[1])
+    covariance: np.ndarray = scattered_covariance(scenario, radiation) + noise
+    return covariance
 
-    def error_covariance_at(
-            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray
-    ) -> np.ndarray: ...
+
+def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
+    """Compute the covariance of the multipath in the received signals, as `signal_covariance`."""
+    spatial = multipath_covariance(scenario)
+    scattered = np.matmul(np.matmul(radiation, spatial), np.conj(np.swapaxes(radiation, 1, 2)))
+    correlated: np.ndarray = measurement_correlation(scenario) * scattered
+    return correlated
 
 
 def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
@@ -83,6 +91,10 @@ class MeasurementModel:
 
     Attributes
     ----------
+    scenario, beams, surface
+        The arguments.
+    elements
+        `surface`, or the distribution that the scenario declares.
     radiation
         T_i of Eq. (9) for the coefficients in effect, complex128 [N_B, N_SB F, N_E], read-only.
 
@@ -95,14 +107,10 @@ class MeasurementModel:
     @one_blas_thread
     def __init__(self, scenario: Scenario, beamforming: Beamforming,
                  surface: Surface | None = None) -> None:
-        self.scenario, self._beams = scenario, beamforming
-        self._is_uncertain = surface is None and has_element_errors(scenario)
-        self._errors: _Errors | None = element_error if self._is_uncertain else None
-        if isinstance(surface, SurfaceEstimate):
-            self._errors = surface
-        applied = (surface.applied_beams(beamforming) if surface
-                   else element_error.expected_beams(scenario, beamforming))
-        self.radiation = _read_only(radiation_matrix(scenario, applied))
+        self.scenario, self.beams, self.surface = scenario, beamforming, surface
+        self.elements: SurfaceModel = surface or DeclaredElements(scenario)
+        self.radiation = _read_only(
+            radiation_matrix(scenario, self.elements.applied_beams(beamforming)))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -117,8 +125,8 @@ class MeasurementModel:
         Unknown errors of the elements contribute their average over the region of interest.
         """
         covariance = signal_covariance(self.scenario, self.radiation)
-        if self._errors:
-            covariance += self._errors.error_covariance(self.scenario, self._beams)
+        if not self.elements.is_exact:
+            covariance += self.elements.error_covariance(self.scenario, self.beams)
         return covariance
 
     def covariance_at(self, positions: np.ndarray) -> np.ndarray:
@@ -129,9 +137,9 @@ class MeasurementModel:
         positions = checked_positions(positions)
         covariance: np.ndarray = np.repeat(
             signal_covariance(self.scenario, self.radiation)[None], len(positions), axis=0)
-        if self._errors:
-            covariance += self._errors.error_covariance_at(
-                self.scenario, self._beams, positions)
+        if not self.elements.is_exact:
+            covariance += self.elements.error_covariance_at(
+                self.scenario, self.beams, positions)
         return covariance
 
     @functools.cached_property
@@ -236,12 +244,12 @@ class MeasurementModel:
 
         Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
         draws the gain of every element instead; the distribution is the same, but the call takes
-        a hundred times as long. Deviations that the scenario declares are drawn as described
+        a hundred times as long. Impairments that the scenario declares are drawn as described
         there.
         """
-        surface, factors = draw_deviations(self.scenario, len(positions), rng)
-        if surface is not None and self._is_uncertain:
-            return MeasurementModel(self.scenario, self._beams, surface)._sample(
+        surface, factors = draw_impairments(self.scenario, len(positions), rng)
+        if surface is not None and self.surface is None:
+            return MeasurementModel(self.scenario, self.beams, surface)._sample(
                 positions, rng, factors)
         return self._sample(positions, rng, factors)
 

@@ -4,6 +4,7 @@ from importlib import metadata
 from typing import Any
 
 # Groups of entry points; the page `extending` of the documentation specifies their objects.
+IMPAIRMENTS = 'rhs_isac_ros.impairments'
 ESTIMATORS = 'rhs_isac_ros.estimators'
 MOBILITIES = 'rhs_isac_ros.mobilities'
 GAIN_PATTERNS = 'rhs_isac_ros.gain_patterns'

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rhs_isac_ros.model.imperfections import SurfaceImperfection, draw_deviations
+from rhs_isac_ros.model.impairments import ElementErrors, draw_impairments
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.scenario import Scenario
@@ -45,11 +45,11 @@ def received_signal(
 @one_blas_thread
 def simulate_received(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
-        rng: np.random.Generator, surface: SurfaceImperfection | None = None) -> np.ndarray:
+        rng: np.random.Generator, surface: ElementErrors | None = None) -> np.ndarray:
     """Simulate signals of independent positioning phases by Eq. (8), element by element.
 
     Takes the user's position in each phase, float64 [N, 3] [m], and returns complex128
-    [N, N_B, N_SB F], sub-band-major. Deviations that the scenario declares are drawn too: a new
+    [N, N_B, N_SB F], sub-band-major. Impairments that the scenario declares are drawn too: a new
     user and a new cycle for each position, and one surface for all of them.
 
     Parameters
@@ -64,7 +64,7 @@ def simulate_received(
         the sizes of the scenario.
     """
     positions = checked_positions(positions)
-    drawn, factors = draw_deviations(scenario, len(positions), rng)
+    drawn, factors = draw_impairments(scenario, len(positions), rng)
     surface = surface or drawn
     radiation = radiation_matrix(
         scenario, surface.applied_beams(codebook) if surface else codebook)

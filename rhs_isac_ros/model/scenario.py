@@ -10,19 +10,147 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rhs_isac_ros.model.deviations import Deviations
-from rhs_isac_ros.model.fields import ScenarioError, checked
+from rhs_isac_ros.model.fields import ScenarioError, checked, declare
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.table1 import Table1
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Scenario(Deviations, Table1):
+class Table1:
+    """Geometry, bands and propagation as the paper defines them."""
+
+    center_frequencies_hz: tuple[float, ...] = declare(
+        (2.5e9, 3.0e9), 1e6, 1e13, 'Centre frequency f_c,i of each band.', 'Hz',
+        label='centre frequencies $f_{c,i}$')
+    n_subbands: int = declare(
+        8, 1, 4096, 'Sub-bands N_SB of each band.', label=r'sub-bands $N_\mathrm{SB}$')
+    subband_width_hz: float = declare(
+        125e3, 1.0, 1e10, 'Width W of a sub-band.', 'Hz', label='sub-band width $W$')
+    n_frames: int = declare(4, 1, 4096, 'Frames F of each band.', label='frames $F$')
+    frame_duration_s: float = declare(
+        4e-6, 1e-12, 1.0, 'Duration of a frame.', 's', label=r'frame duration $\Delta_t$')
+    elements_per_side: int = declare(
+        10, 1, 128, 'Elements along one side of the square surface.',
+        label=r'elements along a side $\sqrt{N_\mathrm{E}}$')
+    element_interval_wavelengths: float = declare(
+        0.3, 1e-3, 10.0, 'Spacing of the elements, in mean wavelengths.',
+        label=r'element spacing in $\lambda_\mathrm{avr}$')
+    n_feeds: int = declare(3, 1, 256, 'Feeds K of the surface.', label='feeds $K$')
+    feed_positions_m: tuple[tuple[float, float, float], ...] | None = declare(
+        None, -1e3, 1e3,
+        'Positions of the feeds; if null, they are evenly spaced on the centre line.', 'm',
+        label='feed positions')
+    refractive_index: float = declare(
+        2.1, 1.0, 100.0, 'Refractive index n_r of the board.', label='refractive index $n_r$')
+    element_gain: float | GainPattern = declare(
+        1.0, 1e-6, 1e6, 'Amplitude gain g^E of an element.', label=r'element gain $g^\mathrm{E}$')
+    user_gain: float | GainPattern = declare(
+        1.0, 1e-6, 1e6, "Amplitude gain g^U of the user's antenna.",
+        label=r'user gain $g^\mathrm{U}$')
+    delay_spread_s: float = declare(
+        0.5e-6, 0.0, 1.0, 'RMS delay spread of the multipath.', 's',
+        label=r'delay spread $\sigma_\mathrm{rms}$')
+    max_user_speed_mps: float = declare(
+        20 / 3.6, 0.0, 1e4, 'Highest speed of a user.', 'm/s',
+        label=r'user speed $v_\mathrm{max}$')
+    angular_spread_deg: float = declare(
+        10.0, 1e-2, 1e3, 'Angular spread of the multipath, in azimuth and elevation.', 'deg',
+        label='angular spread')
+    noise_psd_dbm_hz: float = declare(
+        -174.0, -400.0, 100.0, 'Power spectral density P_N of the noise.', 'dBm/Hz',
+        label='noise density $P_N$')
+    max_power_w: float = declare(
+        1e-3, 1e-15, 1e6, 'Power P_max of the combining vectors.', 'W',
+        label=r'power $P_\mathrm{max}$')
+    roi_center_m: tuple[float, float, float] = declare(
+        (10.0, 0.0, 0.0), -1e6, 1e6, 'Centre of the region of interest.', 'm',
+        label='centre of the region')
+    roi_size_m: tuple[float, float, float] = declare(
+        (10.0, 10.0, 2.0), 1e-6, 1e6, 'Side lengths of the region of interest.', 'm',
+        label='size of the region')
+
+
+@dataclasses.dataclass(frozen=True)
+class Extensions:
+    """Effects beyond the paper's model; by default there are none.
+
+    A standard deviation is that of a zero-mean Gaussian. Phases are angles, so their Gaussian is
+    wrapped to the circle: from a standard deviation of 2 pi on, a phase is uniform in effect,
+    because its mean resultant length, exp(-std^2 / 2), is below 3e-9.
+
+    A user's gain and carrier offset are drawn once per user. Phases and the timing offset are
+    drawn once per cycle, and element errors and failures once per surface.
+    """
+
+    multipath_to_los_db: float = declare(
+        0.0, -200.0, 100.0,
+        'Power of the multipath at an element, relative to the mean power of the direct path in '
+        'the region. The paper does not normalise the profile of Eq. (2); 0 dB is the reading '
+        'of this package.', 'dB',
+        'inverse Rice factor, 3GPP TR 38.901, section 7.5', label='multipath / direct path')
+    user_gain_std_db: float = declare(
+        0.0, 0.0, 60.0,
+        "Standard deviation of the gain of a user, log-normal, in addition to user_gain: "
+        'transmit power, antenna and shadowing. It acts on the direct path and on the multipath.',
+        'dB', 'log-normal shadow fading, 3GPP TR 38.901, section 7.4',
+        label='user gain, standard deviation')
+    phase_std_rad: float = declare(
+        0.0, 0.0, 1e3,
+        'Standard deviation of a phase that all bands of a cycle share; 6.2832 for a uniform '
+        'phase.', 'rad',
+        'wrapped normal distribution, Mardia and Jupp, Directional Statistics, 2000, '
+        'section 3.5', label='common phase, standard deviation')
+    band_phase_std_rad: float = declare(
+        0.0, 0.0, 1e3,
+        'Standard deviation of a phase that each band of a cycle draws independently, as after '
+        'retuning an oscillator; 6.2832 for a uniform phase.', 'rad',
+        'wrapped normal distribution, Mardia and Jupp, Directional Statistics, 2000, '
+        'section 3.5', label='phase of a band, standard deviation')
+    timing_std_s: float = declare(
+        0.0, 0.0, 1.0,
+        'Standard deviation of the sampling-time offset of a cycle, a phase that is linear over '
+        'the sub-bands.', 's',
+        'Speth, Fechtel, Fock and Meyr, Optimum receiver design for wireless broad-band systems '
+        'using OFDM, part I, IEEE Trans. Commun. 47 (11), 1999',
+        label='timing offset, standard deviation')
+    carrier_offset_std_hz: float = declare(
+        0.0, 0.0, 1e9,
+        "Standard deviation of the carrier frequency offset of a user's oscillator, the same in "
+        'all bands, a phase that is linear over the frames of a band.', 'Hz',
+        'Moose, A technique for orthogonal frequency division multiplexing frequency offset '
+        'correction, IEEE Trans. Commun. 42 (10), 1994',
+        label='carrier offset, standard deviation')
+    element_error_rms: float = declare(
+        0.0, 0.0, 1.0,
+        'RMS of the complex error of an element coefficient relative to its value; the error is '
+        'the same in all bands and frames.', '',
+        'Van Trees, Optimum Array Processing, 2002, section 2.6.3',
+        label='relative error of an element, RMS')
+    failed_element_share: float = declare(
+        0.0, 0.0, 1.0,
+        'Probability that an element has failed. A failed element is stuck at an amplitude that '
+        'is uniform in [0, 1] and the same in all bands and frames.', '',
+        'stuck-at faults, Taghvaee, Cabellos-Aparicio, Georgiou and Abadal, Error analysis of '
+        'programmable metasurfaces for beam steering, IEEE J. Emerg. Sel. Top. Circuits Syst. '
+        '10 (1), 2020', label='share of failed elements')
+    amplitude_levels: int = declare(
+        0, 0, 65536,
+        'Number L of amplitudes k / (L - 1) that an element can take: 2 for one bit; 0 if '
+        'amplitudes are continuous.', '',
+        'Smith, Yurduseven, Mancera, Bowen and Kundtz, Analysis of a waveguide-fed metasurface '
+        'antenna, Phys. Rev. Applied 8, 2017', label='amplitude levels $L$')
+    impairments: tuple[tuple[str, float], ...] = declare(
+        (), 0.0, 1e300,
+        'Impairments of installed plug-ins: a mapping of names to strengths, each in the unit '
+        'that the plug-in documents.', '', label='impairments')
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario(Extensions, Table1):
     """Geometry, bands and propagation of one system; the defaults are the paper's Table I.
 
-    The fields are those of `Table1`, followed by those of `Deviations`, all of which are off by
+    The fields are those of `Table1`, followed by those of `Extensions`, all of which are off by
     default.
 
     Lengths are in metres in the frame ``map``: the surface lies in the plane x = 0, centred on
@@ -105,7 +233,11 @@ class Scenario(Deviations, Table1):
     @functools.cached_property
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
-        return f'sc{hashlib.sha256(json.dumps(self.fields()).encode()).hexdigest()[:16]}'
+        fields = self.fields()
+        if not self.impairments:
+            # Identifiers in existing files precede this field.
+            del fields['impairments']
+        return f'sc{hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:16]}'
 
     @property
     def n_bands(self) -> int:
@@ -143,6 +275,6 @@ class Scenario(Deviations, Table1):
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, GainPattern):
+    if isinstance(value, GainPattern | str):
         return str(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value

@@ -11,7 +11,7 @@ import hashlib
 
 import numpy as np
 
-from rhs_isac_ros.model.imperfections import AppliedBeams
+from rhs_isac_ros.model.impairments.elements import AppliedBeams
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.scenario import Scenario
@@ -45,6 +45,11 @@ class SurfaceEstimate:
     band_gains: np.ndarray
     factor: np.ndarray
     failed_probability: np.ndarray
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the estimate has no errors."""
+        return not self.factor.shape[1]
 
     @property
     def id(self) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.monitoring.entities import Lines, Points
 from rhs_isac_ros.monitoring.scene_shapes import user_colour
-from rhs_isac_ros.positioning.weighted_modes import WeightedModes
+from rhs_isac_ros.positioning import WeightedModes
 
 # Half the width of the chart, the distance of its labels, and the height of the probability 1 [m].
 REACH_M = 3.0

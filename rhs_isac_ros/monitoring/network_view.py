@@ -16,7 +16,7 @@ from rhs_isac_ros.monitoring.entities import Clear, Entity, Entry, Text
 from rhs_isac_ros.monitoring.overview import NodeStatus
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.monitoring.scene_state import SceneState
-from rhs_isac_ros.positioning.weighted_modes import WeightedModes
+from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.newest import NewestDict
 

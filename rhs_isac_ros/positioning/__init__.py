@@ -19,14 +19,19 @@ from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario, plugins
-from rhs_isac_ros.positioning.bayes import BayesEstimator
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError, estimate_each
-from rhs_isac_ros.positioning.exhaustive import exhaustive_posterior
-from rhs_isac_ros.positioning.ml import MlEstimator
+from rhs_isac_ros.positioning.estimators import (
+    BayesEstimator,
+    MlEstimator,
+    SearchEstimator,
+    WeightedModes,
+    surface_of,
+    weighted_modes,
+)
 from rhs_isac_ros.positioning.motion import Motion
 from rhs_isac_ros.positioning.network import ModelError, Network
 from rhs_isac_ros.positioning.neural import NeuralEstimator
-from rhs_isac_ros.positioning.search import surface_of
+from rhs_isac_ros.positioning.reference import exhaustive_posterior
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.tracking import Tracker, TrackEstimate
 from rhs_isac_ros.positioning.training import train
@@ -38,10 +43,9 @@ REGION_ESTIMATORS = (BayesEstimator.name, MlEstimator.name)
 
 __all__ = [
     'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator',
-    'ModelError', 'Motion', 'Network', 'NeuralEstimator', 'SignalError', 'TrackEstimate',
-    'Tracker', 'estimate_each', 'exhaustive_posterior', 'file_options', 'make_estimator',
-    'simulate_pairs', 'surface_of',
-    'train',
+    'ModelError', 'Motion', 'Network', 'NeuralEstimator', 'SearchEstimator', 'SignalError',
+    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'exhaustive_posterior',
+    'file_options', 'make_estimator', 'simulate_pairs', 'surface_of', 'train', 'weighted_modes',
 ]
 
 

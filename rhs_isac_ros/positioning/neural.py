@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.fit import FitTest
 from rhs_isac_ros.positioning.network import ModelError, Network
-from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
 class NeuralEstimator:
@@ -35,7 +34,9 @@ class NeuralEstimator:
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
             model_file: Network | str | Path = '') -> None:
-        self._model = WhitenedModel(scenario, codebook)
+        codebook.check(scenario)
+        self._scenario, self._codebook = scenario, codebook
+        self._model = MeasurementModel(scenario, codebook).prepare()
         if model_file == '':
             raise ModelError(
                 'model_file: none, expected a model of this codebook, trained with '
@@ -50,8 +51,7 @@ class NeuralEstimator:
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
         """Estimate positions from received signals, as `Estimator.estimate` describes."""
-        model = self._model
-        return estimate_each(model.scenario, model.codebook, received, self._locate)
+        return estimate_each(self._scenario, self._codebook, received, self._locate)
 
     def _locate(self, batch: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
         energies = np.sum(np.abs(self._model.whiten(batch))**2, axis=(1, 2))

@@ -1,11 +1,41 @@
-"""The posterior of a position, in the form in which a track needs it."""
+"""The posterior of a position: weighted samples of its modes, in the region of interest.
 
+A mode is a Gaussian, whose samples have equal weights inside the region, unless the phases of the
+bands are unknown. Then only delays, amplitudes and the curvature of the wavefront reveal the
+range, and a mode extends over metres, over which the likelihood is not quadratic and the volume
+element changes. The samples then serve as a proposal: each has the weight of the posterior
+relative to the mixture of all Gaussians, so that modes may overlap.
+"""
+
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.positioning.coordinates import (
+    carrier_wavenumbers,
+    is_inside,
+    jacobian,
+    likelihood_loss,
+    to_polar,
+    to_positions,
+)
 from rhs_isac_ros.positioning.estimate import Estimate
-from rhs_isac_ros.positioning.modes import Modes
+from rhs_isac_ros.positioning.likelihood import UNIFORM_STD_RAD, Conditional, Likelihood, Signals
+from rhs_isac_ros.positioning.search import Modes, first_of_each, marginal_at
+
+# Factor of the spread of samples that are a proposal. Tails of the posterior may be heavier than
+# Gaussian.
+_SPREAD = 1.3
+# Samples whose log-weight is lower than the best by more have no effect, whatever their phases.
+_LIKELY_MARGIN = 20.0
+# Phases of bands: spacing of the ranges over which their density is averaged, in standard
+# deviations of the product of the bands' factors, and values of a phase that all bands share: the
+# average over the range nearly removes it.
+_SPACING = 1.5
+_N_COMMON = 8
+# From this standard deviation, a wrapped phase is uniform; wraps beyond one turn are negligible.
+_MAX_STD_RAD = 3.0
 
 
 class Doubt(NamedTuple):
@@ -35,8 +65,8 @@ class Posterior(NamedTuple):
         Its mean and covariance, or the reason why there is no position.
     modes
         Its modes; None without a position.
-    whitened
-        Whitened signals, complex128 [N_B, N_SB F].
+    signals
+        Signals of the phase, N = 1.
     doubt
         The possibility that the user is outside of the region, which the covariance includes;
         None if it is negligible, or without a position.
@@ -44,5 +74,250 @@ class Posterior(NamedTuple):
 
     estimate: Estimate
     modes: Modes | None
-    whitened: np.ndarray
+    signals: Signals
     doubt: Doubt | None
+
+
+class Samples(NamedTuple):
+    """Samples of the Gaussians of M modes, S of each.
+
+    Attributes
+    ----------
+    positions
+        Float64 [M, S, 3] [m].
+    log_weights
+        Logarithm of the weights, not normalised, float64 [M, S]; -inf outside of the region.
+    spread
+        Factor of the covariance of each mode's position, float64 [M, 3, 3] [m].
+    """
+
+    positions: np.ndarray
+    log_weights: np.ndarray
+    spread: np.ndarray
+
+
+def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
+    """Represent the modes by samples, for a uniform prior on the region of interest.
+
+    Parameters
+    ----------
+    normal
+        Points that represent a standard Gaussian, float64 [S, 3].
+    bounds
+        Lower and upper vertex of the region, float64 [2, 3] [m].
+    """
+    points, curvature, roi_offset = modes.points, modes.curvature, modes.roi_offset
+    starts = first_of_each(modes.phases)
+    jacobians = jacobian(points)
+    log_mass = (modes.log_likelihood + np.log(np.linalg.det(jacobians))
+                - np.log(np.linalg.det(curvature)) / 2)
+    factors = np.linalg.inv(np.swapaxes(np.linalg.cholesky(curvature), 1, 2))
+    # The Gaussian of a mode outside the region is sampled around the point where it enters
+    # the region; the weights of the samples correct for the shift.
+    shift = np.linalg.solve(factors, roi_offset[..., None])[..., 0]
+    log_weights = (log_mass[:, None] - shift @ normal.T
+                   - likelihood_loss(roi_offset, curvature)[:, None])
+    # Contiguous coordinates make the following operations several times as fast.
+    spread = np.matmul(factors, normal.T)
+    positions = to_positions(np.swapaxes((points + roi_offset)[..., None] + spread, 1, 2))
+    inside = is_inside(positions, bounds)
+    possible = np.logical_or.reduceat(inside.any(axis=1), starts)
+    if not possible.all():
+        lost = np.repeat(~possible, np.diff(starts, append=len(points)))
+        positions[lost] = np.clip(positions[lost], *bounds)
+        inside[lost] = True
+    log_weights[~inside] = -np.inf
+    return Samples(positions, log_weights, np.matmul(jacobians, factors))
+
+
+class WeightedSamples(NamedTuple):
+    """The samples of the posteriors of N phases, with weights whose sum is one for each phase.
+
+    Attributes
+    ----------
+    positions
+        Float64 [M, S, 3] [m].
+    weights
+        Float64 [M, S].
+    spread
+        As in `Samples`.
+    starts
+        Index of each phase's first mode, int [N].
+    log_totals
+        Logarithms of the sums of the weights before they were normalised, float64 [N].
+    """
+
+    positions: np.ndarray
+    weights: np.ndarray
+    spread: np.ndarray
+    starts: np.ndarray
+    log_totals: np.ndarray
+
+    @classmethod
+    def of(cls, samples: Samples, modes: Modes) -> 'WeightedSamples':
+        """Normalise the weights of each phase."""
+        starts = first_of_each(modes.phases)
+        counts = np.diff(starts, append=len(modes.phases))
+        highest = np.maximum.reduceat(samples.log_weights.max(axis=1), starts)
+        weights = np.exp(samples.log_weights - np.repeat(highest, counts)[:, None])
+        totals = np.add.reduceat(weights.sum(axis=1), starts)
+        weights /= np.repeat(totals, counts)[:, None]
+        return cls(samples.positions, weights, samples.spread, starts, highest + np.log(totals))
+
+    def log_evidence(self, volume_m3: float) -> np.ndarray:
+        """Likelihood averaged over a region of this volume, as its logarithm, float64 [N]."""
+        result: np.ndarray = (self.log_totals - np.log(self.weights.shape[1])
+                + 1.5 * np.log(2 * np.pi) - np.log(volume_m3))
+        return result
+
+    def average(self, values: np.ndarray) -> np.ndarray:
+        """Average values of the modes, float64 [M, ...], over each posterior, [N, ...]."""
+        shares = self.weights.sum(axis=1).reshape(-1, *[1] * (values.ndim - 1))
+        return self.sums(shares * values)
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Add values of the modes, float64 [M, ...], for each phase, [N, ...]."""
+        return np.add.reduceat(values, self.starts)
+
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the mean, float64 [N, 3] [m], and the covariance, [N, 3, 3], of the samples."""
+        mean = self.sums(np.matmul(self.weights[:, None], self.positions)[:, 0])
+        counts = np.diff(self.starts, append=len(self.weights))
+        offsets = self.positions - np.repeat(mean, counts, axis=0)[:, None]
+        weighted = np.swapaxes(offsets * self.weights[..., None], 1, 2)
+        return mean, self.sums(np.matmul(weighted, offsets))
+
+
+def draw_broad_samples(
+        likelihood: Likelihood, conditionals: Sequence[Conditional], phases: 'BandPhases',
+        signals: Signals, modes: Modes, normal: np.ndarray) -> Samples:
+    """Represent the modes of one phase by samples with the weights of the posterior.
+
+    Takes the likelihood of each state of the surface.
+    """
+    bounds = likelihood.scenario.roi_bounds_m
+    samples = draw_samples(modes, _SPREAD * normal, bounds)
+    inside = np.isfinite(samples.log_weights)
+    log_weights, positions = np.full(inside.shape, -np.inf), samples.positions.copy()
+    for state in np.unique(modes.state):
+        rows = modes.state == state
+        chosen = inside & rows[:, None]
+        points = to_polar(positions[chosen])
+        values = np.repeat(modes.values, inside.sum(axis=1) * rows, axis=0)
+        evidence, values = marginal_at(
+            conditionals[state], likelihood, points, values,
+            signals.repeated(0, len(points)))
+        evidence += (np.log(np.linalg.det(jacobian(points))) - 1.5 * np.log(2 * np.pi)
+                     - _log_proposal(points, modes.select(rows)))
+        if phases.is_informative:
+            likely = evidence >= evidence.max() - _LIKELY_MARGIN
+            outputs = likelihood.outputs(points[likely], values[likely], signals.repeated(
+                0, int(np.count_nonzero(likely))))
+            turned = likelihood.nuisance.band_angles(values[likely])
+            log_factors, offsets_m = phases.factors(outputs.T * np.exp(1j * turned.T))
+            evidence[likely] += log_factors
+            points[likely, 0] += offsets_m
+            positions[chosen] = to_positions(points)
+        log_weights[chosen] = evidence
+    return samples._replace(positions=positions, log_weights=log_weights)
+
+
+def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
+    """Logarithm of the sum of the densities from which samples of the modes are drawn, [P]."""
+    offset = points[:, None] - modes.roi_points
+    exponent = -np.einsum('pma,mab,pmb->pm', offset, modes.curvature, offset) / (2 * _SPREAD**2)
+    exponent += np.linalg.slogdet(modes.curvature)[1] / 2
+    result: np.ndarray = (np.logaddexp.reduce(exponent, axis=1)
+            - 3 * np.log(_SPREAD) - 1.5 * np.log(2 * np.pi))
+    return result
+
+
+class BandPhases:
+    """The information in phases of the bands that are neither known nor uniform.
+
+    Relative to uniform phases, the likelihood of a position has one factor for each band: the
+    density of the phase of the matched filter's output, the wrapped normal distribution broadened
+    by the noise. Along the range, the product of the factors turns with the carriers, far faster
+    than the rest of the posterior: it has peaks of centimetres, whose heights follow the
+    differences of the carriers. It is averaged over one wavelength around each sample.
+
+    Attributes
+    ----------
+    is_informative
+        Whether the search has left out information in the phases of the bands; otherwise, there
+        are no factors.
+    """
+
+    def __init__(self, likelihood: Likelihood) -> None:
+        prior = likelihood.nuisance
+        self._std = prior.relative_phase_std_rad
+        self.is_informative = prior.is_coarse and self._std <= UNIFORM_STD_RAD
+        if not self.is_informative:
+            return
+        wavenumbers = carrier_wavenumbers(likelihood.scenario)
+        shared = max(prior.phase_covariance.min(), 0.0) if len(wavenumbers) > 1 else 0.0
+        spacing = _SPACING * self._std / np.sqrt(len(wavenumbers))
+        n_ranges = int(np.ceil(2 * np.pi / spacing))
+        self._ranges_m = (((np.arange(n_ranges) + 0.5) / n_ranges - 0.5)
+                          * 2 * np.pi / wavenumbers.mean())
+        self._wavenumbers = wavenumbers
+        self._common, self._log_weights = _common_phase(np.sqrt(shared))
+
+    def factors(self, outputs: np.ndarray, *, averages: bool = True
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Average the product of the factors over the wavelength around positions, or not.
+
+        Takes the outputs of the matched filters at the positions, complex128 [N_B, P].
+
+        Returns
+        -------
+        log_factors, offsets_m
+            Logarithm of the average, and the mean offset in range [m], float64 [P].
+        """
+        ranges_m = self._ranges_m if averages else np.zeros(1)
+        all_turns = self._wavenumbers[:, None, None] * ranges_m[:, None] + self._common
+        log_factor = np.zeros((outputs.shape[1], *all_turns.shape[1:]))
+        for output, turns in zip(outputs, all_turns, strict=True):
+            std = self._broadened(np.abs(output))[:, None, None]
+            log_factor += _log_density(np.angle(output)[:, None, None] + turns, std)
+        log_factor += self._log_weights - np.log(len(ranges_m))
+        highest = log_factor.max(axis=(1, 2))
+        weights = np.exp(log_factor - highest[:, None, None]).sum(axis=2)
+        total = weights.sum(axis=1)
+        return highest + np.log(total), weights @ ranges_m / total
+
+    def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
+        """Standard deviation of the phase of outputs of these magnitudes.
+
+        That of the noise has the von Mises density; its first harmonic is that of a wrapped
+        normal distribution.
+        """
+        from scipy.special import i0e, i1e
+
+        concentration = 2 * np.maximum(magnitude, 1e-9)
+        variance = self._std**2 - 2 * np.log(i1e(concentration) / i0e(concentration))
+        result: np.ndarray = np.minimum(np.sqrt(variance), _MAX_STD_RAD)
+        return result
+
+
+def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values of the phase that all bands share, and the logarithms of their weights."""
+    if std == 0:
+        return np.zeros(1), np.zeros(1)
+    if std > UNIFORM_STD_RAD:
+        turns = 2 * np.pi * np.arange(_N_COMMON) / _N_COMMON
+        return turns, np.full(_N_COMMON, -np.log(_N_COMMON))
+    values, weights = np.polynomial.hermite_e.hermegauss(_N_COMMON)
+    return std * values, np.log(weights / weights.sum())
+
+
+def _log_density(angle: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Density of the wrapped normal distribution relative to the uniform one, as a logarithm."""
+    angle = angle - 2 * np.pi * np.round(angle / (2 * np.pi))
+    # The wraps by one turn, relative to the term without a wrap.
+    ratio = np.exp(-2 * np.pi**2 / std**2)
+    slope = 2 * np.pi / std**2 * angle
+    wraps = ratio * (np.exp(slope) + np.exp(-slope))
+    density: np.ndarray = (
+        np.log(np.sqrt(2 * np.pi) / std) - angle**2 / (2 * std**2) + np.log1p(wraps))
+    return density

@@ -1,280 +1,250 @@
-"""The common part of the estimators that search for modes."""
+"""The modes of the posterior: found on the grid, refined by Gauss-Newton steps.
 
-import abc
-import itertools
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+Steps maximise over position and nuisance parameters together. Around a mode, the posterior is
+Gaussian, so that the marginal of the position has the Schur complement of the information, and its
+mass contains the determinant of the parameters' information: Laplace's method.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.model.nuisance import nuisance_parameters
-from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
-from rhs_isac_ros.positioning.element_error_model import ElementErrorModel
-from rhs_isac_ros.positioning.estimate import (
-    Estimate,
-    Estimator,
-    Located,
-    checked_received,
-    estimate_each,
-)
-from rhs_isac_ros.positioning.failed_elements import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.fit import (
-    DOUBT_LIMIT,
-    FitTest,
-    outside_probability,
-    outside_test,
-)
-from rhs_isac_ros.positioning.marginal import Found, MarginalSearch
-from rhs_isac_ros.positioning.modes import (
-    LONG_SEARCH_STEPS,
-    Modes,
-    find_modes,
-    find_modes_of_each,
-)
-from rhs_isac_ros.positioning.posterior import Doubt, Posterior
-from rhs_isac_ros.positioning.samples import WeightedSamples, draw_samples_of_each
-from rhs_isac_ros.positioning.store import load_table
-from rhs_isac_ros.positioning.surroundings import Surroundings
-from rhs_isac_ros.positioning.table import TemplateTable
-from rhs_isac_ros.positioning.whitened import WhitenedModel
+from rhs_isac_ros.model.gaussian import Marginal, marginalise
+from rhs_isac_ros.positioning.coordinates import likelihood_loss, offset_to_roi
+from rhs_isac_ros.positioning.grid import Starts, TemplateTable, suppress
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, Signals
 
-# Standard deviations of the user's gain that the test of the energy admits.
-_GAIN_REACH = 6
-# Coordinates fitted to the signals of each phase.
-_N_COORDINATES = 3
-# Number of phases that are located together.
-_BLOCK = 128
+# Largest number of modes of a phase.
+MAX_MODES = 32
+# Maximum difference between the best log-likelihood and that of a mode: on the grid, which is
+# accurate to one Gauss-Newton step, and after exact steps.
+GRID_MARGIN = 10.0
+EXACT_MARGIN = 8.0
+# Squared Mahalanobis distance below which two modes have converged to the same maximum.
+_SAME_MODE = 2.0
+# The linear model of a step in (r [m], u, v) does not hold beyond these; nor beyond the last
+# in range if the phases of the bands carry no information about it.
+_STEP_LIMITS = np.array([0.02, 0.05, 0.05])
+_COARSE_STEP_M = 0.7
+# A mode has converged when its last step gained less log-likelihood than this.
+_MIN_GAIN = 0.02
+# Maximum number of exact steps: usually, with nuisance parameters, and for strong signals.
+_N_STEPS = 2
+_N_NUISANCE_STEPS = 5
+LONG_SEARCH_STEPS = 12
 
 
-class SearchEstimator(abc.ABC):
-    """An estimator from the modes of the posterior, for a uniform prior on the region of interest.
+class Modes(NamedTuple):
+    """Local maxima of the posterior in or near the region of interest (ROI).
 
-    Signals that the model cannot explain at the best mode give no fix; see `fit`. Tables are kept
-    in `table_folder` between runs.
-
-    Parameters
+    Attributes
     ----------
-    reject_outside
-        Whether the user may also be outside of the region; see `surroundings`. If this is almost
-        certain (`fit.OUTSIDE_LIMIT`), there is no fix either. If it is merely possible
-        (`fit.DOUBT_LIMIT`), the covariance includes the positions outside, while the position
-        remains that of a user inside.
-    surface
-        What is known of the surface, as in `MeasurementModel`; for example a calibration.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
+    phases
+        Positioning phase of each mode, int [M], ascending.
+    points
+        (r [m], u, v), float64 [M, 3].
+    curvature
+        Curvature of the marginal log-likelihood in these coordinates, float64 [M, 3, 3].
+    log_likelihood
+        Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters, it is
+        minus the squared norm of the whitened residual.
+    roi_offset
+        Offset to the region of interest, from `offset_to_roi`, float64 [M, 3].
+    values
+        Nuisance parameters, float64 [M, Q].
+    residual
+        Energy of the whitened residual, float64 [M].
+    state
+        Number of the state of the surface, int [M]; 0 if there is only one.
     """
 
-    @one_blas_thread
-    def __init__(
-            self, scenario: Scenario, codebook: Codebook,
-            table_folder: Path | None = None, *, reject_outside: bool = False,
-            surface: Surface | None = None) -> None:
-        self._rejects_outside = reject_outside
-        self._model = WhitenedModel(scenario, codebook, surface)
-        arrays = load_table(self._model, table_folder)
-        self._table = TemplateTable(scenario, arrays)
-        self._surroundings = Surroundings(scenario, arrays)
-        n_measurements = int(np.prod(self._model.shape))
-        self._test = FitTest(n_measurements)
-        self._bounds = scenario.roi_bounds_m
-        self._volume_m3 = float(np.prod(scenario.roi_size_m))
-        self._error = ElementErrorModel.of(self._model)
-        self._failures: FailedElements | None = None
-        if surface is None and can_enumerate(scenario):
-            self._failures = FailedElements(self._model, self._table)
-        self._marginal: MarginalSearch | None = None
-        # Weak signals may be those of a user with a low gain.
-        self._max_power = 10**(_GAIN_REACH * scenario.user_gain_std_db / 10)
-        if nuisance_parameters(scenario):
-            self._marginal = MarginalSearch(
-                self._model, self._table, self._surroundings if reject_outside else None,
-                self._error)
-        n_fitted = _N_COORDINATES + (len(self._marginal.unknowns.names) if self._marginal else 0)
-        # Twice an energy has two degrees of freedom for each complex measurement, less one for
-        # each fitted parameter.
-        self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
+    phases: np.ndarray
+    points: np.ndarray
+    curvature: np.ndarray
+    log_likelihood: np.ndarray
+    roi_offset: np.ndarray
+    values: np.ndarray
+    residual: np.ndarray
+    state: np.ndarray
 
-    @one_blas_thread
-    def estimate(self, received: np.ndarray) -> Estimate:
-        """Estimate positions from received signals, as `Estimator.estimate` describes."""
-        model = self._model
-        return estimate_each(model.scenario, model.codebook, received, self._locate)
-
-    @one_blas_thread
-    def posterior(self, received: np.ndarray) -> Posterior:
-        """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F].
-
-        Raises
-        ------
-        SignalError
-            If the signals cannot be used, as in `estimate`.
-        """
-        model = self._model
-        (signals,) = checked_received(model.scenario, model.codebook, received)
-        (whitened,) = model.whiten(signals[None])
-        located, modes, doubt = self._analyse(signals, whitened)
-        return Posterior(Estimate(*located), modes, whitened, doubt)
-
-    def with_outside(
-            self, mean: np.ndarray, covariance: np.ndarray, doubt: Doubt) -> np.ndarray:
-        """Add positions outside of the region to a covariance about a mean inside, [3, 3]."""
-        moment = self._surroundings.second_moment(doubt.whitened, mean, doubt.scale)
-        result: np.ndarray = (1 - doubt.probability) * covariance + doubt.probability * moment
+    @property
+    def roi_log_likelihood(self) -> np.ndarray:
+        """Log-likelihood at `roi_points`, float64 [M]."""
+        result: np.ndarray = self.log_likelihood - likelihood_loss(self.roi_offset, self.curvature)
         return result
 
     @property
-    def normal(self) -> np.ndarray:
-        """Points that represent a standard Gaussian, float64 [128, 3]."""
-        return self._table.normal
+    def roi_points(self) -> np.ndarray:
+        """For each mode, its most likely point inside the region, (r [m], u, v), [M, 3]."""
+        result: np.ndarray = self.points + self.roi_offset
+        return result
 
-    @property
-    def exact_model(self) -> WhitenedModel | None:
-        """The model of the whitened signals; None if they also depend on other unknowns."""
-        return None if self._marginal or self._error else self._model
+    def select(self, chosen: np.ndarray | slice) -> 'Modes':
+        """Return the modes with the given indices or mask."""
+        return Modes(*(field[chosen] for field in self))
 
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario of the signals."""
-        return self._model.scenario
-
-    def _locate(self, batch: np.ndarray) -> Iterable[Located]:
-        whitened = self._model.whiten(batch)
-        if self._marginal or self._failures or self._error:
-            return [self._analyse(*phase)[0] for phase in zip(batch, whitened, strict=True)]
-        starts = range(0, len(batch), _BLOCK)
-        blocks = map_blocks(
-            lambda start: self._locate_block(whitened[start:start + _BLOCK]), starts)
-        return itertools.chain.from_iterable(blocks)
-
-    def _locate_block(self, whitened: np.ndarray) -> list[Located]:
-        """Locate phases together whose signals depend on the position only."""
-        reasons = [self._too_weak(signals) for signals in whitened]
-        (usable,) = np.nonzero([not reason for reason in reasons])
-        located: list[Located] = [(*_no_fix(), reason, np.nan, np.nan) for reason in reasons]
-        if not len(usable):
-            return located
-        found = [self._found(*phase) for phase in zip(
-            whitened[usable], find_modes_of_each(self._model, self._table, whitened[usable]),
-            strict=True)]
-        for row, (one, _) in zip(usable.tolist(), self._judge(found), strict=True):
-            located[row] = one
-        return located
-
-    def _analyse(
-            self, received: np.ndarray, whitened: np.ndarray
-    ) -> tuple[Located, Modes | None, Doubt | None]:
-        """Locate one phase; also return the modes, None without a position, and the doubt."""
-        reason = self._too_weak(whitened)
-        if reason:
-            return (*_no_fix(), reason, np.nan, np.nan), None, None
-        found = (self._marginal.find(received) if self._marginal
-                 else self._find(received, whitened))
-        ((located, doubt),) = self._judge([found])
-        return located, None if located[2] else found.modes, doubt
-
-    def _too_weak(self, whitened: np.ndarray) -> str:
-        """Return a reason if the signals are weaker than noise."""
-        return self._test.min_energy_test(
-            float(np.sum(np.abs(whitened)**2)) * self._max_power)
-
-    def _judge(self, found: Sequence[Found]) -> Iterator[tuple[Located, Doubt | None]]:
-        """Yield the position of each phase, or why there is none, and the doubt."""
-        starts = np.array([0, *itertools.accumulate(len(one.residuals) for one in found[:-1])])
-        modes = Modes(*map(np.concatenate, zip(*(one.modes for one in found), strict=True)))
-        residuals = np.concatenate([one.residuals for one in found])
-        drawn = found[0].samples or draw_samples_of_each(
-            modes, starts, self._table.normal, self._bounds)
-        samples = WeightedSamples.of(drawn, starts)
-        evidence = samples.log_evidence(self._volume_m3)
-        moments = self._moments(modes, samples)
-        # Averaged over the posterior, the energy of a model that holds has the mean of a
-        # chi-square variable. At the best of several modes it is smaller, by the difference from
-        # the average.
-        expected = self._mean_residual - samples.average(residuals)
-        likelihood = modes.roi_log_likelihood
-        for row, (one, start) in enumerate(zip(found, starts.tolist(), strict=True)):
-            end = start + len(one.residuals)
-            residual = float(residuals[start + np.argmax(likelihood[start:end])])
-            outside = outside_probability(evidence[row] - one.log_evidence_outside)
-            yield self._conclude(one, residual, expected[row] + residual, outside,
-                                 (moments[0][row], moments[1][row]))
-
-    def _conclude(
-            self, found: Found, residual: float, expected: float, outside: float,
-            moments: tuple[np.ndarray, np.ndarray]) -> tuple[Located, Doubt | None]:
-        """Return a position, or why there is none, and the doubt."""
-        reason = self._reason(found, residual, outside)
-        if reason:
-            moments = _no_fix()
-        doubt = None
-        if outside > DOUBT_LIMIT and not self._test.residual_test(residual) == reason != '':
-            expected = np.nan
-            if not reason:
-                doubt = Doubt(outside, found.whitened, found.scale_outside)
-                moments = moments[0], self.with_outside(*moments, doubt)
-        return (*moments, reason, residual, expected), doubt
-
-    def _find(self, received: np.ndarray, whitened: np.ndarray) -> Found:
-        if self._failures:
-            modes = find_modes(
-                self._model, self._table, whitened, extra_margin=self._failures.search_margin)
-            return self._with_evidence(whitened, *self._failures.refine(modes, received))
-        found = self._found(whitened, find_modes(self._model, self._table, whitened))
-        if not self._error:
-            return found
-        signals = np.broadcast_to(received, (len(found.modes.points), *received.shape))
-        modes, residuals = self._error.refine(found.modes, signals, step=True)
-        return found._replace(modes=modes, residuals=residuals)
-
-    def _found(self, whitened: np.ndarray, modes: Modes) -> Found:
-        """Return the result of a search; continue it if it has not reached a maximum."""
-        residuals = -modes.roi_log_likelihood
-        if self._test.residual_test(residuals.min()):
-            # Strong signals may need more steps to reach the maximum.
-            modes = find_modes(self._model, self._table, whitened, LONG_SEARCH_STEPS)
-            residuals = -modes.roi_log_likelihood
-        return self._with_evidence(whitened, modes, residuals)
-
-    def _with_evidence(
-            self, whitened: np.ndarray, modes: Modes, residuals: np.ndarray) -> Found:
-        outside = (float(self._surroundings.log_evidence(whitened)[0])
-                   if self._rejects_outside else -np.inf)
-        return Found(modes, residuals, whitened, outside)
-
-    def _reason(self, found: Found, residual: float, outside: float) -> str:
-        """Return why there is no fix, empty if there is one.
-
-        If no position of the region explains the signals, one outside has to explain them for
-        the user to be there.
-        """
-        unexplained = self._test.residual_test(residual)
-        if not self._rejects_outside or unexplained and not self._surroundings.explain(
-                found.whitened, self._test.max_residual):
-            return unexplained
-        return outside_test(outside) or unexplained
-
-    @property
-    def surface(self) -> Surface | None:
-        """What the estimator assumes to be known of the surface."""
-        return self._model.surface
-
-    @abc.abstractmethod
-    def _moments(
-            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions, [N, 3], and covariances, [N, 3, 3], of N phases."""
+    def of_phase(self, phase: int) -> 'Modes':
+        """Return the modes of one phase."""
+        return self.select(slice(*np.searchsorted(self.phases, (phase, phase + 1))))
 
 
-def _no_fix() -> tuple[np.ndarray, np.ndarray]:
-    return np.full(3, np.nan), np.full((3, 3), np.nan)
+def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
+               aligned: np.ndarray, n_steps: int = 0, extra_margin: float = 0.0) -> Modes:
+    """Find the modes of each of N phases with a substantial weight in the posterior.
+
+    Each phase has at least one mode, and its most likely one comes first.
+
+    Parameters
+    ----------
+    aligned
+        Parameters that the signals alone reveal, float64 [N, Q]; 0 for the others.
+    n_steps
+        Maximum number of exact steps, at least 1; by default as many as usually needed.
+    extra_margin
+        Modes may be less likely than the best by this more than usual.
+    """
+    starts = grid.starts(
+        likelihood.whitened(aligned, signals), likelihood.nuisance, GRID_MARGIN + extra_margin)
+    starts = starts._replace(values=starts.values + aligned[starts.phases])
+    default = _N_NUISANCE_STEPS if len(likelihood.nuisance) else _N_STEPS
+    return ascend(likelihood, likelihood, starts, signals, n_steps or default,
+                  EXACT_MARGIN + extra_margin)
 
 
-def surface_of(estimator: Estimator) -> Surface | None:
-    """Return what an estimator assumes to be known of the surface; None for other estimators."""
-    return estimator.surface if isinstance(estimator, SearchEstimator) else None
+def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
+           n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
+    """Take Gauss-Newton steps from points to the modes of the posterior.
+
+    Parameters
+    ----------
+    conditional
+        The likelihood of the state of the surface.
+    starts
+        Points of N phases, and parameters there.
+    margin
+        Modes that are less likely than the best of a phase by more are dropped.
+    """
+    rows = starts.phases
+    modes, gain = _step(conditional, likelihood, starts, signals.take(rows), state)
+    for _ in range(n_steps - 1):
+        chosen = _prune(modes, gain, margin)
+        modes, gain = modes.select(chosen), gain[chosen]
+        (moving,) = np.nonzero(gain > _MIN_GAIN)
+        if not len(moving):
+            break
+        again = Starts(modes.phases[moving], modes.roi_points[moving], modes.values[moving])
+        moved, gain[moving] = _step(
+            conditional, likelihood, again, signals.take(again.phases), state)
+        for field, new in zip(modes, moved, strict=True):
+            field[moving] = new
+    chosen = _prune(modes, gain, margin)
+    modes = modes.select(chosen)
+    if len(likelihood.nuisance):
+        # A step that has not converged may predict any likelihood.
+        again = Starts(modes.phases, modes.points, modes.values)
+        modes, gain = _step(
+            conditional, likelihood, again, signals.take(modes.phases), state, moves=False)
+        modes = modes.select(_prune(modes, gain, margin))
+    return modes
+
+
+def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
+                values: np.ndarray, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the marginal log-likelihood of points [M, 3], [M], and the best parameters, [M, Q].
+
+    Takes approximate parameters, [M, Q], from which Newton steps start.
+    """
+    values = likelihood.settle(points, values, signals)
+    for _ in range(2):
+        local = conditional.local(points, values, signals)
+        marginal = marginalise(local.information, local.gradient)
+        values = values + marginal.offset
+    rise = np.sum(local.gradient[:, 3:] * marginal.offset, axis=1) / 2
+    return local.value + rise + marginal.log_volume, values
+
+
+def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
+          state: int, moves: bool = True) -> tuple[Modes, np.ndarray]:
+    """Take one scoring step; also return the gain of log-likelihood in the region, [M].
+
+    If it does not move the points, the result is the likelihood there, and the gain is 0.
+    """
+    points = starts.points
+    values = likelihood.settle(points, starts.values, signals)
+    local = conditional.local(points, values, signals)
+    marginal, whole, rise = _newton(local, likelihood)
+    if not moves:
+        whole, rise = np.zeros_like(whole), np.zeros_like(rise)
+    step, values = whole[:, :3], values + whole[:, 3:]
+    evidence = local.value + marginal.log_volume
+    points = points + step
+    offset = offset_to_roi(points, marginal.information, likelihood.scenario.roi_bounds_m)
+    gain = rise - likelihood_loss(offset, marginal.information)
+    modes = Modes(
+        starts.phases, points, marginal.information, evidence + rise, offset, values,
+        local.residual - gain, np.full(len(points), state))
+    return modes, gain if moves else np.zeros(len(points))
+
+
+def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
+    """Compute the marginal log-likelihood after a Gauss-Newton step, float64 [M]."""
+    marginal, _, rise = _newton(local, likelihood)
+    result: np.ndarray = local.value + marginal.log_volume + rise
+    return result
+
+
+def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray, np.ndarray]:
+    """Return the marginal, the limited step of all unknowns [M, 3 + Q], and its rise [M]."""
+    n, n_values = len(local.value), len(likelihood.nuisance)
+    marginal = (marginalise(local.information, local.gradient) if n_values
+                else Marginal(local.information, local.gradient, np.zeros((n, 0, 3)),
+                              np.zeros((n, 0)), np.zeros(n)))
+    step = np.linalg.solve(marginal.information, marginal.gradient[..., None])[..., 0]
+    limits = _STEP_LIMITS.copy()
+    if likelihood.nuisance.is_coarse:
+        limits[0] = _COARSE_STEP_M
+    whole = np.clip(step, -limits, limits)
+    if n_values:
+        whole = np.hstack([whole, marginal.offset + np.einsum(
+            'mqp,mp->mq', marginal.regression, whole)])
+    rise = np.sum(local.gradient * whole, axis=1) - likelihood_loss(whole, local.information)
+    return marginal, whole, rise
+
+
+def _prune(modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
+    """Choose the probable and separate modes of each phase, the most likely first.
+
+    The likelihood of a mode is a prediction. The best is at most the one before the last step,
+    which is computed.
+    """
+    value = modes.roi_log_likelihood
+    order = np.lexsort((-value, modes.phases))
+    phases, value, gain = modes.phases[order], value[order], gain[order]
+    firsts = first_of_each(phases)
+    best = np.minimum(value[firsts], np.maximum.reduceat(value - gain, firsts))
+    lists = np.searchsorted(phases[firsts], phases)
+    kept = value >= best[lists] - margin - np.maximum(gain, 0)
+    order, lists = order[kept], lists[kept]
+    # Lists of the modes of each phase, filled up to the same length.
+    place = np.arange(len(lists)) - first_of_each(lists)[lists]
+    index = np.zeros((len(firsts), place.max() + 1), int)
+    valid = np.zeros(index.shape, bool)
+    index[lists, place], valid[lists, place] = order, True
+    points, curvature = modes.roi_points[index], modes.curvature[index]
+    rows = np.arange(len(index))[:, None]
+
+    def are_close(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        offset = points[rows, first][:, :, None] - points[rows, second][:, None]
+        scaled = np.matmul(offset, curvature[rows, first])
+        close: np.ndarray = np.einsum('lnmp,lnmp->lnm', scaled, offset) < _SAME_MODE
+        return close
+
+    chosen: np.ndarray = index[suppress(are_close, valid, MAX_MODES)]
+    return chosen
+
+
+def first_of_each(phases: np.ndarray) -> np.ndarray:
+    """Return the index of the first mode of each phase, for phases [M] in ascending order."""
+    changes = np.ones(len(phases), bool)
+    np.not_equal(phases[1:], phases[:-1], out=changes[1:])
+    return np.flatnonzero(changes)

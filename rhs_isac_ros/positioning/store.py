@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros import __version__
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.positioning import surroundings, templates
-from rhs_isac_ros.positioning.whitened import WhitenedModel
+from rhs_isac_ros.positioning import grid, outside
 
 # Maximum number of tables in a folder; the least recently used ones beyond it are deleted.
 _MAX_TABLES = 16
@@ -28,10 +28,11 @@ def default_folder() -> Path:
     return (Path(base) if os.path.isabs(base) else Path.home() / '.cache') / 'rhs_isac_ros'
 
 
-def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str, np.ndarray]:
+def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = None
+               ) -> Mapping[str, np.ndarray]:
     """Load the table of a model from a folder, or compute it and store it there.
 
-    The result contains the arrays of `tabulate` and `tabulate_surroundings`; from a folder, they
+    The result contains the arrays of `tabulate` and `tabulate_outside`; from a folder, they
     are read-only and mapped into memory. Without a folder, the table is in memory only.
 
     Warns
@@ -41,7 +42,7 @@ def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str,
     """
     if folder is None:
         return _tabulate(model)
-    key = table_key(model)
+    key = table_key(model, codebook_id)
     path = folder / f'{_PREFIX}{key}.npy'
     table = _read(path, key)
     if table is not None:
@@ -55,15 +56,14 @@ def load_table(model: WhitenedModel, folder: Path | None = None) -> Mapping[str,
     return _read(path, key) or table
 
 
-def _tabulate(model: WhitenedModel) -> dict[str, np.ndarray]:
-    return templates.tabulate(model) | surroundings.tabulate_surroundings(model)
+def _tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
+    return grid.tabulate(model) | outside.tabulate_outside(model)
 
 
-def table_key(model: WhitenedModel) -> str:
+def table_key(model: MeasurementModel, codebook_id: str) -> str:
     """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
-    parts = (dataclasses.astuple(model.scenario), model.codebook.id, __version__, _FORMAT,
-             templates.RANGE_CELL_M, templates.DIRECTION_STEP,
-             surroundings.RANGE_RATIO, surroundings.DIRECTION_STEP,
+    parts = (dataclasses.astuple(model.scenario), codebook_id, __version__, _FORMAT,
+             grid.RANGE_CELL_M, grid.DIRECTION_STEP, outside.RANGE_RATIO, outside.DIRECTION_STEP,
              *([model.surface.id] if model.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 

@@ -17,12 +17,11 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.network import INPUTS, Network
 from rhs_isac_ros.positioning.simulate import simulate_pairs
-from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 DEFAULT_PAIRS = 100_000
 DEFAULT_HIDDEN = 256
@@ -174,5 +173,5 @@ def _mean_square(errors: np.ndarray) -> float:
 
 
 def _max_energy(scenario: Scenario, codebook: Codebook, positions: np.ndarray) -> float:
-    model = WhitenedModel(scenario, codebook)
-    return float(np.sum(np.abs(model.mean(positions))**2, axis=(1, 2)).max())
+    model = MeasurementModel(scenario, codebook)
+    return float(np.sum(np.abs(model.whiten(model.mean(positions)))**2, axis=(1, 2)).max())

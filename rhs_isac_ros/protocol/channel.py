@@ -7,9 +7,8 @@ import numpy as np
 
 from rhs_isac_ros.link import Beam, capacity
 from rhs_isac_ros.model import Scenario, streams
-from rhs_isac_ros.model.imperfections import draw_surface, has_element_errors
+from rhs_isac_ros.model.impairments import DeclaredElements, draw_factors, draw_surface
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.nuisance import draw_user_cycle, nuisance_factors, nuisance_parameters
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.delivery import Recipient
@@ -37,18 +36,16 @@ class _Deviations:
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._scenario, self._seed = scenario, seed
         self.surface = (
-            draw_surface(scenario, streams.generator(seed, streams.SURFACE))
-            if has_element_errors(scenario) else None)
+            None if DeclaredElements(scenario).is_exact
+            else draw_surface(scenario, streams.generator(seed, streams.SURFACE)))
 
     def factors(self, truth: m.GroundTruth) -> np.ndarray | None:
         """Return the factors of the signals of a cycle [N_B, N_SB, F], or None if all are 1."""
         scenario, seed = self._scenario, self._seed
-        if not nuisance_parameters(scenario):
-            return None
-        values = draw_user_cycle(
-            scenario, streams.generator(seed, streams.USER_DEVIATION, truth.user),
+        factors = draw_factors(
+            scenario, 1, streams.generator(seed, streams.USER_DEVIATION, truth.user),
             streams.generator(seed, streams.CYCLE_DEVIATION, truth.user, truth.cycle_id))
-        return nuisance_factors(scenario, values).reshape(
+        return None if factors is None else factors.reshape(
             scenario.n_bands, scenario.n_subbands, scenario.n_frames)
 
 

@@ -3,7 +3,7 @@
 import collections
 
 from rhs_isac_ros.positioning import Estimate
-from rhs_isac_ros.positioning.residual_monitor import ResidualMonitor
+from rhs_isac_ros.positioning.innovation_test import InnovationTest
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.user_lists import MAX_NAMED
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
@@ -21,8 +21,8 @@ class ResidualWatch:
 
     def __init__(self) -> None:
         self._codebook_id = ''
-        self._all = ResidualMonitor()
-        self._users: collections.OrderedDict[int, ResidualMonitor] = collections.OrderedDict()
+        self._all = InnovationTest()
+        self._users: collections.OrderedDict[int, InnovationTest] = collections.OrderedDict()
         self._warning = ''
 
     def add(self, user: int, codebook_id: str, estimate: Estimate) -> list[LogMessage]:
@@ -30,7 +30,7 @@ class ResidualWatch:
         if codebook_id != self._codebook_id:
             self.clear()
             self._codebook_id = codebook_id
-        own = self._users.setdefault(user, ResidualMonitor(_USER_WINDOW))
+        own = self._users.setdefault(user, InnovationTest(_USER_WINDOW))
         self._users.move_to_end(user)
         # Beyond the limit, the least recent user is forgotten.
         if len(self._users) > MAX_USERS:
@@ -80,6 +80,6 @@ class ResidualWatch:
         return f'the signals do not match the scenario: {"; ".join(parts)}'
 
 
-def _deviation(prefix: str, monitor: ResidualMonitor) -> str:
+def _deviation(prefix: str, monitor: InnovationTest) -> str:
     return (f'{prefix}residuals {monitor.ratio:.3g} times as strong as expected, with '
             f'{monitor.spread:.3g} times the variance, over {monitor.n_fixes} cycles')

@@ -2,8 +2,7 @@
 
 import dataclasses
 
-from rhs_isac_ros.positioning import Estimate, Estimator, Motion, Tracker
-from rhs_isac_ros.positioning.search import SearchEstimator
+from rhs_isac_ros.positioning import Estimate, Estimator, Motion, SearchEstimator, Tracker
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.newest import NewestDict

@@ -16,9 +16,14 @@ import numpy as np
 from rclpy.node import Node
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.calibration import Calibration, SurfacePrior, calibrate, prior_of
-from rhs_isac_ros.calibration.pilots import Pilots
-from rhs_isac_ros.calibration.report import report
+from rhs_isac_ros.calibration import (
+    Calibration,
+    Pilots,
+    SurfacePrior,
+    calibrate,
+    prior_of,
+    report,
+)
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError

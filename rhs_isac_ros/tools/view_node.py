@@ -16,7 +16,7 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.entities import Entry
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
-from rhs_isac_ros.positioning.weighted_modes import WeightedModes
+from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker

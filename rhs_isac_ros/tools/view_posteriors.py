@@ -9,9 +9,14 @@ from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.positioning import BayesEstimator, Estimate, SignalError
+from rhs_isac_ros.positioning import (
+    BayesEstimator,
+    Estimate,
+    SignalError,
+    WeightedModes,
+    weighted_modes,
+)
 from rhs_isac_ros.positioning.store import default_folder
-from rhs_isac_ros.positioning.weighted_modes import WeightedModes, weighted_modes
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.tracks import Tracks

@@ -32,9 +32,9 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import (
+    ElementErrors,
     MeasurementModel,
     Scenario,
-    SurfaceImperfection,
     draw_surface,
     streams,
 )
@@ -137,7 +137,7 @@ def measure(declared: Scenario, silent: Scenario, codebook: Codebook,
     return stacked, elapsed_s / options.surfaces, found
 
 
-def failures(surface: SurfaceImperfection, calibration: Calibration) -> np.ndarray:
+def failures(surface: ElementErrors, calibration: Calibration) -> np.ndarray:
     """Count failed elements that were found, all of them, and false ones [3]."""
     true, found = ~np.isnan(surface.stuck), calibration.surface.failed
     return np.array([np.sum(true & found), np.sum(true), np.sum(found & ~true)])

@@ -1,11 +1,15 @@
-"""Averages of losses of quadratic forms."""
+"""Averages of losses of quadratic forms, and the average bound."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import compressed_rows, measurement_rows
+from rhs_isac_ros.bounds import AverageCrlb, average_crlb, crlb, rows
 from rhs_isac_ros.bounds.average import Average, Gradient
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.impairments import BUILT_IN
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 N_ITEMS = 7
@@ -125,9 +129,9 @@ def test_results_do_not_depend_on_the_blocks(
     """The last block is shorter, of equal size, or the only one; the loss depends on the item."""
     scenario, codebook = faded
     expected = make(scenario, items, loss)(codebook)
-    monkeypatch.setattr(measurement_rows, '_BLOCK', size)
+    monkeypatch.setattr(rows, '_BLOCK', size)
     average = make(scenario, items, loss, tolerance)
-    assert len(list(measurement_rows.blocks(average.rows.n_items))) == -(-N_ITEMS // size)
+    assert len(list(rows.blocks(average.rows.n_items))) == -(-N_ITEMS // size)
     assert_is(average(codebook), expected, max(1e-12, 10 * tolerance))
     assert average.value(codebook) == pytest.approx(expected.value, rel=max(1e-12, 10 * tolerance))
 
@@ -153,7 +157,7 @@ def test_a_constant_loss_has_its_value_and_no_gradient(faded, items):
 
 def test_the_loss_receives_every_item_once_and_in_order(faded, items, plain, monkeypatch):
     scenario, codebook = faded
-    monkeypatch.setattr(measurement_rows, '_BLOCK', 3)
+    monkeypatch.setattr(rows, '_BLOCK', 3)
     seen = []
 
     def record(block, forms):
@@ -172,11 +176,176 @@ def test_the_loss_receives_every_item_once_and_in_order(faded, items, plain, mon
 
 def test_rows_are_exact_unless_there_is_a_tolerance(faded, items, loss):
     scenario, _ = faded
-    assert isinstance(make(scenario, items, loss).rows, measurement_rows.ExactRows)
-    assert isinstance(make(scenario, items, loss, 1e-3).rows, compressed_rows.CompressedRows)
+    assert isinstance(make(scenario, items, loss).rows, rows.ExactRows)
+    assert isinstance(make(scenario, items, loss, 1e-3).rows, rows.CompressedRows)
 
 
-@pytest.mark.parametrize('tolerance', [compressed_rows.MIN_TOLERANCE / 2, -1.0, -0.1, np.nan])
-def test_a_tolerance_out_of_range_is_an_error(faded, items, loss, tolerance):
+@pytest.mark.parametrize('tolerance', [rows.MIN_TOLERANCE / 2, -1.0, -0.1, np.nan])
+def test_an_average_with_a_tolerance_out_of_range_is_an_error(faded, items, loss, tolerance):
     with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
         make(faded[0], items, loss, tolerance)
+
+
+def assert_matches_vectors(outcome, vectors, tolerance=1e-8, value_tolerance=1e-8):
+    value, by_analog, by_digital = outcome
+    assert value == pytest.approx(float(vectors['average_crlb']), rel=value_tolerance)
+    for actual, expected in ((by_analog, vectors['grad_analog']),
+                             (by_digital, vectors['grad_digital'])):
+        assert actual.shape == expected.shape
+        assert actual.dtype == expected.dtype
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(
+            actual, expected, rtol=tolerance, atol=tolerance * scale)
+
+
+def test_bound_and_gradients_match_the_vectors(case):
+    outcome = average_crlb(case.scenario, case.codebook, case.vectors['positions'])
+    assert type(outcome.value) is float
+    assert_matches_vectors(outcome, case.vectors)
+    value = AverageCrlb(case.scenario, case.vectors['positions']).value(case.codebook)
+    assert type(value) is float
+    assert value == pytest.approx(float(case.vectors['average_crlb']), rel=1e-8)
+
+
+def test_evaluations_of_the_bound_are_repeatable(case):
+    average = AverageCrlb(case.scenario, case.vectors['positions'])
+    for _ in range(2):
+        assert_matches_vectors(average(case.codebook), case.vectors)
+
+
+def test_the_bound_does_not_depend_on_the_blocks(case, monkeypatch):
+    monkeypatch.setattr(rows, '_BLOCK', 4)
+    assert_matches_vectors(
+        average_crlb(case.scenario, case.codebook, case.vectors['positions']), case.vectors)
+
+
+@pytest.mark.parametrize('tolerance', [1e-7, 1e-6, 1e-5, 1e-4])
+def test_compressed_rows_match_the_vectors_to_a_multiple_of_the_tolerance(case, tolerance):
+    """The bound depends most on directions with little information, which amplifies errors."""
+    average = AverageCrlb(case.scenario, case.vectors['positions'], tolerance)
+    assert_matches_vectors(average(case.codebook), case.vectors, 2000 * tolerance, 50 * tolerance)
+
+
+# N_B, N_SB, F, K, elements along a side.
+SIZES = [(1, 3, 2, 2, 3), (2, 2, 3, 1, 3), (3, 1, 2, 3, 2), (2, 2, 1, 2, 4), (1, 1, 4, 3, 4)]
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
+@pytest.mark.parametrize('sizes', SIZES)
+def test_gradients_are_the_limit_of_differences_of_plain_bounds(
+        sizes, tolerance, plain, random_beams):
+    n_bands, n_subbands, n_frames, n_feeds, side = sizes
+    rng = np.random.default_rng(SIZES.index(sizes))
+    scenario = Scenario(
+        center_frequencies_hz=tuple(rng.uniform(1e9, 4e9, n_bands)), n_subbands=n_subbands,
+        n_frames=n_frames, n_feeds=n_feeds, elements_per_side=side, subband_width_hz=3e5,
+        frame_duration_s=2e-3, roi_center_m=(3, 0, 0), roi_size_m=(2, 3, 2))
+    codebook = random_beams(scenario, rng)
+    spatial = multipath_covariance(scenario)
+    positions = scenario.sample_positions(2, rng)
+
+    def bound(analog, digital):
+        return plain(scenario, analog, digital).crlb(positions, spatial).mean()
+
+    value, by_analog, by_digital = AverageCrlb(scenario, positions, tolerance)(codebook)
+    analog, digital = codebook.analog, codebook.digital
+    assert value == pytest.approx(bound(analog, digital), rel=1e-7)
+    size, scale, step = np.linalg.norm(analog), np.linalg.norm(digital), 1e-5
+    # The weights of a single feed have little effect compared with rounding in the bound.
+    slack = 1e-6 * value
+    for _ in range(2):
+        way = rng.normal(size=analog.shape)
+        way *= size / np.linalg.norm(way)
+        difference = (bound(analog + step * way, digital) - bound(analog - step * way, digital))
+        assert np.sum(by_analog * way) == pytest.approx(
+            difference / (2 * step), abs=slack + 1e-6 * np.linalg.norm(by_analog) * size)
+        way = rng.normal(size=(*digital.shape, 2)) @ [1, 1j]
+        way *= scale / np.linalg.norm(way)
+        difference = (bound(analog, digital + step * way) - bound(analog, digital - step * way))
+        assert np.sum(by_digital.conj() * way).real == pytest.approx(
+            difference / (2 * step), abs=slack + 1e-6 * np.linalg.norm(by_digital) * scale)
+
+
+def test_the_bound_is_the_mean_over_the_positions(small):
+    """The vectors contain the bound of every position."""
+    average = AverageCrlb(small.scenario, small.vectors['positions'][[4, 1, 1]])
+    expected = small.vectors['crlb'][[4, 1, 1]].mean()
+    assert average(small.codebook).value == pytest.approx(expected, rel=1e-8)
+    assert average.value(small.codebook) == pytest.approx(expected, rel=1e-8)
+
+
+def test_the_bound_is_the_mean_of_the_bounds_of_many_positions(small):
+    positions = small.scenario.sample_positions(300, np.random.default_rng(0))
+    expected = crlb(small.scenario, small.codebook, positions).mean()
+    for tolerance, allowed in ((0, 1e-9), (1e-7, 5e-6)):
+        average = AverageCrlb(small.scenario, positions, tolerance)
+        assert average(small.codebook).value == pytest.approx(expected, rel=allowed)
+
+
+def test_the_bound_does_not_depend_on_a_common_phase_of_a_frame(small):
+    """Noise and multipath are circular, so the gradient has no component along the phase."""
+    value, _, by_digital = average_crlb(
+        small.scenario, small.codebook, small.vectors['positions'])
+    turned = dataclasses.replace(
+        small.codebook, digital=small.codebook.digital * np.exp(0.7j))
+    assert average_crlb(small.scenario, turned, small.vectors['positions']).value == pytest.approx(
+        value, rel=1e-9)
+    along = np.sum(by_digital.conj() * 1j * small.codebook.digital, axis=(1, 3)).real
+    assert np.abs(along).max() < 1e-7 * value
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
+def test_singular_information_is_infinite_and_flat_without_a_warning(small, tolerance):
+    dark = Codebook(np.zeros((1, 2, 16)), small.codebook.digital)
+    average = AverageCrlb(small.scenario, small.vectors['positions'], tolerance)
+    value, by_analog, by_digital = average(dark)
+    assert value == average.value(dark) == np.inf
+    np.testing.assert_array_equal(by_analog, 0)
+    np.testing.assert_array_equal(by_digital, 0)
+
+
+@pytest.mark.parametrize('positions', [
+    np.zeros((0, 3)), [10.0, 0.0, 0.0], [[10.0, 0.0]], [[np.nan, 0.0, 0.0]]])
+def test_malformed_positions_are_errors(small, positions):
+    with pytest.raises(ValueError, match='^positions: .*, expected '):
+        average_crlb(small.scenario, small.codebook, np.array(positions))
+    with pytest.raises(ValueError, match='^positions: .*, expected '):
+        AverageCrlb(small.scenario, np.array(positions), 1e-3)
+
+
+@pytest.mark.parametrize('tolerance', [1e-8, -1e-3, np.nan])
+def test_a_bound_with_a_tolerance_out_of_range_is_an_error(small, tolerance):
+    with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1'):
+        AverageCrlb(small.scenario, small.vectors['positions'], tolerance)
+
+
+FACTORS = tuple(one.field for one in BUILT_IN)
+ERRORS = 'element_error_rms', 'failed_element_share'
+
+
+@pytest.mark.parametrize('region_prior', [False, True])
+@pytest.mark.parametrize('tolerance', [0, 1e-7], ids=['exact', 'compressed'])
+@pytest.mark.parametrize('absent', [(*FACTORS, *ERRORS), ERRORS, FACTORS, ()],
+                         ids=['none', 'nuisance', 'errors', 'all'])
+def test_with_impairments_average_and_gradients_are_those_of_the_bound(
+        uncertain, uncertain_codebook, absent, tolerance, region_prior):
+    codebook = uncertain_codebook
+    scenario = dataclasses.replace(uncertain, **dict.fromkeys(absent, 0.0))
+    positions = scenario.sample_positions(3, np.random.default_rng(2))
+    average = AverageCrlb(scenario, positions, tolerance, region_prior=region_prior)
+    value, by_analog, by_digital = average(codebook)
+    assert average.value(codebook) == pytest.approx(value, rel=1e-12)
+
+    def bound(analog, digital):
+        return crlb(scenario, Codebook(analog, digital), positions,
+                    region_prior=region_prior).mean()
+
+    assert value == pytest.approx(bound(codebook.analog, codebook.digital), rel=1e-5)
+    rng, step = np.random.default_rng(3), 1e-5
+    for _ in range(3):
+        analog = rng.normal(size=by_analog.shape)
+        digital = rng.normal(size=(*by_digital.shape, 2)) @ [1, 1j] * np.abs(codebook.digital)
+        ahead, behind = (bound(np.clip(codebook.analog + sign * step * analog, 0, 1),
+                               codebook.digital + sign * step * digital) for sign in (1, -1))
+        expected = np.sum(by_analog * analog) + np.sum(np.conj(by_digital) * digital).real
+        assert (ahead - behind) / (2 * step) == pytest.approx(expected, rel=2e-4)

@@ -1,4 +1,6 @@
-"""Fisher information and the bound."""
+"""Fisher information and the bound, with nuisance parameters and the region as a prior."""
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from rhs_isac_ros.bounds import (
 )
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 
@@ -189,3 +192,70 @@ def test_malformed_positions_are_errors(small, positions):
     for function in (crlb, fisher_information):
         with pytest.raises(ValueError, match='^positions: .*, expected '):
             function(small.scenario, small.codebook, np.array(positions))
+
+
+DECLARED = {
+    'user_gain_std_db': 2.0, 'carrier_offset_std_hz': 700.0, 'phase_std_rad': 0.4,
+    'timing_std_s': 30e-9, 'band_phase_std_rad': 0.7}
+ERRORS = {'element_error_rms': 0.1, 'failed_element_share': 0.05}
+# Impairments, one at a time and together.
+CASES = [{name: value} for name, value in DECLARED.items()] + [
+    {'element_error_rms': 0.1}, {'failed_element_share': 0.05}, DECLARED | ERRORS]
+
+
+def test_nothing_declared_gives_the_plain_bound(case):
+    positions = case.vectors['positions']
+    model = MeasurementModel(case.scenario, case.codebook)
+    joint = fisher.joint_information_of(model, positions)
+    np.testing.assert_allclose(
+        fisher.marginal_information(joint), case.vectors['fim'], rtol=1e-8,
+        atol=1e-9 * np.abs(case.vectors['fim']).max())
+    # An impairment too small to matter, through the code of nuisance parameters.
+    tiny = dataclasses.replace(case.scenario, band_phase_std_rad=1e-9, user_gain_std_db=1e-9)
+    np.testing.assert_allclose(
+        crlb(tiny, case.codebook, positions), case.vectors['crlb'], rtol=1e-8)
+
+
+def test_the_bound_is_that_of_the_joint_information(uncertain, uncertain_codebook):
+    """Position and nuisance parameters by finite differences of the mean, and the whole
+    matrix inverted."""
+    model = MeasurementModel(uncertain, uncertain_codebook)
+    position = uncertain.sample_positions(1, np.random.default_rng(1))
+    nuisance = nuisance_of(uncertain)
+    n_parameters = 3 + len(nuisance)
+
+    def mean(values):
+        factors = np.exp(np.tensordot(values[3:], nuisance.scaled_patterns, axes=1))
+        return model.whiten(model.mean(position + values[:3]) * factors).ravel()
+
+    steps = 1e-5 * np.eye(n_parameters)
+    slopes = np.stack([(mean(step) - mean(-step)) / 2e-5 for step in steps])
+    information = 2 * (slopes @ slopes.conj().T).real
+    information[3:, 3:] += np.eye(len(nuisance))
+    expected = np.trace(np.linalg.inv(information)[:3, :3])
+    assert crlb_of(model, position)[0] == pytest.approx(expected, rel=1e-5)
+    information[:3, :3] += np.diag(12 / np.array(uncertain.roi_size_m)**2)
+    expected = np.trace(np.linalg.inv(information)[:3, :3])
+    assert crlb_of(model, position, region_prior=True)[0] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize('declared', CASES, ids=lambda declared: '+'.join(declared)[:24])
+def test_an_impairment_raises_the_bound(table1, declared):
+    scenario = dataclasses.replace(table1.scenario, **declared)
+    bound = crlb(scenario, table1.codebook, table1.vectors['positions'])
+    assert (bound > 1.0001 * table1.vectors['crlb']).all()
+
+
+def test_the_region_is_an_upper_limit(small):
+    mute = dataclasses.replace(small.scenario, user_gain=1e-6, noise_psd_dbm_hz=-100)
+    bound = crlb(mute, small.codebook, small.vectors['positions'], region_prior=True)
+    np.testing.assert_allclose(bound, np.sum(np.square(mute.roi_size_m)) / 12, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.linalg.inv(fisher.region_information(mute)), np.diag(np.square(mute.roi_size_m) / 12))
+
+
+def test_equation_12_is_that_of_the_position_alone(table1):
+    declared = dataclasses.replace(table1.scenario, **DECLARED)
+    np.testing.assert_array_equal(
+        fisher_information(declared, table1.codebook, table1.vectors['positions']),
+        fisher_information(table1.scenario, table1.codebook, table1.vectors['positions']))

@@ -1,10 +1,13 @@
-"""The chain rule from radiation matrices to a codebook."""
+"""The chain rule from radiation matrices to a codebook, also for an estimated surface."""
 
 import numpy as np
 import pytest
 
+from rhs_isac_ros.bounds import AverageCrlb
 from rhs_isac_ros.bounds.gradient import gradient_analog, gradient_digital
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.impairments import AppliedBeams
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 
 def complex_array(rng, *shape):
@@ -63,3 +66,38 @@ def test_gradient_by_the_digital_weights_is_the_difference_quotient(odd, distanc
                           - distance(analog, digital - step)[0])
             assert (gradient[index].conj() * direction).real == pytest.approx(
                 difference / (2 * size), rel=1e-9, abs=1e-9 * np.abs(gradient).max())
+
+
+SCENARIO = Scenario(elements_per_side=4, n_feeds=2, element_error_rms=0.1)
+N_ELEMENTS = SCENARIO.n_elements
+
+
+@pytest.fixture
+def average():
+    """The average bound for a surface with complex coefficients, failures and band gains."""
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=(2, N_ELEMENTS, 2)) @ [1, 1j]
+    failed = np.arange(N_ELEMENTS) % 7 == 0
+    average = AverageCrlb(SCENARIO, SCENARIO.sample_positions(10, rng))
+    average.surface = SurfaceEstimate(
+        np.where(failed, 0, 1 + 0.3 * numbers[0]), np.where(failed, 0.5 + 0.1 * numbers[1], 0),
+        np.array([1.2 + 0.3j, 0.8 - 0.1j]),
+        0.1 * np.ones((2 * N_ELEMENTS + 2, 1), complex), failed.astype(float))
+    return average
+
+
+@pytest.mark.parametrize('name', ['analog', 'digital'])
+def test_gradients_for_an_estimated_surface_are_slopes(average, random_beams, name):
+    beams, rng = random_beams(SCENARIO, np.random.default_rng(1)), np.random.default_rng(2)
+    result = average(beams)
+    assert result.value == pytest.approx(average.value(beams), rel=1e-12)
+    start = getattr(beams, name)
+    direction = rng.normal(size=start.shape) * np.abs(start).mean()
+    if name == 'digital':
+        direction = direction * np.exp(1j * rng.uniform(size=start.shape))
+    gradient = result.by_analog if name == 'analog' else result.by_digital
+    parts = AppliedBeams(beams.analog, beams.digital)
+    ends = [average.value(parts._replace(**{name: start + step * direction}))
+            for step in (-1e-5, 1e-5)]
+    slope = np.sum(np.conj(direction) * gradient).real
+    assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(slope, rel=1e-4)

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import measurement_rows
-from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost
+from rhs_isac_ros.bounds import rows
+from rhs_isac_ros.bounds.pairwise_error import PairwiseErrorCost, best_phases
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.multipath import multipath_covariance
 
 N_PAIRS = 9
@@ -151,7 +152,7 @@ def test_gradients_are_the_limit_of_differences_of_the_value(
 @pytest.mark.parametrize('tolerance', [0, 1e-6], ids=['exact', 'compressed'])
 def test_pairs_are_weighted_in_all_blocks(
         scenario, codebook, pairs, plain_of, monkeypatch, tolerance):
-    monkeypatch.setattr(measurement_rows, '_BLOCK', 1)
+    monkeypatch.setattr(rows, '_BLOCK', 1)
     weights = np.random.default_rng(3).uniform(0, 2, N_PAIRS)
     weights[5] = 0
     expected = np.mean(weights * plain_of(codebook.analog, codebook.digital, *pairs))
@@ -286,9 +287,9 @@ def test_a_sample_is_closer_to_the_cost_than_a_uniform_choice(many, codebook, sc
 def test_a_sample_holds_each_pair_at_most_once(many, codebook, n):
     sample = many.sample(codebook, n, np.random.default_rng(n))
     assert sample.rows.n_items == n
-    rows = sample.rows.coefficients[0]
-    assert len(np.unique(rows, axis=0)) == n
-    assert rows.dtype == np.complex64
+    coefficients = sample.rows.coefficients[0]
+    assert len(np.unique(coefficients, axis=0)) == n
+    assert coefficients.dtype == np.complex64
 
 
 def test_a_sample_of_pairs_that_cost_nothing_is_uniform(codebook, pairs, scenario):
@@ -305,3 +306,36 @@ def test_a_sample_of_another_number_of_pairs_is_an_error(many, codebook, n):
 def test_exact_differences_are_not_sampled(scenario, codebook, pairs):
     with pytest.raises(ValueError, match='^tolerance: 0, expected compressed differences'):
         PairwiseErrorCost(scenario, *pairs).sample(codebook, 2, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize('phases', [
+    {'phase_std_rad': 0.2}, {'phase_std_rad': 6.3}, {'band_phase_std_rad': 0.2},
+    {'band_phase_std_rad': 6.3}, {'phase_std_rad': 0.5, 'band_phase_std_rad': 0.5}])
+def test_hardly_any_phases_are_better(phases):
+    """Compared with a search over all phases."""
+    rng, scales = np.random.default_rng(0), nuisance_of(Scenario(**phases)).scaled_phases
+    products = rng.exponential(3.0, (50, 2)) * np.exp(2j * np.pi * rng.uniform(size=(50, 2)))
+    found, penalties = best_phases(products, scales)
+    grid = np.linspace(-np.pi, np.pi, 181)
+    if scales.shape[1] == 1:
+        every = np.stack([grid, grid], axis=1)
+    else:
+        every = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    inverse = np.linalg.pinv(scales @ scales.T)
+
+    def cost(theta, penalty):
+        return penalty - 2 * np.sum((products * np.exp(-1j * theta)).real, axis=-1)
+
+    least = np.min([cost(theta, theta @ inverse @ theta) for theta in every], axis=0)
+    excess = cost(found, penalties) - least
+    assert excess.max() < 0.05
+    assert np.mean(excess < 1e-3) > 0.9
+    np.testing.assert_allclose(
+        penalties, np.einsum('na,ab,nb->n', found, inverse, found), atol=1e-9)
+
+
+def test_small_phases_equal_the_linear_model():
+    """Minimise |a (1 + i theta) - b|^2 with a prior: theta = 2 Im a^H b / (2 |a|^2 + 1 / s^2)."""
+    products, scale = np.array([[4.0 * np.exp(1e-3j)]]), np.array([[0.7]])
+    (found,), _ = best_phases(products, scale)
+    assert found[0] == pytest.approx(4e-3 / (4 + 1 / 0.7**2), rel=1e-3)

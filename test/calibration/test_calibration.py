@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.calibration import Calibration, CalibrationError, calibrate, load_surface
-from rhs_isac_ros.calibration.report import report
+from rhs_isac_ros.calibration.calibration import report
 from rhs_isac_ros.model import Scenario
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.calibration import Pilots, SurfacePrior, estimate_surface, prior_of
-from rhs_isac_ros.model import MeasurementModel, Scenario, SurfaceImperfection
-from rhs_isac_ros.model.element_error import error_covariance, expected_beams
+from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments import DeclaredElements
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
 
@@ -58,12 +58,13 @@ def test_without_pilots_the_estimate_is_the_prior(scenario, beams):
     """Mean and covariance of the signals are those that the scenario declares."""
     found = estimate_surface(scenario, [], SurfacePrior(
         scenario.element_error_rms, scenario.failed_element_share, band_gain_rms=0.0))
-    applied, expected = found.applied_beams(beams), expected_beams(scenario, beams)
+    elements = DeclaredElements(scenario)
+    applied, expected = found.applied_beams(beams), elements.applied_beams(beams)
     np.testing.assert_allclose(applied.analog, expected.analog, atol=1e-9)
     np.testing.assert_allclose(applied.digital, expected.digital)
     np.testing.assert_allclose(found.failed_probability, scenario.failed_element_share)
     covariance = found.error_covariance(scenario, beams)
-    declared = error_covariance(scenario, beams)
+    declared = elements.error_covariance(scenario, beams)
     assert np.abs(covariance - declared).max() < 0.05 * np.abs(declared).max()
 
 
@@ -141,7 +142,7 @@ def test_an_exact_estimate_is_the_surface(scenario, beams, damaged, truth):
         scenario, beams, exact)
     np.testing.assert_allclose(one.radiation, other.radiation, rtol=1e-12)
     np.testing.assert_allclose(one.covariance(), other.covariance(), rtol=1e-12)
-    assert surface.id != SurfaceImperfection(surface.gains + 1, surface.stuck).id
+    assert surface.id != ElementErrors(surface.gains + 1, surface.stuck).id
 
 
 @pytest.mark.parametrize(('positions', 'received', 'error'), [

@@ -26,7 +26,6 @@ from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_h
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import mean_los_power, multipath_covariance
 from rhs_isac_ros.positioning import make_estimator, store
-from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
 def patch(angles):
@@ -185,14 +184,15 @@ def test_bounds_match_differences_of_the_mean(scenario, codebook):
 
 
 def test_whitened_jacobian_is_the_limit_of_differences(scenario, codebook):
-    model = WhitenedModel(scenario, codebook)
+    model = MeasurementModel(scenario, codebook)
     positions = scenario.sample_positions(6, np.random.default_rng(6))
-    mean, slopes = model.mean_and_jacobian(positions)
-    np.testing.assert_allclose(mean, model.mean(positions), rtol=1e-9)
+    mean, slopes = model.mean_and_jacobian(positions, whitened=True)
+    np.testing.assert_allclose(mean, model.whiten(model.mean(positions)), rtol=1e-9)
     step = 1e-5
     for u in range(3):
         shift = step * np.eye(3)[u]
-        difference = (model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
+        difference = model.whiten(
+            model.mean(positions + shift) - model.mean(positions - shift)) / (2 * step)
         np.testing.assert_allclose(
             slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
 
@@ -256,7 +256,7 @@ class TestIdentity:
     def test_tables_are_keyed_by_the_gains(self, scenario, codebook):
         def key(**fields):
             changed = dataclasses.replace(scenario, **fields)
-            return store.table_key(WhitenedModel(changed, codebook))
+            return store.table_key(MeasurementModel(changed, codebook), codebook.id)
         assert key() == key(element_gain=lambda angles: patch(angles))
         others = {key(), key(element_gain=1.0), key(element_gain=lambda a: 2 * patch(a)),
                   key(user_gain=1.0)}

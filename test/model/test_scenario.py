@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 import yaml
 
-from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError, plugins
+
+
+@pytest.fixture
+def plugin(install) -> str:
+    """The name of an installed impairment, which these tests never call."""
+    install('rusts', 'def rust(strength): raise NotImplementedError',
+            {plugins.IMPAIRMENTS: {'rust': 'rust', 'moss': 'rust'}})
+    return 'rust'
 
 
 def test_defaults_are_table_1_of_the_paper():
@@ -23,7 +31,8 @@ def test_defaults_are_table_1_of_the_paper():
         **dict.fromkeys(
             ('multipath_to_los_db', 'user_gain_std_db', 'phase_std_rad', 'band_phase_std_rad',
              'timing_std_s', 'carrier_offset_std_hz', 'element_error_rms',
-             'failed_element_share', 'amplitude_levels'), 0)}
+             'failed_element_share', 'amplitude_levels'), 0),
+        'impairments': ()}
     assert dataclasses.asdict(Scenario()) == expected
 
 
@@ -112,7 +121,7 @@ def test_message_names_field_value_and_expectation(field, value, shown, expected
 
 
 @pytest.mark.parametrize('field', dataclasses.fields(Scenario), ids=lambda field: field.name)
-def test_values_just_outside_the_bounds_are_errors(field):
+def test_values_just_outside_the_bounds_are_errors(field, plugin):
     if isinstance(field.default, int):
         outside = (field.metadata['low'] - 1, field.metadata['high'] + 1)
     else:
@@ -123,6 +132,8 @@ def test_values_just_outside_the_bounds_are_errors(field):
             value = [[0, 0, 0], [0, 0, 0], [0, value, 0]]
         elif field.name == 'center_frequencies_hz':
             value = [1e9, value]
+        elif field.name == 'impairments':
+            value = {plugin: value}
         elif isinstance(field.default, tuple):
             value = [10, value, 1]
         with pytest.raises(ScenarioError, match=f'^{field.name}: .*, expected .* to .*'):
@@ -230,6 +241,66 @@ def test_the_id_is_a_hash_of_the_content():
               Scenario(user_gain=2.0), Scenario(feed_positions_m=[(0, 0, 0)] * 3)]
     assert len({scenario.id, *(other.id for other in others)}) == 5
     assert Scenario(**scenario.fields()) == scenario
+
+
+@pytest.mark.parametrize(('changes', 'expected'), [
+    ({}, 'sc337b8b24c90a1923'),
+    ({'n_feeds': 2, 'user_gain_std_db': 2.0}, 'scc86c2bbf127e1ffd'),
+    ({'center_frequencies_hz': [28e9]}, 'scd6c6596ccd3b8041')], ids=str)
+def test_without_impairments_the_id_is_that_of_existing_files(changes, expected):
+    assert Scenario(**changes).id == Scenario(**changes, impairments={}).id == expected
+
+
+class TestImpairments:
+    """The field of impairments that plug-ins define."""
+
+    @pytest.mark.parametrize('value', [
+        {'rust': '1e-1', 'moss': 2}, [('rust', 0.1), ('moss', 2.0)],
+        (('moss', 2.0), ('rust', 0.1))], ids=['mapping', 'list', 'field'])
+    def test_names_and_strengths_are_sorted(self, plugin, value):
+        scenario = Scenario(impairments=value)
+        assert scenario.impairments == (('moss', 2.0), ('rust', 0.1))
+        assert hash(scenario) == hash(dataclasses.replace(scenario))
+
+    def test_a_file_is_read_and_written(self, plugin, tmp_path):
+        path, scenario = tmp_path / 'scenario.yaml', Scenario(impairments={plugin: 0.1})
+        path.write_text('impairments: {rust: 1e-1}', encoding='utf-8')
+        assert Scenario.from_yaml(path) == scenario
+        path.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+        assert Scenario.from_yaml(path) == scenario
+        assert Scenario(**scenario.fields()) == scenario
+
+    def test_the_id_depends_on_names_and_strengths(self, plugin):
+        ids = {Scenario(impairments=value).id
+               for value in ({}, {'rust': 0.1}, {'rust': 0.2}, {'moss': 0.1})}
+        assert len(ids) == 4
+
+    def test_an_unknown_plugin_is_an_error_that_lists_those_installed(self, plugin):
+        with pytest.raises(ScenarioError, match=(
+                f"^impairments: 'dust', expected a plug-in of {plugins.IMPAIRMENTS}; "
+                'installed: (.*, )?moss, (.*, )?rust')):
+            Scenario(impairments={'rust': 0.1, 'dust': 0.1})
+
+    def test_a_plugin_that_cannot_be_imported_is_an_error(self, install):
+        install('broken', '1 / 0', {plugins.IMPAIRMENTS: {'dust': 'dust'}})
+        with pytest.raises(ScenarioError, match=r'^impairments: .*cannot be loaded: ZeroDivision'):
+            Scenario(impairments={'dust': 0.1})
+
+    @pytest.mark.parametrize('value', [None, 3, 'rust', ['rust'], [0.1], {1: 2, 'rust': 0.1}],
+                             ids=str)
+    def test_a_value_that_is_no_mapping_is_an_error(self, plugin, value):
+        with pytest.raises(ScenarioError) as caught:
+            Scenario(impairments=value)
+        assert str(caught.value) == (
+            f'impairments: {value!r}, expected a mapping of names to strengths')
+
+    @pytest.mark.parametrize(('strength', 'error'), [
+        ('strong', "'strong', expected a number"), (None, 'None, expected a number'),
+        ([1], r'\[1\], expected a number'), (True, 'True, expected a finite number'),
+        (math.nan, 'nan, expected a finite number'), (-0.1, '-0.1, expected 0 to 1e[+]300')])
+    def test_a_strength_that_is_no_number_in_range_is_an_error(self, plugin, strength, error):
+        with pytest.raises(ScenarioError, match=f'^impairments: {error}$'):
+            Scenario(impairments={plugin: strength})
 
 
 def test_positions_are_uniform_in_the_region():

@@ -11,7 +11,7 @@ from rhs_isac_ros.monitoring import charts, network_view
 from rhs_isac_ros.monitoring.entities import Clear, Number, Series, Text
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.positioning.weighted_modes import WeightedModes
+from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 
 N_CYCLES = 4

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import make_estimator, simulate_pairs, store, templates
-from rhs_isac_ros.positioning.surroundings import tabulate_surroundings
-from rhs_isac_ros.positioning.whitened import WhitenedModel
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.positioning import grid, make_estimator, simulate_pairs, store
+from rhs_isac_ros.positioning.outside import tabulate_outside
 
 
 @pytest.fixture(scope='module')
@@ -20,20 +19,28 @@ def scenario() -> Scenario:
 
 
 @pytest.fixture(scope='module')
-def model(scenario, random_beams) -> WhitenedModel:
-    return WhitenedModel(scenario, random_beams(scenario, np.random.default_rng(0)))
+def model(scenario, random_beams) -> MeasurementModel:
+    return MeasurementModel(scenario, random_beams(scenario, np.random.default_rng(0)))
 
 
 @pytest.fixture
 def computed(monkeypatch):
     """Ids of the codebooks for which tables were computed."""
-    ids, original = [], templates.tabulate
+    ids, original = [], grid.tabulate
 
     def tabulate(model):
-        ids.append(model.codebook.id)
+        ids.append(model.beams.id)
         return original(model)
-    monkeypatch.setattr(templates, 'tabulate', tabulate)
+    monkeypatch.setattr(grid, 'tabulate', tabulate)
     return ids
+
+
+def load_table(model, folder=None):
+    return store.load_table(model, model.beams.id, folder)
+
+
+def table_name(model) -> str:
+    return f'table-{store.table_key(model, model.beams.id)}.npy'
 
 
 def only_file(folder: Path) -> Path:
@@ -42,7 +49,7 @@ def only_file(folder: Path) -> Path:
 
 
 def assert_same(table, model):
-    expected = templates.tabulate(model) | tabulate_surroundings(model)
+    expected = grid.tabulate(model) | tabulate_outside(model)
     assert table.keys() == expected.keys()
     for name, array in expected.items():
         assert table[name].dtype == array.dtype
@@ -51,21 +58,21 @@ def assert_same(table, model):
 
 def test_a_table_is_computed_once_and_then_mapped(tmp_path, model, computed):
     for _ in range(3):
-        table = store.load_table(model, tmp_path / 'new' / 'folder')
+        table = load_table(model, tmp_path / 'new' / 'folder')
         for array in table.values():
             assert array.flags.aligned
             assert not array.flags.writeable
             while not isinstance(array, np.memmap):
                 array = array.base
-    assert computed == [model.codebook.id]
+    assert computed == [model.beams.id]
     assert_same(table, model)
-    assert only_file(tmp_path / 'new' / 'folder').name == f'table-{store.table_key(model)}.npy'
+    assert only_file(tmp_path / 'new' / 'folder').name == table_name(model)
 
 
 def test_without_a_folder_no_table_is_kept(tmp_path, model, computed, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    store.load_table(model)
-    store.load_table(model)
+    load_table(model)
+    load_table(model)
     assert len(computed) == 2
     assert not list(tmp_path.iterdir())
 
@@ -92,29 +99,29 @@ def flip_bit(share):
 ], ids=['truncated', 'magic', 'header', 'middle', 'end', 'empty', 'text', 'array', 'pickle',
         'folder'])
 def test_a_damaged_table_is_computed_again(tmp_path, model, computed, damage, recwarn):
-    store.load_table(model, tmp_path)
+    load_table(model, tmp_path)
     damage(only_file(tmp_path))
-    assert_same(store.load_table(model, tmp_path), model)
-    assert computed[:2] == [model.codebook.id] * 2
+    assert_same(load_table(model, tmp_path), model)
+    assert computed[:2] == [model.beams.id] * 2
 
 
 def test_a_table_of_another_codebook_or_scenario_is_not_used_under_a_wrong_name(
         tmp_path, scenario, model, computed, random_beams):
-    others = [WhitenedModel(scenario, random_beams(scenario, np.random.default_rng(1))),
-              WhitenedModel(Scenario(**scenario.changes() | {'noise_psd_dbm_hz': -170.0}),
-                            model.codebook)]
-    store.load_table(model, tmp_path)
+    others = [MeasurementModel(scenario, random_beams(scenario, np.random.default_rng(1))),
+              MeasurementModel(Scenario(**scenario.changes() | {'noise_psd_dbm_hz': -170.0}),
+                            model.beams)]
+    load_table(model, tmp_path)
     first = only_file(tmp_path)
     for other in others:
-        shutil.copy(first, tmp_path / f'table-{store.table_key(other)}.npy')
-        assert_same(store.load_table(other, tmp_path), other)
+        shutil.copy(first, tmp_path / table_name(other))
+        assert_same(load_table(other, tmp_path), other)
     assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_estimates_with_a_table_from_disk_are_identical(tmp_path, scenario, model):
-    received = simulate_pairs(scenario, model.codebook, 10, 0)[1]
+    received = simulate_pairs(scenario, model.beams, 10, 0)[1]
     estimates = [
-        make_estimator('bayes', scenario, model.codebook, **options).estimate(received)
+        make_estimator('bayes', scenario, model.beams, **options).estimate(received)
         for options in ({}, {'table_folder': tmp_path}, {'table_folder': tmp_path})]
     for other in estimates[1:]:
         np.testing.assert_array_equal(other.mean, estimates[0].mean)
@@ -124,7 +131,7 @@ def test_estimates_with_a_table_from_disk_are_identical(tmp_path, scenario, mode
 def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, model):
     (tmp_path / 'file').write_text('')
     with pytest.warns(RuntimeWarning, match='the table cannot be stored: .*file'):
-        assert_same(store.load_table(model, tmp_path / 'file'), model)
+        assert_same(load_table(model, tmp_path / 'file'), model)
 
 
 def test_a_failed_write_leaves_no_file(tmp_path, model, monkeypatch):
@@ -132,7 +139,7 @@ def test_a_failed_write_leaves_no_file(tmp_path, model, monkeypatch):
         raise OSError('disk full')
     monkeypatch.setattr(os, 'replace', replace)
     with pytest.warns(RuntimeWarning, match='disk full'):
-        store.load_table(model, tmp_path)
+        load_table(model, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -143,9 +150,9 @@ def test_the_oldest_tables_are_deleted(tmp_path, model, monkeypatch):
         (tmp_path / name).write_text('')
         os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
     (tmp_path / 'other.npy').write_text('')
-    store.load_table(model, tmp_path)
+    load_table(model, tmp_path)
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {*names[:2], f'table-{store.table_key(model)}.npy', 'other.npy'}
+    assert left == {*names[:2], table_name(model), 'other.npy'}
 
 
 @pytest.mark.parametrize(('variable', 'expected'), [

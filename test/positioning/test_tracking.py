@@ -236,8 +236,8 @@ def test_an_estimator_of_another_codebook_continues_the_track(table1, tracker, f
     assert error(estimate, START + 1.0 * VELOCITY) < 1.0
 
 
-def test_declared_unknowns_use_the_gaussians_of_the_modes(random_beams):
-    """The exact likelihood has more unknowns than the position."""
+def test_declared_nuisance_parameters_use_the_gaussians_of_the_modes(random_beams):
+    """The exact likelihood has more parameters than the position."""
     scenario = Scenario(
         elements_per_side=6, angular_spread_deg=2.0, roi_center_m=(4, 0, 0),
         roi_size_m=(2, 2, 1), center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), phase_std_rad=0.3)
@@ -270,9 +270,3 @@ def test_correlated_multipath_does_not_narrow_the_covariance(table1_estimator, s
         again = tracker.update(k * 1e-4, signals)
     assert np.trace(again.covariance) > 0.8 * np.trace(first.covariance)
     assert again.n_phases == 1
-
-
-@pytest.mark.parametrize('values', [{'speed_mps': 0.0}, {'memory_s': np.inf}, {'turn_s': -1.0}])
-def test_an_invalid_motion_is_an_error(values):
-    with pytest.raises(ValueError, match=f'{next(iter(values))}: .*, expected a positive number'):
-        Motion(**values)

@@ -9,17 +9,18 @@ from collections.abc import Callable
 import numpy as np
 
 from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments import AppliedBeams
 from rhs_isac_ros.model.los import los_derivative, los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     measurement_correlation,
     multipath_covariance,
 )
-from rhs_isac_ros.positioning.modes import find_modes
-from rhs_isac_ros.positioning.samples import draw_samples
-from rhs_isac_ros.positioning.table import TemplateTable
-from rhs_isac_ros.positioning.templates import tabulate
+from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
+from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
+from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
+from rhs_isac_ros.positioning.search import find_modes
 
 # Positions whose mean signals determine the subspace of all mean signals, and its accuracy: the
 # largest whitened amplitude outside of it.
@@ -31,7 +32,7 @@ class ArrayReceiver:
     """Whitened signals of a receiver, reduced to the subspace of its mean signals.
 
     The reduction keeps everything that the signals contain about the position. It has the
-    interface of `WhitenedModel` that the search for modes needs.
+    interface of `MeasurementModel` that the search for modes needs.
 
     Parameters
     ----------
@@ -116,17 +117,32 @@ class ArrayReceiver:
         return means + complex_normal(means.shape, rng)
 
 
+class ArrayLikelihood(Likelihood):
+    """The likelihood of a receiver's signals, which are white, without impairments."""
+
+    def __init__(self, receiver: ArrayReceiver) -> None:
+        self.scenario = scenario = receiver.scenario
+        self.model = receiver
+        dark = AppliedBeams(
+            np.zeros((scenario.n_bands, scenario.n_frames, scenario.n_elements)),
+            np.zeros((scenario.n_bands, scenario.n_subbands, scenario.n_frames,
+                      scenario.n_feeds)))
+        # The prior of no parameters is the same for all beams.
+        self.nuisance = NuisancePrior(MeasurementModel(scenario, dark))
+
+
 def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray:
     """Compute the posterior means of positioning phases as `bayes` does, float64 [N, 3] [m].
 
     Every mode of the likelihood contributes with the mass of its Gaussian inside the region.
     """
-    table = TemplateTable(receiver.scenario, tabulate(receiver))
+    likelihood = ArrayLikelihood(receiver)
+    grid = TemplateTable(receiver.scenario, tabulate(receiver))
     means = []
-    for signals in received:
-        modes = find_modes(receiver, table, signals)
-        positions, log_weights, _ = draw_samples(
-            modes, table.normal, receiver.scenario.roi_bounds_m)
-        weights = np.exp(log_weights - log_weights.max()).ravel()
-        means.append(weights @ positions.reshape(-1, 3) / weights.sum())
-    return np.array(means)
+    for start in range(0, len(received), _BLOCK):
+        signals = received[start:start + _BLOCK]
+        modes = find_modes(
+            likelihood, grid, Signals(signals, signals), np.zeros((len(signals), 0)))
+        samples = draw_samples(modes, grid.normal, receiver.scenario.roi_bounds_m)
+        means.append(WeightedSamples.of(samples, modes).moments()[0])
+    return np.concatenate(means)

@@ -6,18 +6,18 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments.resampling import reduction
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.imperfections import SurfaceImperfection
+from rhs_isac_ros.model import ElementErrors, Scenario
 from rhs_isac_ros.positioning import Estimate, exhaustive_posterior
-from rhs_isac_ros.positioning.exhaustive_failures import posterior_with_truth
+from rhs_isac_ros.positioning.failures import can_enumerate
+from rhs_isac_ros.positioning.reference import posterior_with_truth
 
 
 def reference_means(
         scenario: Scenario, codebook: Codebook, positions: np.ndarray, received: np.ndarray,
-        surfaces: list[SurfaceImperfection | None], log2_points: int) -> np.ndarray:
+        surfaces: list[ElementErrors | None], log2_points: int) -> np.ndarray:
     """Compute the means of the reference from two sets of points, float64 [2, N, 3] [m]."""
     known = [surface for surface in surfaces if surface]
-    if scenario.failed_element_share:
+    if can_enumerate(scenario):
         return np.tile(
             posterior_with_truth(scenario, codebook, received, known, positions).mean, (2, 1, 1))
     return np.stack([

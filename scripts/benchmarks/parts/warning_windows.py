@@ -6,7 +6,7 @@ import numpy as np
 
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.positioning import Estimate
-from rhs_isac_ros.positioning.residual_monitor import WINDOW, ResidualMonitor
+from rhs_isac_ros.positioning.innovation_test import WINDOW, InnovationTest
 
 
 def warnings(estimate: Estimate, n_windows: int) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def warnings(estimate: Estimate, n_windows: int) -> dict[str, Any]:
 
 def first_warning(residuals: np.ndarray) -> int | None:
     """Return the number of phases until the monitor warns; None if it does not."""
-    monitor = ResidualMonitor()
+    monitor = InnovationTest()
     for count, (energy, expected) in enumerate(residuals.tolist(), 1):
         monitor.add(energy, expected)
         if monitor.drifts:

@@ -19,7 +19,7 @@ from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
 from rhs_isac_ros.positioning import BayesEstimator, Motion
-from rhs_isac_ros.positioning.samples import draw_samples
+from rhs_isac_ros.positioning.posterior import draw_samples
 
 EPOCH = datetime.datetime(2000, 1, 1)
 # Rows of the position in a state (x, vx, y, vy, z, vz).
@@ -29,7 +29,7 @@ POSITION, VELOCITY = [0, 2, 4], [1, 3, 5]
 class Likelihood(MeasurementModel):
     """The likelihood of whitened signals, a vector, at the positions of particles."""
 
-    model: object = Property(doc='WhitenedModel')
+    model: object = Property(doc='Mean and covariance of the signals')
     bounds: np.ndarray = Property(doc='Corners of the region')
 
     @property
@@ -50,17 +50,20 @@ class Likelihood(MeasurementModel):
     def function(self, state, noise=False, **kwargs):
         """Return the mean of the whitened signals."""
         positions = np.asarray(state.state_vector)[POSITION].T.astype(float)
-        return self.model.mean(positions).reshape(len(positions), -1).T
+        return self._whitened_means(positions).T
 
     def logpdf(self, state1, state2, **kwargs):
         """Return the log-likelihood of the particles, up to a constant."""
         positions = np.asarray(state2.state_vector)[POSITION].T.astype(float)
         inside = ((positions >= self.bounds[0]) & (positions <= self.bounds[1])).all(axis=1)
         result = np.full(len(positions), -1e6)
-        means = self.model.mean(positions[inside]).reshape(inside.sum(), -1)
+        means = self._whitened_means(positions[inside])
         signals = np.asarray(state1.state_vector).ravel()
         result[inside] = -np.sum(np.abs(signals - means)**2, axis=1)
         return result
+
+    def _whitened_means(self, positions):
+        return self.model.whiten(self.model.mean(positions)).reshape(len(positions), -1)
 
     def pdf(self, state1, state2, **kwargs):
         """Return the likelihood."""
@@ -125,7 +128,7 @@ class ParticleFilter:
         self._predictor = ParticlePredictor(
             Turns(straight=straight, motion=motion, rng=self._rng))
         self._likelihood = Likelihood(
-            model=estimator.exact_model, bounds=estimator.scenario.roi_bounds_m)
+            model=estimator.exact_likelihood.model, bounds=estimator.scenario.roi_bounds_m)
         self._updater = ParticleUpdater(self._likelihood, ESSResampler())
         self._state: ParticleState | None = None
 

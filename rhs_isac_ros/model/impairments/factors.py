@@ -1,0 +1,162 @@
+"""The impairments of users and cycles that scenario fields declare, and random draws of all."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from rhs_isac_ros.model import plugins
+from rhs_isac_ros.model.geometry import subband_frequencies_hz
+from rhs_isac_ros.model.impairments.elements import ElementErrors, draw_surface, has_errors
+from rhs_isac_ros.model.impairments.impairment import Impairment, Linear, Nuisance, Scope
+from rhs_isac_ros.model.scenario import Scenario
+
+# Nepers per decibel of an amplitude gain.
+_NEPERS_PER_DB = np.log(10) / 20
+
+
+def _gain(scenario: Scenario) -> np.ndarray:
+    return np.ones((1, *_shape(scenario)), complex)
+
+
+def _phase(scenario: Scenario) -> np.ndarray:
+    return np.full((1, *_shape(scenario)), 1j)
+
+
+def _phase_of_each_band(scenario: Scenario) -> np.ndarray:
+    return 1j * np.eye(scenario.n_bands)[:, :, None] * np.ones(_shape(scenario))
+
+
+def _carrier_offset(scenario: Scenario) -> np.ndarray:
+    frames = np.arange(scenario.n_frames) * scenario.frame_duration_s
+    return 2j * np.pi * np.broadcast_to(
+        np.tile(frames, scenario.n_subbands), (1, *_shape(scenario)))
+
+
+def _timing_offset(scenario: Scenario) -> np.ndarray:
+    centers = np.array(scenario.center_frequencies_hz)[:, None]
+    offsets = subband_frequencies_hz(scenario) - centers
+    return -2j * np.pi * np.repeat(offsets, scenario.n_frames, axis=1)[None]
+
+
+def _shape(scenario: Scenario) -> tuple[int, int]:
+    return scenario.n_bands, scenario.n_subbands * scenario.n_frames
+
+
+@dataclasses.dataclass(frozen=True)
+class Factor(Impairment):
+    """Independent values whose standard deviation is a field of the scenario.
+
+    Attributes
+    ----------
+    field
+        The field.
+    patterns
+        Function that returns the exponents per unit of the values.
+    unit
+        Unit of the field, in the unit of the values.
+    needs_search, scope
+        As in `Linear` and `Impairment`.
+    """
+
+    field: str
+    patterns: Callable[[Scenario], np.ndarray]
+    unit: float = 1.0
+    needs_search: bool = False
+    scope: Scope = Scope.CYCLE
+
+    def std(self, scenario: Scenario) -> float:
+        """Return the standard deviation that the scenario declares, in the unit of the values."""
+        return float(getattr(scenario, self.field)) * self.unit
+
+    def size(self, scenario: Scenario) -> int:
+        """Return the number of values: one, or one for each band."""
+        return len(self.patterns(scenario))
+
+    def linear(self, scenario: Scenario) -> Linear:
+        """Return exponents and prior."""
+        patterns = self.patterns(scenario)
+        return Linear(patterns, self.std(scenario) * np.eye(len(patterns)), self.needs_search)
+
+
+BUILT_IN: tuple[Factor, ...] = (
+    Factor('user_gain_std_db', _gain, unit=_NEPERS_PER_DB, scope=Scope.USER),
+    Factor('carrier_offset_std_hz', _carrier_offset, needs_search=True, scope=Scope.USER),
+    Factor('phase_std_rad', _phase),
+    Factor('timing_std_s', _timing_offset, needs_search=True),
+    Factor('band_phase_std_rad', _phase_of_each_band),
+)
+
+
+@functools.lru_cache(maxsize=16)
+def impairments_of(scenario: Scenario) -> tuple[Impairment, ...]:
+    """Return the impairments of the signals that a scenario declares; none for Table I.
+
+    Raises
+    ------
+    PluginError
+        If a plug-in of the field ``impairments`` cannot be loaded, or returns no `Impairment`.
+    """
+    return (*(one for one in BUILT_IN if one.std(scenario) > 0), *_installed(scenario))
+
+
+@functools.lru_cache(maxsize=16)
+def nuisance_of(scenario: Scenario) -> Nuisance:
+    """Return the nuisance parameters of all impairments that a scenario declares."""
+    return Nuisance(scenario, [one.linear(scenario) for one in impairments_of(scenario)])
+
+
+def draw_factors(
+        scenario: Scenario, n: int, user: np.random.Generator, cycle: np.random.Generator
+) -> np.ndarray | None:
+    """Draw the factors of the signals of n users and cycles, complex128 [n, N_B, N_SB F].
+
+    Impairments of users and of cycles have a generator each. The values of a built-in impairment
+    do not depend on what else the scenario declares. The result is None if nothing is declared.
+    """
+    declared = impairments_of(scenario)
+    if not declared:
+        return None
+    generators = {Scope.USER: user, Scope.CYCLE: cycle}
+    # A plug-in may be unhashable.
+    values: dict[int, np.ndarray] = {}
+    for group in (BUILT_IN, _installed(scenario)):
+        for scope, rng in generators.items():
+            members = [one for one in group if one.scope is scope]
+            sizes = [one.size(scenario) for one in members]
+            white = np.split(rng.standard_normal((n, sum(sizes))), np.cumsum(sizes), axis=1)
+            values |= {id(one): one.values(scenario, part)
+                       for one, part in zip(members, white, strict=False) if one in declared}
+    return nuisance_of(scenario).factors(
+        np.concatenate([values[id(one)] for one in declared], axis=1))
+
+
+def draw_impairments(
+        scenario: Scenario, n: int, rng: np.random.Generator
+) -> tuple[ElementErrors | None, np.ndarray | None]:
+    """Draw a surface, and the factors of the signals of n phases, complex128 [n, N_B, N_SB F].
+
+    Each phase has another user. Either result is None if the scenario does not declare it. The
+    numbers come from children of the generator, so that those which it yields itself, of
+    multipath and noise, do not depend on what is declared.
+    """
+    if not has_errors(scenario) and not impairments_of(scenario):
+        return None, None
+    of_surface, of_users = rng.spawn(2)
+    surface = draw_surface(scenario, of_surface) if has_errors(scenario) else None
+    return surface, draw_factors(scenario, n, of_users, of_users)
+
+
+def _installed(scenario: Scenario) -> tuple[Impairment, ...]:
+    return tuple(_load(name, strength) for name, strength in scenario.impairments)
+
+
+@functools.lru_cache(maxsize=16)
+def _load(name: str, strength: float) -> Impairment:
+    made = plugins.make(plugins.IMPAIRMENTS, name, strength)
+    if not isinstance(made, Impairment):
+        raise plugins.PluginError(
+            f'{plugins.describe(plugins.IMPAIRMENTS, name)}: returned {made!r}, expected an '
+            'Impairment')
+    return made

@@ -1,0 +1,108 @@
+"""Positions as range and direction cosines, in which the likelihood is nearly Gaussian.
+
+A point q = (r, u, v) is the position r (w, u, v) with w = sqrt(1 - u^2 - v^2), in front of the
+surface. The signals determine the range to a fraction of a wavelength, but the direction only to
+a fraction of a beam. In Cartesian coordinates, the modes of the likelihood are therefore curved.
+"""
+
+import numpy as np
+
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
+
+# Alternating projections onto the region and onto a sphere, and the distance from the sphere that
+# they may leave.
+_N_PROJECTIONS = 4
+_RANGE_TOLERANCE_M = 0.02
+
+
+def to_positions(points: np.ndarray) -> np.ndarray:
+    """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
+
+    Directions outside the unit circle have x = 0.
+    """
+    distance, u, v = points[..., 0], points[..., 1], points[..., 2]
+    positions = np.empty_like(points, dtype=float)
+    positions[..., 0] = np.sqrt(np.maximum(1 - u**2 - v**2, 0.0))
+    positions[..., 1:] = points[..., 1:]
+    positions *= distance[..., None]
+    return positions
+
+
+def to_polar(positions: np.ndarray) -> np.ndarray:
+    """Convert positions with x > 0, float64 [..., 3] [m], to (r [m], u, v), float64 [..., 3]."""
+    points = np.empty(positions.shape)
+    points[..., 0] = np.sqrt(np.sum(positions**2, axis=-1))
+    points[..., 1:] = positions[..., 1:] / points[..., :1]
+    return points
+
+
+def jacobian(points: np.ndarray) -> np.ndarray:
+    """Compute dp/dq at points (r [m], u, v), float64 [N, 3].
+
+    The result is float64 [N, 3, 3], with the coordinates of the position in rows.
+    """
+    distance, u, v = points.T
+    w = np.sqrt(np.maximum(1 - u**2 - v**2, 1e-9))
+    matrix = np.zeros((len(points), 3, 3))
+    matrix[:, 0, 0], matrix[:, 1, 0], matrix[:, 2, 0] = w, u, v
+    matrix[:, 0, 1], matrix[:, 0, 2] = -distance * u / w, -distance * v / w
+    matrix[:, 1, 1] = matrix[:, 2, 2] = distance
+    return matrix
+
+
+def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
+    """Return the wavenumbers k_i at the bands' centres, float64 [N_B] [1/m]."""
+    return 2 * np.pi * np.array(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS
+
+
+def is_inside(positions: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Return whether positions, float64 [..., 3] [m], are in the region, bool [...].
+
+    The bounds are those of `offset_to_roi`.
+    """
+    low, high = bounds
+    inside = np.ones(positions.shape[:-1], bool)
+    # A reduction over the coordinates takes several times as long.
+    for axis in range(positions.shape[-1]):
+        coordinate = positions[..., axis]
+        inside &= coordinate >= low[axis]
+        inside &= coordinate <= high[axis]
+    return inside
+
+
+def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Compute the offsets from modes to the nearest points of the region of interest.
+
+    The offset follows the sphere of the mode's range, the coordinate that the signals determine
+    best. The range then changes with the direction so that the likelihood is highest.
+
+    Parameters
+    ----------
+    points
+        Modes (r [m], u, v), float64 [M, 3]; the offsets, 0 inside, have the same form.
+    curvature
+        Curvature of the log-likelihood at each mode, float64 [M, 3, 3].
+    bounds
+        Lower and upper corner of the region, float64 [2, 3] [m].
+    """
+    positions = to_positions(points)
+    for _ in range(_N_PROJECTIONS):
+        nearest = to_polar(np.clip(positions, *bounds))
+        offset: np.ndarray = nearest - points
+        nearest[:, 0] = points[:, 0]
+        positions = to_positions(nearest)
+    # The projections leave a small remainder; a larger one means that the sphere does not
+    # intersect the region.
+    excess = np.sign(offset[:, 0]) * np.maximum(np.abs(offset[:, 0]) - _RANGE_TOLERANCE_M, 0.0)
+    coupling = np.einsum('mq,mq->m', curvature[:, 0, 1:], offset[:, 1:]) / curvature[:, 0, 0]
+    offset[:, 0] = excess - coupling
+    return offset
+
+
+def likelihood_loss(offset: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    """Compute the decrease of the log-likelihood over offsets from modes, float64 [M].
+
+    The arguments have the shapes of `offset_to_roi`.
+    """
+    loss: np.ndarray = np.einsum('mp,mpq,mq->m', offset, curvature, offset) / 2
+    return loss

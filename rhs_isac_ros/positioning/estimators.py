@@ -1,0 +1,421 @@
+"""Estimators that search for the modes of the posterior: `bayes` and `ml`."""
+
+import abc
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.measurement import Surface
+from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
+from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
+from rhs_isac_ros.positioning.estimate import (
+    Estimate,
+    Estimator,
+    Located,
+    checked_received,
+    estimate_each,
+)
+from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
+from rhs_isac_ros.positioning.fit import (
+    DOUBT_LIMIT,
+    FitTest,
+    outside_probability,
+    outside_test,
+)
+from rhs_isac_ros.positioning.grid import Starts, TemplateTable, standard_normal
+from rhs_isac_ros.positioning.likelihood import (
+    Alignment,
+    Conditional,
+    DispersedLikelihood,
+    Likelihood,
+    Signals,
+)
+from rhs_isac_ros.positioning.outside import Outside
+from rhs_isac_ros.positioning.posterior import (
+    BandPhases,
+    Doubt,
+    Posterior,
+    Samples,
+    WeightedSamples,
+    draw_broad_samples,
+    draw_samples,
+)
+from rhs_isac_ros.positioning.search import (
+    LONG_SEARCH_STEPS,
+    Modes,
+    ascend,
+    find_modes,
+    first_of_each,
+)
+from rhs_isac_ros.positioning.store import load_table
+
+# Standard deviations of the user's gain that the test of the energy admits.
+_GAIN_REACH = 6
+# Coordinates fitted to the signals of each phase.
+_N_COORDINATES = 3
+# Number of phases that are located together.
+_BLOCK = 128
+# Samples of a mode if the phases of the bands carry information: their density has several peaks
+# within a mode, so that fewer samples have most of the weight.
+_N_INFORMATIVE = 512
+
+
+class _Search(NamedTuple):
+    """The result of a search for several phases.
+
+    Attributes
+    ----------
+    modes
+        Modes of all phases.
+    samples
+        Their samples.
+    whitened
+        Whitened signals without the parameters that they reveal, complex128 [N, N_B, N_SB F].
+    outside
+        Logarithm of the evidence for a user outside of the region, and the most probable factor
+        of the signals there, for each phase.
+    """
+
+    modes: Modes
+    samples: Samples
+    whitened: np.ndarray
+    outside: list[tuple[float, float]]
+
+
+class SearchEstimator(abc.ABC):
+    """An estimator from the modes of the posterior, for a uniform prior on the region of interest.
+
+    Signals that the model cannot explain at the best mode give no fix; see `fit`. Tables are kept
+    in `table_folder` between runs.
+
+    Parameters
+    ----------
+    reject_outside
+        Whether the user may also be outside of the region; see `outside`. If this is almost
+        certain (`fit.OUTSIDE_LIMIT`), there is no fix either. If it is merely possible
+        (`fit.DOUBT_LIMIT`), the covariance includes the positions outside, while the position
+        remains that of a user inside.
+    surface
+        What is known of the surface, as in `MeasurementModel`; for example a calibration.
+
+    Raises
+    ------
+    CodebookError
+        If the codebook does not fit the scenario.
+    """
+
+    @one_blas_thread
+    def __init__(
+            self, scenario: Scenario, codebook: Codebook,
+            table_folder: Path | None = None, *, reject_outside: bool = False,
+            surface: Surface | None = None) -> None:
+        self._rejects_outside = reject_outside
+        self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
+        arrays = load_table(likelihood.model, codebook.id, table_folder)
+        self._grid = TemplateTable(scenario, arrays)
+        self._outside = Outside(scenario, arrays)
+        prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
+        self._test = FitTest(n_measurements)
+        self._bounds = scenario.roi_bounds_m
+        self._volume_m3 = float(np.prod(scenario.roi_size_m))
+        self._alignment = Alignment(likelihood, self._grid.filters)
+        self._phases = BandPhases(likelihood)
+        self._failures = (FailedElements(likelihood, self._grid)
+                          if surface is None and can_enumerate(scenario) else None)
+        self._dispersed = None if self._failures else DispersedLikelihood.of(likelihood)
+        # Weak signals may be those of a user with a low gain.
+        self._max_power = np.exp(2 * _GAIN_REACH * prior.gain_std)
+        # Twice an energy has two degrees of freedom for each complex measurement, less one for
+        # each fitted parameter.
+        n_fitted = _N_COORDINATES + len(prior)
+        self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
+        self._normal = (standard_normal(_N_INFORMATIVE) if self._phases.is_informative
+                        else self._grid.normal)
+
+    @one_blas_thread
+    def estimate(self, received: np.ndarray) -> Estimate:
+        """Estimate positions from received signals, as `Estimator.estimate` describes."""
+        return estimate_each(self.scenario, self._likelihood.codebook, received, self._locate)
+
+    @one_blas_thread
+    def posterior(self, received: np.ndarray) -> Posterior:
+        """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F].
+
+        Raises
+        ------
+        SignalError
+            If the signals cannot be used, as in `estimate`.
+        """
+        batch = checked_received(self.scenario, self._likelihood.codebook, received)
+        signals = self._likelihood.signals(batch)
+        ((located, modes, doubt),) = self._locate_block(signals)
+        return Posterior(Estimate(*located), modes, signals, doubt)
+
+    def with_outside(
+            self, mean: np.ndarray, covariance: np.ndarray, doubt: Doubt) -> np.ndarray:
+        """Add positions outside of the region to a covariance about a mean inside, [3, 3]."""
+        moment = self._outside.second_moment(doubt.whitened, mean, doubt.scale)
+        return (1 - doubt.probability) * covariance + doubt.probability * moment
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Points that represent a standard Gaussian, float64 [128, 3]."""
+        return self._grid.normal
+
+    @property
+    def exact_likelihood(self) -> Likelihood | None:
+        """The likelihood of positions; None if it also depends on other unknowns."""
+        is_exact = not (len(self._likelihood.nuisance) or self._failures or self._dispersed)
+        return self._likelihood if is_exact else None
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the signals."""
+        return self._likelihood.scenario
+
+    @property
+    def surface(self) -> Surface | None:
+        """What the estimator assumes to be known of the surface."""
+        return self._likelihood.surface
+
+    @abc.abstractmethod
+    def _moments(
+            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions, [N, 3], and covariances, [N, 3, 3], of N phases."""
+
+    def _locate(self, batch: np.ndarray) -> Iterable[Located]:
+        signals = self._likelihood.signals(batch)
+        blocks = map_blocks(
+            lambda start: self._locate_block(
+                signals.take(np.arange(start, min(start + _BLOCK, len(batch))))),
+            range(0, len(batch), _BLOCK))
+        return (located for located, _, _ in itertools.chain.from_iterable(blocks))
+
+    def _locate_block(
+            self, signals: Signals) -> list[tuple[Located, Modes | None, Doubt | None]]:
+        """Locate phases together: position or reason, modes if there is a position, and doubt."""
+        energies = np.sum(np.abs(signals.whitened)**2, axis=(1, 2)) * self._max_power
+        reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
+        results: list[tuple[Located, Modes | None, Doubt | None]] = [
+            ((*_no_fix(), reason, np.nan, np.nan), None, None) for reason in reasons]
+        (usable,) = np.nonzero([not reason for reason in reasons])
+        if len(usable):
+            found = self._search(signals.take(usable))
+            for row, result in zip(usable.tolist(), self._judge(found), strict=True):
+                results[row] = result
+        return results
+
+    def _search(self, signals: Signals) -> _Search:
+        """Search for the modes of N phases."""
+        likelihood = self._likelihood
+        aligned = self._alignment.values_of_each(signals.received)
+        extra = self._failures.search_margin if self._failures else 0.0
+        modes = find_modes(likelihood, self._grid, signals, aligned, extra_margin=extra)
+        if not self._failures and not self._dispersed:
+            modes = self._continued(modes, signals, aligned)
+        conditionals: list[Sequence[Conditional]] = [[likelihood]] * len(aligned)
+        if self._dispersed:
+            starts = Starts(modes.phases, modes.roi_points, modes.values)
+            modes = ascend(self._dispersed, likelihood, starts, signals, 1, np.inf)
+        if self._failures:
+            refined = [self._failures.refine(modes.of_phase(phase), signals.repeated(phase))
+                       for phase in range(len(aligned))]
+            modes = _joined([one for one, _ in refined])
+            conditionals = [sets for _, sets in refined]
+        if likelihood.nuisance.is_coarse:
+            samples = Samples(*(np.concatenate(fields) for fields in zip(*(
+                draw_broad_samples(likelihood, conditionals[phase], self._phases,
+                                   signals.repeated(phase), modes.of_phase(phase), self._normal)
+                for phase in range(len(aligned))), strict=True)))
+        else:
+            samples = draw_samples(modes, self._normal, self._bounds)
+        whitened = likelihood.whitened(aligned, signals)
+        outside = [(-np.inf, 1.0)] * len(aligned)
+        if self._rejects_outside:
+            outside = [self._outside.log_evidence_of(*phase, likelihood.nuisance)
+                       for phase in zip(whitened, aligned, strict=True)]
+        return _Search(modes, samples, whitened, outside)
+
+    def _continued(self, modes: Modes, signals: Signals, aligned: np.ndarray) -> Modes:
+        """Search longer in phases whose signals are not explained.
+
+        Strong signals may need more steps to reach the maximum.
+        """
+        starts = first_of_each(modes.phases)
+        best = np.minimum.reduceat(modes.residual, starts)
+        again = np.flatnonzero([self._test.residual_test(energy) for energy in best.tolist()])
+        if not len(again):
+            return modes
+        longer = find_modes(self._likelihood, self._grid, signals.take(again), aligned[again],
+                            LONG_SEARCH_STEPS)
+        return _joined([
+            longer.of_phase(int(np.searchsorted(again, phase))) if phase in again
+            else modes.of_phase(phase) for phase in range(len(aligned))])
+
+    def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None, Doubt | None]]:
+        """Yield the position of each phase, or why there is none, its modes and the doubt."""
+        modes = found.modes
+        samples = WeightedSamples.of(found.samples, modes)
+        evidence = samples.log_evidence(self._volume_m3)
+        means, covariances = self._moments(modes, samples)
+        # Averaged over the posterior, the energy of a model that holds has the mean of a
+        # chi-square variable. At the best of several modes it is smaller, by the difference from
+        # the average.
+        expected = self._mean_residual - samples.average(modes.residual)
+        likelihood = modes.roi_log_likelihood
+        ends = [*samples.starts[1:].tolist(), len(modes.phases)]
+        for row, (start, end) in enumerate(zip(samples.starts.tolist(), ends, strict=True)):
+            residual = float(modes.residual[start + np.argmax(likelihood[start:end])])
+            outside = outside_probability(evidence[row] - found.outside[row][0])
+            located, doubt = self._conclude(
+                found, row, residual, expected[row] + residual, outside,
+                (means[row], covariances[row]))
+            yield located, None if located[2] else modes.select(slice(start, end)), doubt
+
+    def _conclude(
+            self, found: _Search, row: int, residual: float, expected: float, outside: float,
+            moments: tuple[np.ndarray, np.ndarray]) -> tuple[Located, Doubt | None]:
+        """Return a position, or why there is none, and the doubt."""
+        whitened, scale = found.whitened[row], found.outside[row][1]
+        reason = self._reason(whitened, residual, outside)
+        if reason:
+            moments = _no_fix()
+        doubt = None
+        if outside > DOUBT_LIMIT and not self._test.residual_test(residual) == reason != '':
+            expected = np.nan
+            if not reason:
+                doubt = Doubt(outside, whitened, scale)
+                moments = moments[0], self.with_outside(*moments, doubt)
+        return (*moments, reason, residual, expected), doubt
+
+    def _reason(self, whitened: np.ndarray, residual: float, outside: float) -> str:
+        """Return why there is no fix, empty if there is one.
+
+        If no position of the region explains the signals, one outside has to explain them for
+        the user to be there.
+        """
+        unexplained = self._test.residual_test(residual)
+        if not self._rejects_outside or unexplained and not self._outside.explain(
+                whitened, self._test.max_residual):
+            return unexplained
+        return outside_test(outside) or unexplained
+
+
+class BayesEstimator(SearchEstimator):
+    """Estimates mean and covariance of the posterior; the prior is uniform on the region.
+
+    The grid gives the modes, Gauss-Newton steps on the exact near-field model refine them, and
+    every mode contributes with the mass of its Gaussian inside the region. Parameters and errors
+    are those of `SearchEstimator`.
+    """
+
+    name = 'bayes'
+
+    def _moments(
+            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+        mean, covariance = samples.moments()
+        # The mean of few samples is itself uncertain; its covariance never exceeds that of the
+        # prior.
+        prior = np.diag((self._bounds[1] - self._bounds[0])**2 / 12)
+        within = samples.average(np.matmul(samples.spread, np.swapaxes(samples.spread, 1, 2)))
+        within = within @ np.linalg.solve(within + prior, np.broadcast_to(prior, within.shape))
+        share = samples.sums(np.einsum('ms,ms->m', samples.weights, samples.weights))
+        covariance += within * share[:, None, None]
+        return mean, (covariance + np.swapaxes(covariance, 1, 2)) / 2
+
+
+class MlEstimator(SearchEstimator):
+    """The most likely position in the region of interest.
+
+    The covariance is the inverse curvature of the log-likelihood there and does not account for
+    other modes. Parameters and errors are those of `SearchEstimator`.
+    """
+
+    name = 'ml'
+
+    def _moments(
+            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+        order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
+        best = order[samples.starts]
+        points = modes.roi_points[best]
+        by_point = jacobian(points)
+        covariance = np.matmul(
+            by_point, np.linalg.solve(modes.curvature[best], np.swapaxes(by_point, 1, 2)))
+        positions = np.clip(to_positions(points), *self._bounds)
+        return positions, (covariance + np.swapaxes(covariance, 1, 2)) / 2
+
+
+class WeightedModes(NamedTuple):
+    """The posterior as a mixture of M components, the most probable first.
+
+    Attributes
+    ----------
+    probabilities
+        Float64 [M]; their sum is 1.
+    positions
+        Means of the components, float64 [M, 3] [m].
+    covariances
+        Float64 [M, 3, 3] [m^2].
+    """
+
+    probabilities: np.ndarray
+    positions: np.ndarray
+    covariances: np.ndarray
+
+
+@one_blas_thread
+def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
+    """Compute the modes of the posterior for the signals of one phase.
+
+    Mean and covariance of the mixture are those of the estimate of `BayesEstimator`, up to the
+    uncertainty of the mean of its samples.
+
+    Parameters
+    ----------
+    received
+        Complex128 [N_B, N_SB F], or [N_B, N_SB, F].
+
+    Returns
+    -------
+    WeightedModes or None
+        None if the signals determine no position.
+
+    Raises
+    ------
+    SignalError
+        If the signals cannot be used.
+    """
+    modes = estimator.posterior(received.reshape(len(received), -1)).modes
+    if modes is None:
+        return None
+    samples = draw_samples(modes, estimator.normal, estimator.scenario.roi_bounds_m)
+    weights = np.exp(samples.log_weights - samples.log_weights.max())
+    shares = weights.sum(axis=1)
+    order = np.argsort(-shares)[:np.count_nonzero(shares)]
+    shares, places = shares[order], samples.positions[order]
+    weights = weights[order] / shares[:, None]
+    means = np.einsum('ms,msa->ma', weights, places)
+    offsets = places - means[:, None]
+    covariances = np.einsum('ms,msa,msb->mab', weights, offsets, offsets)
+    return WeightedModes(shares / shares.sum(), means, covariances)
+
+
+def surface_of(estimator: Estimator) -> Surface | None:
+    """Return what an estimator assumes to be known of the surface; None for other estimators."""
+    return estimator.surface if isinstance(estimator, SearchEstimator) else None
+
+
+def _joined(parts: Sequence[Modes]) -> Modes:
+    """Join the modes of successive phases, which each part counts from 0."""
+    numbered = [one._replace(phases=np.full(len(one.phases), phase))
+                for phase, one in enumerate(parts)]
+    return Modes(*(np.concatenate(fields) for fields in zip(*numbered, strict=True)))
+
+
+def _no_fix() -> tuple[np.ndarray, np.ndarray]:
+    return np.full(3, np.nan), np.full((3, 3), np.nan)

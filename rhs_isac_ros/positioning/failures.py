@@ -1,0 +1,561 @@
+"""Modes of the posterior as a mixture over sets of failed elements.
+
+`DispersedLikelihood` replaces the mixture by one Gaussian for each number of failures, which
+discards what the signals reveal about the set: a single failure is far above the nulls of the
+multipath. Here, the sets with a substantial weight are found by adding elements to the most
+probable sets, one at a time.
+
+A failed element is stuck at an amplitude that is uniform in [0, 1]. With its amplitude treated as
+Gaussian, of mean 1/2 and variance 1/12, the signals are Gaussian. The amplitude is one more
+unknown of the direct path, in which the mean is linear; its variance adds to the covariance of the
+multipath.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments.elements import (
+    DeclaredElements,
+    ElementErrors,
+    element_correlation,
+)
+from rhs_isac_ros.model.los import los_and_derivative, los_gain
+from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
+from rhs_isac_ros.model.surface import onboard_matrix
+from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
+from rhs_isac_ros.positioning.grid import Starts, TemplateTable
+from rhs_isac_ros.positioning.likelihood import (
+    Likelihood,
+    Local,
+    NuisancePrior,
+    Signals,
+    assemble,
+    log_determinant,
+)
+from rhs_isac_ros.positioning.search import Modes, ascend, predict
+
+# Largest expected number of failures for which sets are searched.
+_MAX_EXPECTED = 2.0
+# Probability that an intact surface has a higher residual than the usual one, and the number of
+# modes from which sets are searched below that residual.
+_UNUSUAL = 0.01
+_N_USUAL = 2
+# Points of the table and their margin, besides the modes, and sites to search from otherwise.
+_MAX_POINTS = 64
+_POINT_MARGIN = 30.0
+_N_SITES = 64
+# Shares of further failures that order the sets, and numbers of sets of the same size to extend,
+# in a first search and in those that follow while the most probable set is large: almost all sets
+# that the first search finds instead of the true one are large.
+_SEARCHES = ((0.3, 8), (1.0, 16), (0.1, 16))
+_LARGE_SET = 3
+# Largest number of further searches, each under the most probable set, and their points.
+_MAX_SEARCHES = 2
+_N_PEAKS = 16
+_N_GROWN = 3
+# Sets to try at all sites.
+_N_SETS = 4
+# Hypotheses whose log-probability is lower than the best by more than this are dropped, before
+# and after the first exact step, and the number of those that remain.
+_MARGIN = 9.0
+_FIRST_MARGIN = 27.0
+_MAX_HYPOTHESES = 48
+_N_STEPS = 2
+# Hypotheses to extend, of each set and of each site; and of the extended sets, those to weigh
+# exactly.
+_MAX_PER_SET = 3
+_MAX_PER_SITE = 4
+_N_EXACT = 16
+# Largest number of elements by which a set grows.
+_MAX_GROWTH = 6
+# Number of sets whose covariance is kept.
+_MAX_SURFACES = 256
+
+# A set of failed elements and the index of a site.
+Key: TypeAlias = tuple[tuple[int, ...], int]
+
+
+def can_enumerate(scenario: Scenario) -> bool:
+    """Return whether a scenario declares failures so rare that their sets can be searched."""
+    return 0 < scenario.failed_element_share * scenario.n_elements <= _MAX_EXPECTED
+
+
+class FailedElements:
+    """The posterior of positions if a few elements of the surface may have failed.
+
+    Attributes
+    ----------
+    search_margin
+        Extra margin of the search for modes, whose average over sets misjudges each set.
+    """
+
+    search_margin = 10.0
+
+    def __init__(self, likelihood: Likelihood, grid: TemplateTable) -> None:
+        # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
+        from scipy.special import gammainccinv
+
+        self._likelihood, self._grid = likelihood, grid
+        self._model = FailureModel(likelihood)
+        self._usual_residual = float(gammainccinv(np.prod(likelihood.model.shape), _UNUSUAL))
+
+    def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
+        """Return a mode of one phase for every probable set, and the likelihoods of the sets.
+
+        The most likely comes first. Likelihoods are relative to those of the search. The modes
+        are those of the search, and the signals those of the phase, N = 1.
+        """
+        search = self._search(modes, signals)
+        return self._converge(search, signals)
+
+    def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
+        """Search for probable sets at the modes and elsewhere."""
+        order = np.argsort(-modes.roi_log_likelihood)
+        search = FailureSearch(self._model, signals, _MARGIN, self._usual_residual)
+        keys = search.add(modes.roi_points[order], modes.values[order])
+        if search.explains(keys):
+            search.grow(keys[:_N_USUAL])
+        else:
+            aligned = self._aligned(modes.values[order[0]])
+            keys = [((), index) for index in range(len(search.sites))]
+            found = self._grid.starts(
+                self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
+                _POINT_MARGIN)
+            keys += search.add(found.points[:_MAX_POINTS], found.values[:_MAX_POINTS] + aligned)
+            for remainder, n_extended in _SEARCHES:
+                search.grow(keys[:_N_SITES], remainder, n_extended)
+                self._search_again(search, signals)
+                if len(search.best[0]) < _LARGE_SET:
+                    break
+        search.try_neighbours(search.best)
+        return search
+
+    def _search_again(self, search: 'FailureSearch', signals: Signals) -> None:
+        """Add sites that are probable under a set, which the average over sets may miss."""
+        for _ in range(_MAX_SEARCHES):
+            failed, index = search.best
+            aligned = self._aligned(search.sites[index].values)
+            found = self._grid.starts_under(
+                self._likelihood.whitened(aligned, signals)[0], self._likelihood.nuisance,
+                self._model.search_factor(failed), _N_PEAKS)
+            keys = search.add(found.points, found.values + aligned, failed)
+            search.grow(keys[:_N_GROWN])
+            if search.best[0] == failed:
+                break
+
+    def _aligned(self, values: np.ndarray) -> np.ndarray:
+        """Return the parameters [Q] that a search on the grid must know, and 0 for the others."""
+        result: np.ndarray = values * self._likelihood.nuisance.moves_multipath
+        return result
+
+    def _converge(self, search: 'FailureSearch', signals: Signals
+                  ) -> tuple[Modes, list['FailedSet']]:
+        """Take exact steps from the most probable hypotheses."""
+        values, best = search.values, max(search.values.values())
+        keys = sorted((key for key in values if values[key] >= best - _MARGIN),
+                      key=lambda key: -values[key])[:_MAX_HYPOTHESES]
+        # The most probable sets are tried at the other sites, too.
+        sets = list(dict.fromkeys(failed for failed, _ in keys))
+        everywhere = range(len(search.sites))
+        parts, conditionals = [], []
+        for number, failed in enumerate(sets):
+            own = [index for one, index in keys if one == failed]
+            tried = everywhere if number < _N_SETS else own
+            sites = [search.sites[index] for index in tried]
+            starts = Starts(np.zeros(len(sites), int), np.stack([one.point for one in sites]),
+                            np.stack([one.values for one in sites]))
+            conditional = self._model.failed_set(failed)
+            conditionals.append(conditional)
+            parts.append(ascend(conditional, self._likelihood, starts, signals, _N_STEPS,
+                                _FIRST_MARGIN, number))
+        modes = Modes(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+        order = np.argsort(-modes.roi_log_likelihood)[:_MAX_HYPOTHESES]
+        return modes.select(order), conditionals
+
+
+class Surface(NamedTuple):
+    """A set of failed elements.
+
+    Attributes
+    ----------
+    failed
+        The elements, in ascending order.
+    scattered
+        T V, complex128 [N_B, N_SB F, N_E].
+    covariance
+        Covariance of the signals given the amplitudes of the direct path, complex128
+        [N_B, N_SB F, N_SB F].
+    """
+
+    failed: tuple[int, ...]
+    scattered: np.ndarray
+    covariance: np.ndarray
+
+    def whitening(self, prior: NuisancePrior) -> 'Whitening':
+        """Factor the covariance."""
+        roots = np.linalg.cholesky(self.covariance)
+        whitener = np.linalg.inv(roots)
+        return Whitening(whitener[:, None], log_determinant(roots).sum(keepdims=True),
+                         prior.information_of(roots, whitener))
+
+
+class Whitening(NamedTuple):
+    """Factors of the covariances of H sets.
+
+    Attributes
+    ----------
+    whitener
+        Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
+    log_volume
+        Logarithms of the determinants, float64 [H].
+    information
+        Information of a covariance about the nuisance parameters, float64 [Q, Q].
+    """
+
+    whitener: np.ndarray
+    log_volume: np.ndarray
+    information: np.ndarray
+
+
+class Site(NamedTuple):
+    """The signals of a phase at a point.
+
+    Attributes
+    ----------
+    point, values
+        (r [m], u, v), float64 [3], and nuisance parameters, float64 [Q].
+    columns
+        Residual of an intact surface, and derivatives of the mean with respect to the point and
+        the parameters, complex128 [4 + Q, N_B, N_SB F].
+    changes
+        Changes of the columns if an element fails, complex128 [N_E, 4 + Q, N_B, N_SB F].
+    amplitudes
+        Derivatives with respect to the scaled amplitude of a failed element, complex128
+        [N_E, N_B, N_SB F].
+    """
+
+    point: np.ndarray
+    values: np.ndarray
+    columns: np.ndarray
+    changes: np.ndarray
+    amplitudes: np.ndarray
+
+
+class FailedSet:
+    """The likelihood of positions for a set of failed elements: a `Conditional`.
+
+    Its value includes the prior of the set, and is relative to that of `Likelihood`.
+    """
+
+    def __init__(self, likelihood: Likelihood, surface: Surface, log_prior: float) -> None:
+        self._likelihood, scenario = likelihood, likelihood.scenario
+        self._failed = list(surface.failed)
+        stuck = np.full(scenario.n_elements, np.nan)
+        stuck[self._failed] = 0.5
+        self._model = MeasurementModel(
+            scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck))
+        whitening = surface.whitening(likelihood.nuisance)
+        self._whitener, self._information = whitening.whitener[:, 0], whitening.information
+        self._offset = log_prior + likelihood.log_volume - whitening.log_volume[0]
+        self._amplitudes = _amplitude_weights(likelihood)[self._failed]
+
+    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate points, as `Conditional` describes."""
+        prior, positions, n = self._likelihood.nuisance, to_positions(points), len(points)
+        mean, slopes = self._model.mean_and_jacobian(positions, jacobian(points))
+        divided = prior.divide(signals.received, values)
+        gains = np.stack([
+            np.repeat(los_gain(self._likelihood.scenario, positions, band)[:, :, self._failed],
+                      self._likelihood.scenario.n_frames, axis=1)
+            for band in range(mean.shape[1])])
+        amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
+        columns = np.concatenate([
+            (divided - mean)[:, None], slopes, prior.patterns * mean[:, None], amplitudes,
+            prior.patterns * divided[:, None]], axis=1)
+        white = np.einsum('irs,mcis->mcir', self._whitener, columns, optimize=True)
+        white = white.reshape(n, columns.shape[1], -1)
+        n_expected = 4 + len(prior) + len(self._failed)
+        local = assemble(prior, values, white[:, 0], white[:, 1:n_expected],
+                         white[:, n_expected:], information_of_covariance=self._information,
+                         n_linear=len(self._failed))
+        return local._replace(value=local.value + self._offset)
+
+
+def _amplitude_weights(likelihood: Likelihood) -> np.ndarray:
+    """Weight of each element's direct path per standard deviation of an amplitude.
+
+    Returns complex128 [N_E, N_B, N_SB F].
+    """
+    scenario = likelihood.scenario
+    weights = np.matmul(likelihood.codebook.digital, onboard_matrix(scenario)) / np.sqrt(12)
+    shape = scenario.n_bands, -1, scenario.n_elements
+    return np.ascontiguousarray(np.moveaxis(weights.reshape(shape), 2, 0))
+
+
+class FailureModel:
+    """Likelihood of positions and sets of failed elements under the declared share of failures."""
+
+    def __init__(self, likelihood: Likelihood) -> None:
+        scenario, codebook = likelihood.scenario, likelihood.codebook
+        self.likelihood, self.scenario = likelihood, scenario
+        intact = dataclasses.replace(scenario, failed_element_share=0.0)
+        self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
+        weights = np.matmul(codebook.digital, onboard_matrix(scenario))
+        shift = ((0.5 - codebook.analog[:, None]) * weights).reshape(self._model.radiation.shape)
+        self._shift = np.ascontiguousarray(np.moveaxis(shift, 2, 0))
+        self._amplitudes = _amplitude_weights(likelihood)
+        self._spatial = multipath_covariance(scenario)
+        self._correlation = measurement_correlation(scenario)
+        self._intact = Surface((), np.matmul(self._model.radiation, self._spatial),
+                               self._model.covariance())
+        self._surfaces: dict[tuple[int, ...], Surface] = {}
+        failing = dataclasses.replace(scenario, element_error_rms=0.0)
+        self._error = DeclaredElements(failing).error_covariance(failing, codebook)
+        self._extensions: dict[tuple[tuple[int, ...], float], Whitening] = {}
+        share = scenario.failed_element_share
+        self._log_odds = float(np.log(share / (1 - share)))
+        self._log_intact = scenario.n_elements * float(np.log1p(-share))
+        # The same set is often probable in successive phases.
+        self.failed_set = functools.lru_cache(maxsize=_MAX_SURFACES)(self._failed_set)
+        self._whitening = functools.lru_cache(maxsize=_MAX_SURFACES)(
+            lambda failed: self.surface(failed).whitening(likelihood.nuisance))
+
+    def _failed_set(self, failed: tuple[int, ...]) -> FailedSet:
+        return FailedSet(self.likelihood, self.surface(failed),
+                         len(failed) * self._log_odds + self._log_intact)
+
+    def surface(self, failed: tuple[int, ...]) -> Surface:
+        """Return the surface with these failed elements, in ascending order."""
+        if not failed:
+            return self._intact
+        if failed not in self._surfaces:
+            smaller, element = self.surface(failed[:-1]), failed[-1]
+            shift = self._shift[element]
+            scattered = smaller.scattered + shift[..., None] * self._spatial[:, None, element]
+            growth = self._growth(smaller, slice(element, element + 1))[0]
+            if len(self._surfaces) >= _MAX_SURFACES:
+                self._surfaces.clear()
+            self._surfaces[failed] = Surface(failed, scattered, smaller.covariance + growth)
+        return self._surfaces[failed]
+
+    def site(self, point: np.ndarray, values: np.ndarray, signals: Signals) -> Site:
+        """Evaluate the signals of a phase, N = 1, at a point [3] with parameters [Q]."""
+        prior, position = self.likelihood.nuisance, to_positions(point[None])
+        by_point = jacobian(point[None])
+        mean, slopes = self._model.mean_and_jacobian(position, by_point)
+        divided = prior.divide(signals.received, values)
+        columns = np.concatenate([divided - mean, slopes[0], prior.patterns * mean])
+        gains = []
+        for band in range(self.scenario.n_bands):
+            gain, slope = los_and_derivative(self.scenario, position, band)
+            both = np.concatenate([gain, np.tensordot(by_point[0].T, slope[0], 1)])
+            gains.append(np.repeat(both, self.scenario.n_frames, axis=1))
+        elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
+        changes = elements * self._shift[:, None]
+        changes = np.concatenate([
+            -changes[:, :1], changes[:, 1:], prior.patterns * changes[:, :1]], axis=1)
+        return Site(point, values, columns, changes, elements[:, 0] * self._amplitudes)
+
+    def weigh(self, surface: Surface, site: Site) -> tuple[float, float]:
+        """Return the log-probability of a surface at a site, and its deviance.
+
+        Both are those after a Gauss-Newton step. The log-probability is relative to the prior of
+        an intact surface. The deviance is the energy of the residual plus the cost of the
+        parameters: an unknown gain lowers any energy, at a cost.
+        """
+        failed, whitening = list(surface.failed), self._whitening(surface.failed)
+        columns = site.columns + site.changes[failed].sum(axis=0)
+        columns = np.concatenate([columns, site.amplitudes[failed]])[None]
+        value = float(self._predicted(site, columns, whitening, len(failed))[0])
+        return len(failed) * self._log_odds - float(whitening.log_volume[0]) + value, -value
+
+    def weigh_extensions(self, surface: Surface, site: Site, remainder: float = 0.0) -> np.ndarray:
+        """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
+
+        Besides, further elements may have failed, the declared share times `remainder` of them.
+        They add to the covariance, so that elements which explain a part of the signals have a
+        higher value than elements which imitate the sum.
+        """
+        extended, failed = self._extensions_of(surface.failed, remainder), list(surface.failed)
+        columns = site.columns + site.changes[failed].sum(axis=0)
+        own = np.broadcast_to(site.amplitudes[failed],
+                              (len(site.amplitudes), len(failed), *columns.shape[1:]))
+        parts = np.concatenate([columns + site.changes, own, site.amplitudes[:, None]], axis=1)
+        value = self._predicted(site, parts, extended, len(failed) + 1)
+        result: np.ndarray = (len(failed) + 1) * self._log_odds - extended.log_volume + value
+        return result
+
+    def _predicted(self, site: Site, columns: np.ndarray, whitening: Whitening,
+                   n_failed: int) -> np.ndarray:
+        """Marginal log-likelihood of H hypotheses after a step, without determinants, [H].
+
+        Takes columns [H, C, N_B, N_SB F].
+        """
+        prior, n = self.likelihood.nuisance, len(columns)
+        white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
+        white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
+        values = np.broadcast_to(site.values, (n, len(prior)))
+        local = assemble(prior, values, white[:, 0], white[:, 1:], n_linear=n_failed,
+                         information_of_covariance=whitening.information)
+        return predict(local, self.likelihood)
+
+    def search_factor(self, failed: tuple[int, ...]) -> np.ndarray:
+        """Compute the factor of the inverse covariance of a set for `TemplateTable.starts_under`.
+
+        The failed elements have their second moments, averaged over the region of interest.
+        """
+        covariance = self._intact.covariance.copy()
+        for band, of_band in enumerate(covariance):
+            correlation = element_correlation(self.scenario, band)
+            for element in failed:
+                parts = np.stack(
+                    [self._shift[element, band], self._amplitudes[element, band]], axis=1)
+                of_band += (parts @ parts.conj().T) * correlation[..., element]
+        ratio = np.linalg.solve(np.linalg.cholesky(covariance), self.likelihood.model.root)
+        return np.conj(np.swapaxes(ratio, 1, 2))
+
+    def _extensions_of(self, failed: tuple[int, ...], remainder: float) -> Whitening:
+        if (failed, remainder) not in self._extensions:
+            surface = self.surface(failed)
+            covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
+            covariance += remainder * self._error[:, None]
+            roots = np.linalg.cholesky(covariance)
+            # Those of the intact surface serve all phases; each takes a few megabytes.
+            self._extensions = {key: kept for key, kept in self._extensions.items() if not key[0]}
+            self._extensions[failed, remainder] = Whitening(
+                np.linalg.inv(roots), log_determinant(roots).sum(axis=0),
+                self._whitening(failed).information)
+        return self._extensions[failed, remainder]
+
+    def _growth(self, surface: Surface, elements: slice = slice(None)) -> np.ndarray:
+        """Change of a surface's covariance if an element fails, [N_E, N_B, S, S]."""
+        shift, spread = self._shift[elements], self._amplitudes[elements]
+        power = np.diagonal(self._spatial, axis1=1, axis2=2).real.T[elements, :, None]
+        cross = np.moveaxis(surface.scattered[..., elements], 2, 0) + power / 2 * shift
+        # A product of two vectors plus its conjugate transpose, and one of the amplitudes.
+        left = np.stack([shift, cross, power * spread], axis=-1)
+        right = np.stack([cross, shift, spread], axis=-1)
+        result: np.ndarray = self._correlation * np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
+        return result
+
+
+class FailureSearch:
+    """Adds failed elements to sets, one at a time, at several sites.
+
+    The order of the extended sets follows from a likelihood that admits a few more failures; see
+    `FailureModel.weigh_extensions`. Without them, the best first element of two would often be
+    one that imitates the sum of both.
+
+    Parameters
+    ----------
+    signals
+        Signals of the phase, N = 1.
+    margin
+        Growth ends with sets that are less probable than the best by this, in log-probability.
+    usual_residual
+        The growth continues while no hypothesis has a lower deviance.
+
+    Attributes
+    ----------
+    sites
+        The sites.
+    values
+        Logarithm of prior times likelihood of each hypothesis.
+    """
+
+    def __init__(self, model: FailureModel, signals: Signals, margin: float,
+                 usual_residual: float) -> None:
+        self._model, self._signals, self._margin = model, signals, margin
+        self._usual_residual = usual_residual
+        self.sites: list[Site] = []
+        self.values: dict[Key, float] = {}
+        self._deviances: dict[Key, float] = {}
+
+    @property
+    def best(self) -> Key:
+        """The most probable hypothesis."""
+        return max(self.values, key=lambda key: self.values[key])
+
+    def explains(self, keys: list[Key]) -> bool:
+        """Whether a hypothesis has no higher deviance than usual."""
+        return any(self._deviances[key] <= self._usual_residual for key in keys)
+
+    def add(self, points: np.ndarray, values: np.ndarray,
+            failed: tuple[int, ...] = ()) -> list[Key]:
+        """Add sites at points [P, 3] with parameters [P, Q] and a set; the best come first."""
+        first = len(self.sites)
+        self.sites += [self._model.site(point, own, self._signals)
+                       for point, own in zip(points, values, strict=True)]
+        return self._weigh((failed, index) for index in range(first, len(self.sites)))
+
+    def grow(self, parents: list[Key], remainder: float = 0.0, n_extended: int = 8) -> None:
+        """Add failures to hypotheses as long as the result is probable.
+
+        Parameters
+        ----------
+        remainder
+            Share of further failures, relative to the declared one, with which the sets are
+            ordered; see `FailureModel.weigh_extensions`.
+        n_extended
+            Number of sets of the same size to extend.
+        """
+        # Earlier growth does not count: it may have ended with a set that is less probable.
+        found = self._weigh(parents)
+        for _ in range(_MAX_GROWTH):
+            ranked = self._weigh_children(parents, remainder)
+            if not ranked:
+                # All elements have failed.
+                break
+            exact = self._weigh(ranked[:_N_EXACT])
+            limit = max(self.values[key] for key in found) - self._margin
+            if self.values[exact[0]] < limit and self.explains(found):
+                break
+            found += exact
+            parents = _diverse(ranked, n_extended)
+
+    def try_neighbours(self, key: Key) -> None:
+        """Weigh the sets with one element more, less, or exchanged."""
+        failed, index = key
+        smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
+        self._weigh((one, index) for one in smaller)
+        for parent in (failed, *smaller):
+            self._weigh(self._weigh_children([(parent, index)])[:_N_EXACT])
+
+    def _weigh(self, keys: Iterable[Key]) -> list[Key]:
+        """Weigh hypotheses, and return them, the most probable first."""
+        keys = list(keys)
+        for key in keys:
+            if key not in self.values:
+                failed, index = key
+                self.values[key], self._deviances[key] = self._model.weigh(
+                    self._model.surface(failed), self.sites[index])
+        return sorted(keys, key=lambda key: -self.values[key])
+
+    def _weigh_children(self, parents: list[Key], remainder: float = 0.0) -> list[Key]:
+        """Return the sets with one more element, the most probable first."""
+        children: dict[Key, float] = {}
+        # The covariances of a set are computed once.
+        for failed, index in sorted(parents):
+            values = self._model.weigh_extensions(
+                self._model.surface(failed), self.sites[index], remainder)
+            for element, value in enumerate(values.tolist()):
+                if element not in failed:
+                    children[tuple(sorted((*failed, element))), index] = value
+        return sorted(children, key=lambda key: -children[key])
+
+
+def _diverse(ranked: list[Key], n_extended: int) -> list[Key]:
+    """Choose the first hypotheses to extend, few of each set and of each site."""
+    chosen: list[Key] = []
+    for failed, index in ranked:
+        if (sum(other == failed for other, _ in chosen) < _MAX_PER_SET
+                and sum(other == index for _, other in chosen) < _MAX_PER_SITE):
+            chosen.append((failed, index))
+        if len(chosen) == n_extended:
+            break
+    return chosen

@@ -1,0 +1,552 @@
+"""The likelihood of positions and nuisance parameters: one Gaussian for each state of the surface.
+
+Signals y have nuisance parameters z, a factor exp(z P) of direct path and multipath; see
+`model.impairments`. Thermal noise is far weaker than the multipath, so that the divided signals
+y exp(-z P) have the distribution of the model without the factor, apart from the change of volume:
+with mean mu(p) and covariance Lambda at a position p, the log-likelihood is, up to a constant,
+``-|W (y exp(-z P) - mu(p))|^2 - 2 Re(sum z P) - log det Lambda`` with ``W^H W = Lambda^-1``.
+
+A `Conditional` evaluates it for one state of the surface, with its derivatives. Search, posterior
+and tracks use only `Conditional`, whatever the impairments are.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from rhs_isac_ros.bounds.fisher import quadratic_form
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import eliminate, marginalise
+from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.model.measurement import Surface
+from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
+
+# Curvature of the log-likelihood in (r, u, v) [1/m^2, 1, 1] to add everywhere. It keeps matrices
+# regular where the signals carry no information, and is weaker than the prior on any usual region
+# of interest.
+MIN_CURVATURE = (1e-3, 1e-1, 1e-1)
+# Standard deviation from which a wrapped phase is treated as uniform [rad], and that of a Gaussian
+# whose density at its centre is the density of a uniform phase.
+UNIFORM_STD_RAD = 2.0
+_UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
+# Standard deviation from which the search treats the phases of the bands as uniform. Their joint
+# density then has many peaks along the range, too narrow for Gaussians; the information is added
+# to the samples of the posterior afterwards.
+COARSE_STD_RAD = 0.75
+# Grid on which parameters with several maxima are compared: reach in standard deviations, number
+# of points by number of parameters, and refinements of the best point.
+_REACH = 4.0
+_N_GRID = {1: 513, 2: 49, 3: 13}
+_N_REFINEMENTS = 4
+# Profile over the gain: number of gains and of amplitudes in its table, and its reach.
+_N_GAIN = 161
+_N_AMPLITUDE = 256
+_GAIN_REACH = 4.5
+# Smaller gains have no effect [nepers].
+_MIN_GAIN_STD = 1e-9
+# Numbers of failures whose probability is relevant.
+_MIN_PROBABILITY = 1e-5
+_MAX_COUNTS = 12
+# Share of the errors of an estimate in the whitened signals from which their position matters.
+_MIN_ERROR_SHARE = 0.05
+
+
+class Signals(NamedTuple):
+    """Signals of N positioning phases, complex128 [N, N_B, N_SB F], as received and whitened."""
+
+    received: np.ndarray
+    whitened: np.ndarray
+
+    def take(self, rows: np.ndarray | slice) -> 'Signals':
+        """Return the signals of some phases, which may be repeated."""
+        return Signals(self.received[rows], self.whitened[rows])
+
+    def repeated(self, phase: int, n: int = 1) -> 'Signals':
+        """Return the signals of a phase n times."""
+        return self.take(np.full(n, phase))
+
+
+class Local(NamedTuple):
+    """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
+
+    Attributes
+    ----------
+    value
+        Logarithm of likelihood and prior of the parameters, float64 [M].
+    gradient, information
+        Float64 [M, 3 + Q] and [M, 3 + Q, 3 + Q]. The information is the expected one. Observed
+        curvatures of range and phase differ by noise, and would spoil the marginal, in which the
+        two nearly cancel.
+    residual
+        Energy of the whitened residual, float64 [M].
+    """
+
+    value: np.ndarray
+    gradient: np.ndarray
+    information: np.ndarray
+    residual: np.ndarray
+
+
+class Conditional(Protocol):
+    """The likelihood given one state of the surface."""
+
+    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate points [M, 3] with parameters [M, Q] for the signals of each, N = M."""
+        ...
+
+
+class NuisancePrior:
+    """Prior and effect of the nuisance parameters, in units in which they are standard normal.
+
+    A uniform phase has no prior, and the unit `_UNIFORM_EQUIVALENT`. If the phases of the bands
+    are nearly independent, each band has a uniform phase instead of all parameters that turn whole
+    bands; the range then follows from delays, amplitudes and wavefronts only.
+
+    Attributes
+    ----------
+    patterns
+        Exponents of the signals per unit, complex128 [Q, N_B, N_SB F].
+    precision
+        Of the prior, 1 or 0, float64 [Q].
+    phases
+        Phase of each band per unit [rad], float64 [N_B, Q].
+    gain
+        Gain of all signals per unit [nepers], float64 [Q].
+    volume
+        Change of the logarithm of the signals' volume per unit, float64 [Q].
+    information
+        Fisher information from the covariance of the signals, see `information_of`.
+    is_coarse
+        Whether every band has a uniform phase.
+    phase_covariance
+        Covariance of the phases of the bands that the scenario declares, float64 [N_B, N_B].
+    """
+
+    def __init__(self, model: MeasurementModel) -> None:
+        nuisance = nuisance_of(model.scenario)
+        n_bands, n_rows = model.shape
+        patterns, phases = nuisance.scaled_patterns, nuisance.phases
+        self.phase_covariance = phases @ phases.T
+        centre = np.eye(n_bands) - (1 / n_bands if n_bands > 1 else 0.0)
+        relative = np.linalg.eigvalsh(centre @ self.phase_covariance @ centre)[-1]
+        # A phase that all bands share leaves rounding errors.
+        is_shared = relative <= 1e-9 * np.trace(self.phase_covariance)
+        self.relative_phase_std_rad = 0.0 if is_shared else float(np.sqrt(relative))
+        self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
+        keeps = np.ones(len(nuisance), bool)
+        if self.is_coarse:
+            keeps = np.abs(phases).max(axis=0, initial=0.0) == 0
+            per_band = 1j * np.eye(n_bands)[:, :, None] * np.ones(n_rows)
+            patterns = np.concatenate([patterns[keeps], _UNIFORM_EQUIVALENT * per_band])
+            phases = np.hstack([phases[:, keeps], _UNIFORM_EQUIVALENT * np.eye(n_bands)])
+        n_added = len(patterns) - int(keeps.sum())
+        largest = np.abs(phases).max(axis=0, initial=0.0)
+        uniform = largest > UNIFORM_STD_RAD
+        scale = np.where(uniform, _UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
+        self.patterns, self.phases = patterns * scale[:, None, None], phases * scale
+        self.precision = np.where(uniform, 0.0, 1.0)
+        self.gain = self.patterns.real.mean(axis=(1, 2))
+        self.volume = 2 * self.patterns.real.sum(axis=(1, 2))
+        self.needs_search = np.append(nuisance.needs_search[keeps], np.zeros(n_added, bool))
+        self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
+        self._operators = self._multiplying(model.root, model.whitener)
+        self.information = self.information_of(model.root, model.whitener)
+
+    def __len__(self) -> int:
+        """Return the number Q of parameters."""
+        return len(self.patterns)
+
+    @functools.cached_property
+    def gain_std(self) -> float:
+        """Standard deviation of the gain of all signals [nepers]; 0 if it is negligible."""
+        std = float(np.linalg.norm(self.gain))
+        return std if std > _MIN_GAIN_STD else 0.0
+
+    @functools.cached_property
+    def phase_std_rad(self) -> np.ndarray:
+        """Standard deviation of the phase of each band, infinite if uniform, float64 [N_B]."""
+        std = np.sqrt(np.diagonal(self.phase_covariance))
+        return np.where(self.is_coarse | (std > UNIFORM_STD_RAD), np.inf, std)
+
+    def divide(self, received: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Remove the factors of parameters [..., Q] from signals [..., N_B, N_SB F]."""
+        return received * np.exp(-np.tensordot(values, self.patterns, axes=1))
+
+    def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
+        """Compute the Fisher information from a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q].
+
+        The multipath reveals gains and offsets of carrier and timing, but no phase. Takes Cholesky
+        factors and their inverses, complex128 [N_B, N_SB F, N_SB F].
+        """
+        operators = self._multiplying(root, whitener)
+        both = operators + np.conj(np.swapaxes(operators, 2, 3))
+        information: np.ndarray = np.einsum('aimn,binm->ab', both, both, optimize=True).real
+        return information
+
+    def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
+        """Compute W P W^-1, which multiplies whitened signals, [Q, N_B, N_SB F, N_SB F]."""
+        operators: np.ndarray = np.matmul(whitener * self.patterns[:, :, None], root)
+        return operators
+
+    def slopes(self, whitened: np.ndarray) -> np.ndarray:
+        """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
+        slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
+        result: np.ndarray = slopes.reshape(*slopes.shape[:2], -1)
+        return result
+
+    def band_angles(self, values: np.ndarray) -> np.ndarray:
+        """Return the phases of the bands for parameters [M, Q], float64 [M, N_B] [rad]."""
+        result: np.ndarray = values @ self.phases.T
+        return result
+
+    def log_prior(self, values: np.ndarray) -> np.ndarray:
+        """Logarithm of prior and volume of parameters [M, Q], float64 [M]."""
+        result: np.ndarray = -(values**2 @ self.precision / 2 + values @ self.volume)
+        return result
+
+    def amplitude(self, outputs: np.ndarray) -> np.ndarray:
+        """Sum the outputs of the bands' matched filters in their most likely phases.
+
+        Takes complex [N_B, ...]. Each rotation costs half of its improbability.
+        """
+        if not self.relative_phase_std_rad:
+            return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
+        parts = [_in_phase(output, float(std))
+                 for output, std in zip(outputs, self.phase_std_rad, strict=True)]
+        total: np.ndarray = np.sum(parts, axis=0)
+        return total
+
+    def over_gain(self, amplitude: np.ndarray, energy: float, n_rows: int
+                  ) -> tuple[np.ndarray, np.ndarray]:
+        """Maximise the log-likelihood over the gain, up to the template's energy.
+
+        Takes amplitudes A of any shape and the energy of the whitened signals: at a factor h of
+        the signals, the log-likelihood is ``-h^2 |y|^2 + 2 h A + 2 n log h``. Returns the maximum,
+        relative to signals without noise if the gain is known, and the gain [nepers].
+        """
+        if not self.gain_std:
+            return 2 * amplitude, np.zeros(1)
+        gain = self.gain_std * np.linspace(-_GAIN_REACH, _GAIN_REACH, _N_GAIN)
+        factor = np.exp(-gain)
+        fixed = -factor**2 * energy - 2 * n_rows * gain - gain**2 / (2 * self.gain_std**2)
+        low, high = float(amplitude.min()), float(amplitude.max())
+        knots = np.linspace(low, high + 1e-9 * (1 + abs(high)), _N_AMPLITUDE)
+        table = fixed + 2 * factor * knots[:, None]
+        return (np.interp(amplitude, knots, table.max(axis=1)),
+                np.interp(amplitude, knots, gain[table.argmax(axis=1)]))
+
+    def start(self, outputs: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """Return parameters [M, Q] from filters' outputs [N_B, M] and gains [nepers] [M]."""
+        angles = np.angle(outputs)
+        if not self.relative_phase_std_rad:
+            angles = np.broadcast_to(np.angle(outputs.sum(axis=0)), angles.shape)
+        # Phases without a prior follow the angles; the others share the rest by their variance.
+        variance = np.where(self.precision > 0, 1.0, 1e6)
+        spread = self.phases * variance
+        values: np.ndarray = (spread.T @ np.linalg.pinv(spread @ self.phases.T) @ angles).T
+        values += np.outer(gain, self.gain) / max(self.gain_std, _MIN_GAIN_STD)**2
+        return values
+
+    def with_phases(self, values: np.ndarray, outputs: np.ndarray) -> np.ndarray:
+        """Turn every band by the angle of its filter's output [M, N_B], if phases are uniform."""
+        change = np.zeros_like(values)
+        change[:, -outputs.shape[1]:] = np.angle(outputs) / _UNIFORM_EQUIVALENT
+        result: np.ndarray = values + change
+        return result
+
+
+class Likelihood:
+    """The likelihood with one covariance everywhere: the average over region and surfaces.
+
+    Attributes
+    ----------
+    model
+        Mean and covariance of the signals.
+    nuisance
+        Prior of the nuisance parameters.
+
+    Raises
+    ------
+    CodebookError
+        If the codebook does not fit the scenario.
+    """
+
+    def __init__(self, scenario: Scenario, codebook: Codebook,
+                 surface: Surface | None = None) -> None:
+        codebook.check(scenario)
+        self.scenario, self.codebook, self.surface = scenario, codebook, surface
+        # Estimators are built between cycles; their first estimate should be as fast as any.
+        self.model = MeasurementModel(scenario, codebook, surface).prepare(jacobian=True)
+        self.nuisance = NuisancePrior(self.model)
+
+    def signals(self, received: np.ndarray) -> Signals:
+        """Whiten signals [N, N_B, N_SB F]."""
+        return Signals(received, self.model.whiten(received))
+
+    def whitened(self, values: np.ndarray, signals: Signals) -> np.ndarray:
+        """Whiten signals without the factors of parameters [M, Q], [M, N_B, N_SB F]."""
+        if not len(self.nuisance):
+            return signals.whitened
+        return self.model.whiten(self.nuisance.divide(signals.received, values))
+
+    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate points, as `Conditional` describes."""
+        n = len(points)
+        mean, slopes = self.model.mean_and_jacobian(
+            to_positions(points), jacobian(points), whitened=True)
+        derivative = slopes.reshape(n, 3, -1)
+        whitened = self.whitened(values, signals)
+        residual = (whitened - mean).reshape(n, -1)
+        if len(self.nuisance):
+            return assemble(
+                self.nuisance, values, residual,
+                np.concatenate([derivative, self.nuisance.slopes(mean)], axis=1),
+                self.nuisance.slopes(whitened))
+        # Re(a^H b) is the inner product of real and imaginary parts.
+        parts = residual.view(float)
+        information = quadratic_form(derivative) + np.diag(MIN_CURVATURE)
+        gradient = 2 * np.matmul(derivative.view(float), parts[..., None])[..., 0]
+        energy = np.sum(parts**2, axis=1)
+        return Local(-energy, gradient, information, energy)
+
+    def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
+        """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones.
+
+        Steps of the range turn the phases many times. Other parameters remain as they are.
+        """
+        if not self.nuisance.is_coarse:
+            return values
+        return self.nuisance.with_phases(values, self.outputs(points, values, signals))
+
+    def outputs(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
+        """Compute the outputs of the bands' matched filters, complex128 [M, N_B]."""
+        mean = self.model.whiten(self.model.mean(to_positions(points)))
+        result: np.ndarray = np.sum(mean.conj() * self.whitened(values, signals), axis=2)
+        return result
+
+    @functools.cached_property
+    def log_volume(self) -> float:
+        """Logarithm of the determinants of the covariance."""
+        return float(log_determinant(self.model.root).sum())
+
+
+def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
+             expected: np.ndarray, observed: np.ndarray | None = None, *,
+             information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
+    """Combine whitened columns to the likelihood and its derivatives.
+
+    Parameters
+    ----------
+    values
+        Parameters, float64 [M, Q].
+    residual
+        Signals without factors less their mean, complex128 [M, n].
+    expected
+        Derivatives of the mean with respect to the point and of the mean times its factors,
+        complex128 [M, 3 + Q, n].
+    observed
+        Derivatives of the signals times their factors, [M, Q, n]; by default those of the mean,
+        with which the gradient predicts no more than the whole energy.
+    information_of_covariance
+        Of the parameters, float64 [Q, Q]; by default that of the average covariance.
+    n_linear
+        Number of further standard normal parameters in which the mean is linear, and whose
+        derivatives follow in `expected`. They are integrated out.
+    """
+    n = 3 + len(prior)
+    parts = np.ascontiguousarray(residual).view(float)
+    information = quadratic_form(expected)
+    information += np.diag(np.concatenate([MIN_CURVATURE, prior.precision, np.ones(n_linear)]))
+    information[:, 3:n, 3:n] += (prior.information if information_of_covariance is None
+                                 else information_of_covariance)
+    if observed is not None:
+        expected = np.concatenate([expected[:, :3], observed, expected[:, n:]], axis=1)
+    gradient = 2 * np.matmul(
+        np.ascontiguousarray(expected).view(float), parts[..., None])[..., 0]
+    gradient[:, 3:n] -= prior.precision * values + prior.volume
+    energy = np.sum(parts**2, axis=1)
+    value = prior.log_prior(values) - energy
+    if not n_linear:
+        return Local(value, gradient, information, energy)
+    marginal = marginalise(information, gradient, n)
+    rise = np.sum(gradient[:, n:] * marginal.offset, axis=1) / 2
+    return Local(value + rise + marginal.log_volume, marginal.gradient, marginal.information,
+                 energy - rise)
+
+
+def log_determinant(roots: np.ndarray) -> np.ndarray:
+    """Logarithm of the determinants from Cholesky factors [..., S, S], float64 [...]."""
+    result: np.ndarray = 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
+    return result
+
+
+class DispersedLikelihood:
+    """The likelihood with the covariance of element errors at each position.
+
+    Errors of the direct path are stronger for near users, and a surface has a whole number of
+    failed elements: given k failures, their covariance is k / E[k] times the average one. The
+    likelihood is the average over k. Its value is relative to that of `Likelihood`.
+    """
+
+    def __init__(self, likelihood: Likelihood) -> None:
+        self._base, scenario = likelihood, likelihood.scenario
+        # The number of failures of an estimated surface is known.
+        share = scenario.failed_element_share if likelihood.surface is None else 0.0
+        intact = dataclasses.replace(scenario, failed_element_share=0.0)
+        self._average = MeasurementModel(
+            dataclasses.replace(scenario, failed_element_share=share), likelihood.codebook,
+            likelihood.surface).prepare(jacobian=True)
+        self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
+        self._scales, self._log_weights = _failure_counts(scenario.n_elements, share)
+        average, least = self._average.covariance(), self._intact.covariance()
+        roots = np.linalg.cholesky(
+            least + self._scales[:, None, None, None] * (average - least))
+        self._information = [likelihood.nuisance.information_of(*both)
+                             for both in zip(roots, np.linalg.inv(roots), strict=True)]
+
+    @classmethod
+    def of(cls, likelihood: Likelihood) -> 'DispersedLikelihood | None':
+        """Return the likelihood of a model, or None if errors are absent or negligible."""
+        model = likelihood.model
+        if model.elements.is_exact:
+            return None
+        if model.surface is not None:
+            errors = model.elements.error_covariance(model.scenario, model.beams)
+            energy = np.einsum('irs,ist,irt->', model.whitener, errors, model.whitener.conj(),
+                               optimize=True).real
+            if energy <= _MIN_ERROR_SHARE * np.prod(model.shape):
+                return None
+        return cls(likelihood)
+
+    def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
+        """Evaluate points, as `Conditional` describes."""
+        prior, positions, n = self._base.nuisance, to_positions(points), len(points)
+        mean, slopes = self._average.mean_and_jacobian(positions, jacobian(points))
+        divided = prior.divide(signals.received, values)
+        columns = np.concatenate([
+            (divided - mean)[:, None], slopes, prior.patterns * mean[:, None],
+            prior.patterns * divided[:, None]], axis=1)
+        intact = self._intact.covariance_at(positions)
+        excess = self._average.covariance_at(positions) - intact
+        states = []
+        for scale, log_weight, information in zip(
+                self._scales, self._log_weights, self._information, strict=True):
+            roots = np.linalg.cholesky(intact + scale * excess)
+            white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
+            white = np.moveaxis(white, 3, 1).reshape(n, columns.shape[1], -1)
+            n_expected = 4 + len(prior)
+            local = assemble(
+                prior, values, white[:, 0], white[:, 1:n_expected], white[:, n_expected:],
+                information_of_covariance=information)
+            volume = log_determinant(roots).sum(axis=1)
+            states.append(local._replace(
+                value=local.value + log_weight - volume + self._base.log_volume))
+        return _average_of(states)
+
+
+def _average_of(states: list[Local]) -> Local:
+    """Average likelihoods; the residual is that of the most probable state."""
+    value = np.stack([one.value for one in states])
+    highest = value.max(axis=0)
+    weights = np.exp(value - highest)
+    total = weights.sum(axis=0)
+    weights /= total
+    residual = np.stack([one.residual for one in states])
+    return Local(
+        highest + np.log(total),
+        np.einsum('km,kmp->mp', weights, np.stack([one.gradient for one in states])),
+        np.einsum('km,kmpq->mpq', weights, np.stack([one.information for one in states])),
+        np.take_along_axis(residual, value.argmax(axis=0)[None], axis=0)[0])
+
+
+def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of failures relative to their mean, and the logarithm of their probability."""
+    if share == 0:
+        return np.zeros(1), np.zeros(1)
+    from scipy.stats import binom
+
+    counts = np.arange(n_elements + 1)
+    probability = binom.pmf(counts, n_elements, share)
+    likely = counts[probability > _MIN_PROBABILITY]
+    if len(likely) > _MAX_COUNTS:
+        likely = np.unique(np.linspace(likely[0], likely[-1], _MAX_COUNTS).round().astype(int))
+    weights = probability[likely] / probability[likely].sum()
+    return likely / (n_elements * share), np.log(weights)
+
+
+def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
+    """Real part of outputs after the most likely rotation, less half its prior cost."""
+    if std == 0:
+        return outputs.real
+    magnitude: np.ndarray = np.abs(outputs)
+    if not np.isfinite(std):
+        return magnitude
+    angle = np.angle(outputs)
+    phase = angle * magnitude / (magnitude + 1 / (2 * std**2))
+    magnitude = magnitude * np.cos(angle - phase) - phase**2 / (4 * std**2)
+    return magnitude
+
+
+class Alignment:
+    """Estimates of the parameters that move the multipath, from the signals alone.
+
+    Offsets of carrier and timing move the signals out of the nulls of the multipath, so that they
+    must be known before the search. Whatever the position, it contributes the covariance of the
+    mean signals over the region.
+    """
+
+    def __init__(self, likelihood: Likelihood, filters: np.ndarray) -> None:
+        self._model, self._prior = likelihood.model, likelihood.nuisance
+        n_points, n_rows = filters.shape[1:]
+        templates = filters.astype(complex).conj()
+        spread = np.matmul(np.swapaxes(templates, 1, 2), templates.conj()) / n_points
+        self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(n_rows)))
+
+    def values_of_each(self, received: np.ndarray) -> np.ndarray:
+        """Return parameters [N, Q] for signals [N, N_B, N_SB F]; those that move nothing are 0."""
+        if not self._prior.moves_multipath.any():
+            return np.zeros((len(received), len(self._prior)))
+        return np.stack([self._values(one) for one in received])
+
+    def _values(self, received: np.ndarray) -> np.ndarray:
+        """Return parameters [Q] for the signals of one phase."""
+        prior, moves = self._prior, self._prior.moves_multipath
+        values = np.zeros(len(prior))
+        if prior.needs_search.any():
+            values = self._best_on_grid(received)
+        for _ in range(_N_REFINEMENTS):
+            divided = prior.divide(received, values)
+            residual = self._whitened(divided[None]).reshape(-1)
+            slopes = self._whitened(prior.patterns[moves] * divided)
+            slopes = slopes.reshape(len(slopes), -1)
+            # An unknown gain normalises the energy.
+            scale = residual.size / np.sum(np.abs(residual)**2) if prior.gain_std else 1.0
+            curvature = 2 * scale * (slopes.conj() @ slopes.T).real
+            curvature += np.diag(prior.precision[moves])
+            gradient = 2 * scale * (slopes.conj() @ residual).real
+            gradient -= prior.precision[moves] * values[moves]
+            values[moves] += eliminate(curvature, curvature[:, :0], gradient)[1]
+        return values
+
+    def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
+        prior = self._prior
+        (searched,) = np.nonzero(prior.needs_search)
+        n_grid = _N_GRID.get(len(searched), 5)
+        line = np.linspace(-_REACH, _REACH, n_grid)
+        grid = np.stack(np.meshgrid(*[line] * len(searched), indexing='ij'), axis=-1)
+        candidates = np.zeros((n_grid**len(searched), len(prior)))
+        candidates[:, searched] = grid.reshape(len(candidates), -1)
+        signals = self._whitened(prior.divide(received, candidates))
+        cost = np.sum(np.abs(signals)**2, axis=(1, 2))
+        if prior.gain_std:
+            cost = received.size * np.log(cost)
+        cost += candidates**2 @ prior.precision / 2
+        result: np.ndarray = candidates[np.argmin(cost)]
+        return result
+
+    def _whitened(self, signals: np.ndarray) -> np.ndarray:
+        result: np.ndarray = np.einsum('irs,nis->nir', self._whitener, self._model.whiten(signals))
+        return result

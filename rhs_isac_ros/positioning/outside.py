@@ -1,0 +1,269 @@
+"""The evidence for a user in front of the surface but outside of the region of interest.
+
+Range ambiguities repeat every few wavelengths, so that signals from outside often fit some
+position of the region. Whether the user is inside is therefore a comparison of two hypotheses:
+the evidence of each is the likelihood averaged over its prior.
+
+Outside, the prior is uniform in range and solid angle, up to a multiple of the region's farthest
+range. The carrier phases of the bands turn within centimetres of range; the average over them has
+a closed form, the product over the bands of ``I_0(2 |t_i^H y_i|)``. What remains is smooth, so
+that a coarse grid suffices.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
+from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, to_positions
+from rhs_isac_ros.positioning.likelihood import NuisancePrior
+
+# Distance from the region up to which a user may be located at its border.
+BORDER_M = 0.5
+# Nearest range, and the farthest one in units of the farthest range of the region.
+MIN_RANGE_M = 0.5
+MAX_RANGE_FACTOR = 3.0
+# Ratio of successive ranges, and step of the direction cosines.
+RANGE_RATIO = 1.15
+DIRECTION_STEP = 0.05
+# Quadrature over the gain: spacing [nepers], and reach in standard deviations.
+_GAIN_STEP = 0.04
+_GAIN_REACH = 4.0
+# Largest phase error of a template at the ends of the ranges that share it [rad].
+_MAX_PHASE_ERROR = 0.5
+# Error of a residual due to the grid, as a share of the template's energy.
+_GRID_ERROR = 0.25
+# Largest sine of the angle from boresight on the grid.
+_MAX_SINE = 0.998
+
+
+def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
+    """Compute templates of the half space in front of the surface.
+
+    A template is a whitened mean times range and carrier, which depends on the direction and, via
+    the curvature of the wavefront and the delays of the sub-bands, slowly on the range.
+
+    Returns
+    -------
+    dict of numpy.ndarray
+        By name: ``outer_filters``, the conjugate templates for T ranges and V directions,
+        complex64 [N_B, T V, N_SB F]; ``outer_energy`` of the templates [m^2], float32 [T, V];
+        ``outer_index``, the template range of each of R ranges, int64 [R]; and ``outer_weights``,
+        the prior probability of ranges and directions, 0 inside the region, float64 [R, V].
+    """
+    scenario = model.scenario
+    ranges, directions = _ranges(scenario), _directions()
+    nodes, index = _template_ranges(scenario, ranges)
+    weights = _prior(scenario, ranges, directions)
+    points = _points(nodes, directions).reshape(-1, 3)
+    carrier = np.exp(1j * carrier_wavenumbers(scenario) * points[:, :1]) * points[:, :1]
+    templates = model.whiten(model.mean(to_positions(points))) * carrier[..., None]
+    energy = np.sum(np.abs(templates)**2, axis=(1, 2)).reshape(len(nodes), -1)
+    return {
+        'outer_filters': np.swapaxes(templates, 0, 1).conj().astype(np.complex64),
+        'outer_energy': energy.astype(np.float32),
+        'outer_index': index,
+        'outer_weights': weights,
+    }
+
+
+class Outside:
+    """The hypothesis of a user outside of the region of interest.
+
+    Parameters
+    ----------
+    arrays
+        The arrays that `tabulate_outside` returns for the scenario and a codebook.
+    """
+
+    def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
+        self._filters, index = arrays['outer_filters'], arrays['outer_index']
+        self._index = index
+        self._ranges = _ranges(scenario)
+        self._units = to_positions(_points(np.ones(1), _directions()))[0]
+        ranges = self._ranges[:, None]
+        self._scale = (2 / ranges).astype(np.float32)
+        self._energy = (arrays['outer_energy'][index] / ranges**2).astype(np.float32)
+        self._possible = arrays['outer_weights'] > 0
+        log_prior = np.log(arrays['outer_weights'], where=self._possible,
+                           out=np.full(self._possible.shape, -np.inf))
+        self._offset = (log_prior - self._energy).astype(np.float32)
+
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
+                        ) -> tuple[float, float]:
+        """Compute the evidence with the nuisance parameters integrated out.
+
+        Parameters that move the multipath are integrated by Laplace's method, and the gain
+        numerically. Phases have no effect.
+
+        Parameters
+        ----------
+        whitened
+            Whitened signals of one phase without the aligned parameters, complex128
+            [N_B, N_SB F].
+        aligned
+            Parameters that the signals alone reveal, float64 [Q]; 0 for the others.
+
+        Returns
+        -------
+        evidence, scale
+            Logarithm of the evidence, and the most probable factor of the signals.
+        """
+        gain = np.zeros(1)
+        if prior.gain_std:
+            n_points = 2 * int(np.ceil(_GAIN_REACH * prior.gain_std / _GAIN_STEP)) + 3
+            gain = prior.gain_std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
+        evidence = self.log_evidence(whitened, np.exp(-gain)) - 2 * whitened.size * gain
+        weights = -gain**2 / (2 * (prior.gain_std or 1.0)**2)
+        evidence += weights - np.log(np.sum(np.exp(weights)))
+        best = int(np.argmax(evidence))
+        total = evidence[best] + np.log(np.sum(np.exp(evidence - evidence[best])))
+        (moves,) = np.nonzero(prior.moves_multipath)
+        if len(moves):
+            curvature = prior.information[np.ix_(moves, moves)] + np.diag(prior.precision[moves])
+            total -= prior.precision @ aligned**2 / 2 + np.linalg.slogdet(curvature)[1] / 2
+        return float(total), float(np.exp(-gain[best]))
+
+    def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
+        """Compute the logarithm of the likelihood averaged over the prior, for each scale.
+
+        The likelihood is relative to that of signals without noise, as in `Modes`: at a mean t,
+        it is ``exp(-|y - t|^2)``.
+
+        Parameters
+        ----------
+        whitened
+            Whitened signals of one positioning phase, complex128 [N_B, N_SB F].
+        scales
+            Factors of the signals.
+        """
+        argument = self._filter(whitened) * self._scale
+        energy = float(np.sum(np.abs(whitened)**2))
+        return np.array([self._log_average(argument * np.float32(scale)) - scale**2 * energy
+                         for scale in scales])
+
+    def _log_average(self, argument: np.ndarray) -> float:
+        log_likelihood = self._log_likelihood(argument)
+        highest = float(log_likelihood.max())
+        if np.isneginf(highest):
+            return highest
+        return highest + float(np.log(np.sum(np.exp(log_likelihood - highest))))
+
+    def _log_likelihood(self, argument: np.ndarray) -> np.ndarray:
+        """Log-likelihood plus log-prior on the grid, up to the signals' energy, [R, V]."""
+        result: np.ndarray = np.sum(_log_bessel(argument), axis=0) + self._offset
+        return result
+
+    def second_moment(
+            self, whitened: np.ndarray, centre: np.ndarray, scale: float = 1.0) -> np.ndarray:
+        """Compute the posterior second moment of a position outside about a point.
+
+        Parameters
+        ----------
+        whitened
+            Whitened signals of one positioning phase, complex128 [N_B, N_SB F].
+        centre
+            The point, float64 [3] [m].
+        scale
+            Factor of the signals.
+
+        Returns
+        -------
+        numpy.ndarray
+            Float64 [3, 3] [m^2].
+        """
+        log_likelihood = self._log_likelihood(
+            self._filter(whitened) * (self._scale * np.float32(scale)))
+        weights = np.exp(log_likelihood - log_likelihood.max()).astype(float)
+        weights /= weights.sum()
+        mean = self._ranges @ weights @ self._units
+        square = (self._units.T * (self._ranges**2 @ weights)) @ self._units
+        cross = np.outer(mean, centre)
+        result: np.ndarray = square - cross - cross.T + np.outer(centre, centre)
+        return result
+
+    def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
+        """Return whether some position outside leaves a residual with at most this energy.
+
+        The signals are those of one positioning phase, complex128 [N_B, N_SB F].
+        """
+        amplitude = np.sum(self._filter(whitened), axis=0) * self._scale
+        residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
+        tolerated = max_residual + _GRID_ERROR * self._energy
+        return bool((self._possible & (residual <= tolerated)).any())
+
+    def _filter(self, whitened: np.ndarray) -> np.ndarray:
+        """Magnitude of the filtered signals for every range and direction, [N_B, R, V] [m]."""
+        signals = whitened.astype(np.complex64)[..., None]
+        filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
+        by_node: np.ndarray = filtered.reshape(len(filtered), -1, self._energy.shape[1])
+        return by_node[:, self._index]
+
+
+def _log_bessel(argument: np.ndarray) -> np.ndarray:
+    """Approximate log I_0 of non-negative numbers; the error is below 0.04."""
+    # Exact to first order at 0 and to the leading order for large arguments.
+    growth = 1 + (np.pi - 1) * argument / (1.364 + argument)
+    return argument - np.log(1 + 2 * argument * growth) / 2
+
+
+def _ranges(scenario: Scenario) -> np.ndarray:
+    """Ranges of the grid in geometric progression, float64 [R] [m]."""
+    low, high = scenario.roi_bounds_m
+    farthest = MAX_RANGE_FACTOR * np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
+    n_ranges = 1 + max(1, int(np.ceil(np.log(farthest / MIN_RANGE_M) / np.log(RANGE_RATIO))))
+    return MIN_RANGE_M * RANGE_RATIO**np.arange(n_ranges)
+
+
+def _directions() -> np.ndarray:
+    """Direction cosines (u, v) over the half space, float64 [V, 2]."""
+    line = (np.arange(round(2 / DIRECTION_STEP)) + 0.5) * DIRECTION_STEP - 1
+    grid = np.stack(np.meshgrid(line, line, indexing='ij'), axis=-1).reshape(-1, 2)
+    result: np.ndarray = grid[np.hypot(*grid.T) < _MAX_SINE]
+    return result
+
+
+def _points(ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Every range in every direction, (r [m], u, v), float64 [R, V, 3]."""
+    points = np.empty((len(ranges), len(directions), 3))
+    points[..., 0] = ranges[:, None]
+    points[..., 1:] = directions
+    return points
+
+
+def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    positions = to_positions(_points(ranges, directions))
+    distance = np.linalg.norm(positions - np.clip(positions, *scenario.roi_bounds_m), axis=-1)
+    solid_angle = 1 / np.sqrt(1 - np.sum(directions**2, axis=1))
+    weights = np.where(distance > BORDER_M, ranges[:, None] * solid_angle, 0.0)
+    total = weights.sum()
+    return weights / total if total > 0 else weights
+
+
+def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges of the templates [T] [m], and for each range of the grid its template, [R].
+
+    The phase of a template errs by the curvature of the wavefront, proportional to 1 / r, and by
+    the delay across the sub-bands, proportional to r.
+    """
+    aperture = np.max(np.sum(element_positions(scenario)**2, axis=1))
+    by_inverse = np.pi * max(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS * aperture
+    by_range = np.pi * scenario.n_subbands * scenario.subband_width_hz / SPEED_OF_LIGHT_MPS
+    nodes: list[float] = []
+    index = np.empty(len(ranges), np.int64)
+    first = 0
+    while first < len(ranges):
+        last = first
+        for end in range(first, len(ranges)):
+            # Halfway in 1 / r, both ends have the same error from the curvature.
+            node = 2 / (1 / ranges[first] + 1 / ranges[end])
+            errors = (by_inverse * np.abs(1 / ranges[[first, end]] - 1 / node)
+                      + by_range * np.abs(ranges[[first, end]] - node))
+            if end > first and errors.max() > _MAX_PHASE_ERROR:
+                break
+            last = end
+        index[first:last + 1] = len(nodes)
+        nodes.append(2 / (1 / ranges[first] + 1 / ranges[last]))
+        first = last + 1
+    return np.array(nodes), index

@@ -1,0 +1,385 @@
+"""Products with rows, exact and compressed."""
+
+import tracemalloc
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds import rows
+from rhs_isac_ros.bounds.rows import CompressedRows, ExactRows
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.los import los_derivative, los_gain
+
+N_ITEMS = 60
+DIMENSIONS = 144
+
+
+def complex_array(rng, *shape):
+    return rng.normal(size=(*shape, 2)) @ [1, 1j]
+
+
+@pytest.fixture(scope='module')
+def wide():
+    """Two bands of 144 dimensions each, of which a near region needs many."""
+    return Scenario(
+        center_frequencies_hz=(1.2e9, 3.1e9), n_subbands=4, n_frames=3, n_feeds=2,
+        elements_per_side=6, subband_width_hz=5e6, frame_duration_s=1e-3, noise_psd_dbm_hz=-130,
+        roi_center_m=(2, 0, 0), roi_size_m=(2, 4, 2))
+
+
+@pytest.fixture(scope='module')
+def model(wide, random_beams):
+    return MeasurementModel(wide, random_beams(wide, np.random.default_rng(0)))
+
+
+@pytest.fixture(scope='module', params=['derivatives', 'differences'])
+def items(request, wide):
+    """All rows, complex [N_ITEMS, G, N_B, N_SB, N_E], with three rows an item or one."""
+    firsts, seconds = wide.sample_positions(
+        2 * N_ITEMS, np.random.default_rng(1)).reshape(2, -1, 3)
+    if request.param == 'derivatives':
+        return np.stack([los_derivative(wide, firsts, i) for i in range(2)], axis=2)
+    return np.stack(
+        [(los_gain(wide, firsts, i) - los_gain(wide, seconds, i))[:, None] for i in range(2)],
+        axis=2)
+
+
+def source_of(items):
+    return lambda block, band: items[block, :, band].copy()
+
+
+def make(scenario, items, tolerance=0.0):
+    arguments = scenario, source_of(items), len(items), items.shape[1]
+    return CompressedRows(*arguments, tolerance) if tolerance else ExactRows(*arguments)
+
+
+def evaluate(some_rows, model, n_rows, seed=2):
+    """Whitened means of all items and the sums for random weights, by band."""
+    evaluation, rng = some_rows.begin(model), np.random.default_rng(seed)
+    bands = range(len(model.radiation))
+    whitened = [[] for _ in bands]
+    for block in rows.blocks(some_rows.n_items):
+        weights = rng.normal(size=(block.stop - block.start, n_rows, n_rows))
+        for band in bands:
+            whitened[band].append(evaluation.whitened(block, band).copy())
+        for band in bands:
+            evaluation.accumulate(block, band, weights @ whitened[band][-1])
+    return [np.concatenate(parts) for parts in whitened], [*map(evaluation.sums, bands)]
+
+
+def plain_evaluation(scenario, items, model, seed=2):
+    """The same as `evaluate`, by the definitions."""
+    n_items, n_rows = items.shape[:2]
+    weights = np.random.default_rng(seed).normal(size=(n_items, n_rows, n_rows))
+    whitened, sums = [], []
+    for band, (radiation, whitener) in enumerate(
+            zip(model.radiation, model.whitener, strict=True)):
+        frames = radiation.reshape(scenario.n_subbands, -1, scenario.n_elements)
+        means = np.einsum('jqm,ngjm->ngjq', frames, items[:, :, band]).reshape(n_items, n_rows, -1)
+        inverse = whitener.conj().T @ whitener
+        zeta = np.einsum('ab,ngb->nga', inverse, means)
+        w = np.einsum('ngh,nha->nga', weights, zeta)
+        mean_term = np.einsum(
+            'ngjq,ngjm->jqm', w.reshape(*w.shape[:2], scenario.n_subbands, -1),
+            items[:, :, band].conj())
+        whitened.append(np.einsum('ab,ngb->nga', whitener, means))
+        sums.append((mean_term.reshape(radiation.shape),
+                     np.einsum('nga,ngb->ab', w, zeta.conj())))
+    return whitened, sums
+
+
+def recovered(some_rows, scenario):
+    """The rows themselves: their means if each measurement observes one element, not whitened."""
+    size = scenario.n_subbands * scenario.n_elements
+    elements = np.tile(np.eye(scenario.n_elements, dtype=complex), (scenario.n_subbands, 1))
+    evaluation = some_rows.begin(SimpleNamespace(
+        radiation=np.stack([elements] * scenario.n_bands),
+        whitener=np.stack([np.eye(size, dtype=complex)] * scenario.n_bands)))
+    blocks = list(rows.blocks(some_rows.n_items))
+    bands = [np.concatenate([evaluation.whitened(block, i) for block in blocks])
+             for i in range(scenario.n_bands)]
+    whole = np.stack(bands, axis=2)
+    return whole.reshape(*whole.shape[:3], scenario.n_subbands, scenario.n_elements)
+
+
+def relative_errors(some_rows, scenario, items):
+    """Root mean square, in each band, of the relative errors of the rows that are not zero."""
+    norms = np.linalg.norm(items, axis=(3, 4))
+    errors = np.linalg.norm(recovered(some_rows, scenario) - items, axis=(3, 4))
+    relative = np.where(norms > 0, errors, 0) / np.where(norms > 0, norms, 1)
+    return np.sqrt(np.sum(relative**2, axis=(0, 1)) / np.sum(norms > 0, axis=(0, 1)))
+
+
+def least_ranks(items, tolerance):
+    """The fewest dimensions that reach the tolerance, by singular values."""
+    ranks = []
+    for band in range(items.shape[2]):
+        flat = items[:, :, band].reshape(-1, DIMENSIONS)
+        unit = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+        tails = np.cumsum(np.linalg.svd(unit, compute_uv=False)[::-1]**2)[::-1] / len(unit)
+        ranks.append(int(np.sum(tails > tolerance**2)))
+    return ranks
+
+
+def assert_near(actual, expected, tolerance):
+    assert actual.shape == expected.shape
+    assert np.linalg.norm(actual - expected) <= tolerance * np.linalg.norm(expected)
+
+
+def assert_same(first, second, tolerance):
+    for a, b in zip(first[0], second[0], strict=True):
+        assert_near(a, b, tolerance)
+    for one, other in zip(first[1], second[1], strict=True):
+        for a, b in zip(one, other, strict=True):
+            assert_near(a, b, tolerance)
+
+
+def test_exact_evaluations_match_the_definition(wide, items, model, monkeypatch):
+    monkeypatch.setattr(rows, '_BLOCK', 16)
+    assert_same(evaluate(make(wide, items), model, items.shape[1]),
+                plain_evaluation(wide, items, model), 1e-12)
+
+
+@pytest.mark.parametrize('tolerance', [1e-7, 1e-5, 1e-3])
+def test_compressed_evaluations_match_exact_ones_to_the_tolerance(
+        wide, items, model, monkeypatch, tolerance):
+    monkeypatch.setattr(rows, '_BLOCK', 16)
+    compressed = evaluate(make(wide, items, tolerance), model, items.shape[1])
+    assert_same(compressed, plain_evaluation(wide, items, model), 10 * tolerance)
+    assert_same(compressed, evaluate(make(wide, items), model, items.shape[1]), 10 * tolerance)
+
+
+def test_means_are_whitened_with_the_covariance(wide, model):
+    """Means that are the columns of L become unit vectors."""
+    lower = np.linalg.cholesky(model.covariance())
+    items = np.stack([
+        (np.linalg.pinv(block_diagonal(wide, radiation)) @ root).T
+        for radiation, root in zip(model.radiation, lower, strict=True)], axis=1)
+    items = items.reshape(-1, 1, 2, wide.n_subbands, wide.n_elements)
+    for some_rows in (make(wide, items), make(wide, items, 1e-7)):
+        for whitened in evaluate(some_rows, model, 1)[0]:
+            np.testing.assert_allclose(
+                whitened[:, 0], np.eye(len(whitened)), rtol=0, atol=1e-5)
+
+
+def block_diagonal(scenario, radiation):
+    """Matrix from flat rows to their means, [N_SB F, N_SB N_E]."""
+    frames = radiation.reshape(scenario.n_subbands, -1, scenario.n_elements)
+    result = np.zeros((*frames.shape[:2], *frames.shape[::2]), complex)
+    for j in range(scenario.n_subbands):
+        result[j, :, j] = frames[j]
+    return result.reshape(len(radiation), -1)
+
+
+@pytest.mark.parametrize('tolerance', [1e-7, 1e-6, 1e-4, 1e-2, 0.3])
+def test_the_tolerance_is_met_with_the_minimum_rank_or_one_more(
+        wide, items, tolerance):
+    compressed = make(wide, items, tolerance)
+    errors = relative_errors(compressed, wide, items)
+    # At the smallest tolerance, rounding is visible.
+    assert (errors <= 1.01 * tolerance).all()
+    assert len(compressed.ranks) == 2
+    for rank, least in zip(compressed.ranks, least_ranks(items, tolerance), strict=True):
+        assert least <= rank <= least + 1 or (tolerance < 1e-6 and least - 2 <= rank <= least + 3)
+
+
+def test_a_looser_tolerance_needs_fewer_dimensions(wide, items):
+    ranks = [make(wide, items, t).ranks for t in (1e-3, 1e-2, 0.1, 0.5)]
+    for tight, loose in zip(ranks, ranks[1:], strict=False):
+        assert all(a > b for a, b in zip(tight, loose, strict=True))
+
+
+def test_errors_are_relative_to_the_norm_of_each_row(wide, items):
+    sizes = 10.0**np.random.default_rng(3).uniform(-9, 9, items.shape[:2])
+    scaled = items * sizes[:, :, None, None, None]
+    compressed = make(wide, scaled, 1e-4)
+    assert (relative_errors(compressed, wide, scaled) <= 1e-4).all()
+    for rank, least in zip(compressed.ranks, least_ranks(items, 1e-4), strict=True):
+        assert least <= rank <= least + 1
+
+
+@pytest.mark.parametrize('n_items', [1, 2, 7])
+def test_the_rank_does_not_exceed_the_number_of_rows(wide, items, model, n_items):
+    few = items[:n_items]
+    assert few.shape[0] * few.shape[1] < rows._MIN_SKETCH
+    compressed = make(wide, few, 1e-6)
+    assert max(compressed.ranks) <= few.shape[0] * few.shape[1]
+    assert (relative_errors(compressed, wide, few) <= 1e-6).all()
+    assert_same(evaluate(compressed, model, few.shape[1]),
+                plain_evaluation(wide, few, model), 1e-5)
+
+
+@pytest.fixture
+def sizes(monkeypatch):
+    """Numbers of columns of the sketches, in order."""
+    original, made = rows._sketch, []
+
+    def record(*args):
+        made.append(args[-1])
+        return original(*args)
+
+    monkeypatch.setattr(rows, '_sketch', record)
+    return made
+
+
+def test_a_sketch_that_is_too_small_doubles_until_it_suffices(
+        wide, items, model, monkeypatch, sizes):
+    tolerance = 1e-4
+    expected = make(wide, items, tolerance)
+    assert sizes == [min(128, items.shape[0] * items.shape[1])] * 2
+    sizes.clear()
+    monkeypatch.setattr(rows, '_first_sketch', lambda scenario: 2)
+    grown = make(wide, items, tolerance)
+    firsts = [k for k, size in enumerate(sizes) if size == 2]
+    assert len(firsts) == 2
+    for made, least in zip((sizes[:firsts[1]], sizes[firsts[1]:]),
+                           least_ranks(items, tolerance), strict=True):
+        n_total = items.shape[0] * items.shape[1]
+        assert made == [min(2 << k, n_total) for k in range(len(made))]
+        assert len(made) > 2
+        # The previous sketch was too small.
+        assert made[-2] < least + 1 <= made[-1] + 1
+    assert (relative_errors(grown, wide, items) <= tolerance).all()
+    assert_same(evaluate(grown, model, items.shape[1]),
+                evaluate(expected, model, items.shape[1]), 10 * tolerance)
+
+
+@pytest.mark.parametrize(('n_items', 'rank'), [(5, 10), (64, 128), (71, 142), (200, DIMENSIONS)])
+def test_rows_without_structure_have_full_rank(wide, model, sizes, n_items, rank):
+    """The rank is the number of rows or of dimensions, which also limits the sketch."""
+    items = complex_array(np.random.default_rng(4), n_items, 2, 2, 4, 36)
+    compressed = make(wide, items, 1e-6)
+    assert compressed.ranks == (rank, rank)
+    assert len(sizes) <= 4
+    assert (relative_errors(compressed, wide, items) < 1e-12).all()
+    assert_same(evaluate(compressed, model, 2), plain_evaluation(wide, items, model), 1e-11)
+
+
+def test_zero_rows_stay_zero_and_do_not_affect_the_rank(wide, items, model):
+    some = items.copy()
+    some[::3] = 0
+    some[1, 0, 1] = 0
+    compressed = make(wide, some, 1e-4)
+    assert (relative_errors(compressed, wide, some) <= 1e-4).all()
+    np.testing.assert_array_equal(recovered(compressed, wide)[::3], 0)
+    assert_same(evaluate(compressed, model, some.shape[1]),
+                plain_evaluation(wide, some, model), 1e-3)
+    others = items[np.arange(N_ITEMS) % 3 > 0]
+    for rank, least in zip(compressed.ranks, least_ranks(others, 1e-4), strict=True):
+        assert abs(rank - least) <= 1
+
+
+@pytest.mark.parametrize('n_items', [1, 40, 200])
+def test_zero_rows_alone_give_zeros(wide, model, n_items):
+    items = np.zeros((n_items, 1, 2, 4, 36), complex)
+    for some_rows in (make(wide, items), make(wide, items, 1e-5)):
+        whitened, sums = evaluate(some_rows, model, 1)
+        for band in range(2):
+            assert whitened[band].shape == (n_items, 1, 12)
+            np.testing.assert_array_equal(whitened[band], 0)
+            np.testing.assert_array_equal(sums[band].mean_term, np.zeros((12, 36)))
+            np.testing.assert_array_equal(sums[band].covariance_term, np.zeros((12, 12)))
+
+
+@pytest.mark.parametrize('tolerance', [
+    0.0, np.nextafter(rows.MIN_TOLERANCE, 0), 1e-300, -1.0, 1.0, np.inf, -np.inf,
+    np.nan])
+def test_a_tolerance_out_of_range_is_an_error(wide, items, tolerance):
+    with pytest.raises(ValueError, match='^tolerance: .*, expected 1e-07 to 1, or 0 '):
+        CompressedRows(wide, source_of(items), len(items), items.shape[1], tolerance)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
+def test_results_are_reproducible_to_the_bit(wide, items, model, tolerance):
+    first, second = make(wide, items, tolerance), make(wide, items, tolerance)
+    outcomes = [evaluate(each, model, items.shape[1]) for each in (first, second, first)]
+    for outcome in outcomes[1:]:
+        assert_same(outcome, outcomes[0], 0)
+
+
+@pytest.mark.parametrize('tolerance', [0, 1e-5], ids=['exact', 'compressed'])
+def test_concurrent_evaluations_are_independent(
+        wide, items, model, random_beams, tolerance):
+    some_rows = make(wide, items, tolerance)
+    other_model = MeasurementModel(wide, random_beams(wide, np.random.default_rng(5)))
+    expected = evaluate(some_rows, model, items.shape[1])
+    first, second = some_rows.begin(model), some_rows.begin(other_model)
+    rng = np.random.default_rng(2)
+    for block in rows.blocks(some_rows.n_items):
+        weights = rng.normal(size=(block.stop - block.start, *[items.shape[1]] * 2))
+        for band in range(2):
+            part = first.whitened(block, band).copy()
+            other = second.whitened(block, band)
+            second.accumulate(block, band, weights @ other)
+            first.accumulate(block, band, weights @ part)
+    for band in range(2):
+        for actual, wanted in zip(first.sums(band), expected[1][band], strict=True):
+            assert_near(actual, wanted, 1e-13)
+
+
+@pytest.mark.parametrize('size', [1, 7, 30, 60, 100])
+def test_results_do_not_depend_on_the_blocks(wide, items, model, monkeypatch, size):
+    expected = plain_evaluation(wide, items, model)
+    monkeypatch.setattr(rows, '_BLOCK', size)
+    for some_rows, tolerance in ((make(wide, items), 1e-12), (make(wide, items, 1e-6), 1e-5)):
+        blocks = [range(N_ITEMS)[block] for block in rows.blocks(some_rows.n_items)]
+        assert [n for block in blocks for n in block] == list(range(N_ITEMS))
+        lengths = [len(block) for block in blocks]
+        assert lengths[:-1] == [size] * (len(lengths) - 1)
+        assert_same(evaluate(some_rows, model, items.shape[1]), expected, tolerance)
+
+
+class RecordingSource:
+    def __init__(self, items):
+        self.items, self.calls = items, []
+
+    def __call__(self, block, band):
+        self.calls.append((block.start, block.stop, band))
+        return self.items[block, :, band].copy()
+
+
+@pytest.mark.parametrize(('spare', 'kept'), [(0, True), (-1, False)], ids=['fits', 'too large'])
+def test_exact_rows_are_kept_only_within_the_memory_limit(
+        wide, items, model, monkeypatch, spare, kept):
+    monkeypatch.setattr(rows, '_CACHE_BYTES', items.nbytes + spare)
+    monkeypatch.setattr(rows, '_BLOCK', 25)
+    source = RecordingSource(items)
+    some_rows = ExactRows(wide, source, N_ITEMS, items.shape[1])
+    every = {(start, stop, band) for start, stop in ((0, 25), (25, 50), (50, 60))
+             for band in range(2)}
+    expected = plain_evaluation(wide, items, model)
+    for evaluation in range(2):
+        source.calls.clear()
+        assert_same(evaluate(some_rows, model, items.shape[1]), expected, 1e-12)
+        if kept:
+            assert sorted(source.calls) == ([] if evaluation else sorted(every))
+        else:
+            assert set(source.calls) == every
+
+
+def test_memory_of_rows_beyond_the_limit_is_released(wide, items, model, monkeypatch):
+    """After an evaluation, little more than one of six blocks remains in memory."""
+    monkeypatch.setattr(rows, '_CACHE_BYTES', 0)
+    monkeypatch.setattr(rows, '_BLOCK', 10)
+    some_rows = make(wide, items)
+    evaluate(some_rows, model, items.shape[1])
+    tracemalloc.start()
+    try:
+        evaluate(some_rows, model, items.shape[1])
+        held, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < items.nbytes / 5
+    # A few copies of a block, and the results.
+    assert peak < 0.8 * items.nbytes + 2 * sum(
+        part.nbytes for part in evaluate(some_rows, model, items.shape[1])[0])
+
+
+def test_compressed_rows_do_not_use_their_source_again(wide, items, model):
+    source = RecordingSource(items)
+    compressed = CompressedRows(wide, source, N_ITEMS, items.shape[1], 1e-5)
+    assert source.calls
+    source.calls.clear()
+    evaluate(compressed, model, items.shape[1])
+    assert not source.calls

@@ -1,0 +1,327 @@
+"""Estimators that search for the modes of the posterior: its moments, its maximum, its modes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import qmc
+
+from rhs_isac_ros.bounds.fisher import fisher_information
+from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
+from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.positioning import (
+    ESTIMATORS,
+    SignalError,
+    make_estimator,
+    simulate_pairs,
+    weighted_modes,
+)
+
+# Little scattering and three bands, which leave a single mode.
+SINGLE_MODE = Scenario(
+    center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+    roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
+
+
+@pytest.fixture(scope='module')
+def table1_estimates(table1_estimator, shipped):
+    """Signals from 200 positions of Table I, and their estimates."""
+    scenario, rng = Scenario(), np.random.default_rng(0)
+    positions = scenario.sample_positions(200, rng)
+    received = simulate_received(scenario, shipped, positions, rng)
+    return positions, received, table1_estimator.estimate(received)
+
+
+def squared_normalised(errors, covariances):
+    return np.einsum('nu,nu->n', errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
+
+
+def test_the_covariance_describes_the_errors_on_table_1(table1_estimates):
+    """The squared normalised error of three coordinates is 3 on average."""
+    positions, _, estimate = table1_estimates
+    errors = estimate.mean - positions
+    assert np.mean(np.sum(errors**2, axis=1)) < 1.35
+    assert 2 < squared_normalised(errors, estimate.covariance).mean() < 4.5
+    # The mean of 200 errors without bias stays within this limit.
+    assert (np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(200)).all()
+
+
+def test_modes_outside_the_region_do_not_hide_those_inside(table1):
+    """In this phase, the likelihood is e^10 times higher 1.7 m below the region than at the truth.
+
+    An estimator that loses the modes inside the region returns a position 5 m away, with a
+    standard deviation of millimetres.
+    """
+    rng = np.random.default_rng(17)
+    positions = table1.scenario.sample_positions(200, rng)
+    received = simulate_received(table1.scenario, table1.codebook, positions, rng)[83]
+    estimate = make_estimator('bayes', table1.scenario, table1.codebook).estimate(received)
+    error = estimate.mean - positions[83]
+    assert squared_normalised(error[None], estimate.covariance[None])[0] < 100
+
+
+def test_covariances_are_symmetric_and_positive_definite(table1_estimates):
+    _, _, estimate = table1_estimates
+    assert estimate.mean.shape == (200, 3)
+    assert estimate.covariance.shape == (200, 3, 3)
+    np.testing.assert_allclose(
+        estimate.covariance, np.swapaxes(estimate.covariance, 1, 2), rtol=1e-12, atol=1e-15)
+    assert np.linalg.eigvalsh(estimate.covariance).min() > 0
+
+
+def test_means_are_inside_the_region(table1_estimates):
+    low, high = Scenario().roi_bounds_m
+    assert (table1_estimates[2].mean >= low - 1e-9).all()
+    assert (table1_estimates[2].mean <= high + 1e-9).all()
+
+
+def test_a_single_phase_has_the_same_estimate_as_in_a_batch(table1_estimates, table1_estimator):
+    _, received, estimate = table1_estimates
+    for n in range(0, len(received), 11):
+        single = table1_estimator.estimate(received[n])
+        assert single.mean.shape == (3,)
+        assert single.covariance.shape == (3, 3)
+        np.testing.assert_allclose(single.mean, estimate.mean[n], rtol=1e-9)
+        np.testing.assert_allclose(single.covariance, estimate.covariance[n], rtol=1e-6)
+
+
+def test_an_empty_batch_gives_empty_estimates(table1_estimates, table1_estimator):
+    estimate = table1_estimator.estimate(table1_estimates[1][:0])
+    assert estimate.mean.shape == (0, 3)
+    assert estimate.covariance.shape == (0, 3, 3)
+
+
+@pytest.fixture(scope='module')
+def codebook(random_beams):
+    return random_beams(SINGLE_MODE, np.random.default_rng(1))
+
+
+@pytest.fixture(scope='module')
+def single_mode(codebook):
+    return SINGLE_MODE, codebook, make_estimator('bayes', SINGLE_MODE, codebook)
+
+
+def test_strong_signals_give_accurate_positions(single_mode):
+    scenario, codebook, estimator = single_mode
+    rng = np.random.default_rng(2)
+    positions = scenario.sample_positions(40, rng)
+    received = simulate_received(scenario, codebook, positions, rng)
+    estimate = estimator.estimate(received)
+    errors = estimate.mean - positions
+    assert np.linalg.norm(errors, axis=1).max() < 0.1
+    assert 1.5 < squared_normalised(errors, estimate.covariance).mean() < 5
+    noiseless = estimator.estimate(MeasurementModel(scenario, codebook).mean(positions))
+    assert np.linalg.norm(noiseless.mean - positions, axis=1).max() < 0.02
+
+
+def test_a_position_just_outside_the_region_gives_one_inside(single_mode):
+    scenario, codebook, estimator = single_mode
+    low, high = scenario.roi_bounds_m
+    outside = np.array([[4.0, 0.0, high[2] + 0.01], [4.0, low[1] - 0.01, 0.0]] * 5)
+    received = simulate_received(scenario, codebook, outside, np.random.default_rng(3))
+    estimate = estimator.estimate(received)
+    assert estimate.fix.all()
+    assert np.linalg.norm(estimate.mean - outside, axis=1).max() < 0.1
+    assert (estimate.mean >= low - 1e-9).all()
+    assert (estimate.mean <= high + 1e-9).all()
+    assert np.linalg.eigvalsh(estimate.covariance).min() > 0
+
+
+def test_moments_match_a_brute_force_posterior(plain, random_beams):
+    """The reference weights 65 536 points of a small region with the plain likelihood.
+
+    The estimator approximates every mode by a Gaussian, so that single phases differ. Over 40
+    phases, mean and variance must be close to those of the posterior.
+    """
+    scenario = Scenario(n_subbands=2, elements_per_side=4, roi_center_m=(4, 0, 0),
+                        roi_size_m=(1, 1, 0.5))
+    rng = np.random.default_rng(1)
+    codebook = random_beams(scenario, rng)
+    received = simulate_received(scenario, codebook, scenario.sample_positions(40, rng), rng)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received)
+
+    p = plain(scenario, codebook.analog, codebook.digital)
+    points = qmc.Sobol(3, seed=5).random(2**16) * [1, 1, 0.5] + [3.5, -0.5, -0.25]
+    spatial = multipath_covariance(scenario)
+    log_likelihood = np.zeros((40, 2**16))
+    for band in range(2):
+        means = p.mean(points, band)
+        solved = np.linalg.solve(p.covariance(band, spatial[band]), means.T).T
+        energy = np.sum(means.conj() * solved, axis=1).real
+        log_likelihood += 2 * (received[:, band] @ solved.conj().T).real - energy
+    weights = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    means = weights @ points
+    covariances = np.array([np.cov(points.T, aweights=w, ddof=0) for w in weights])
+
+    variance = np.trace(covariances, axis1=1, axis2=2)
+    estimated_variance = np.trace(estimate.covariance, axis1=1, axis2=2)
+    excess = np.sum((estimate.mean - means)**2, axis=1)
+    assert excess.mean() < 0.12 * variance.mean()
+    assert 0.85 < estimated_variance.mean() / variance.mean() < 1.15
+    assert (estimated_variance < 2 * variance).all()
+    assert (estimated_variance > variance / 2).all()
+    # Entries of the mean covariance are compared in units of the standard deviations.
+    expected = covariances.mean(axis=0)
+    deviation = np.sqrt(np.diag(expected))
+    difference = (estimate.covariance.mean(axis=0) - expected) / np.outer(deviation, deviation)
+    assert np.abs(difference).max() < 0.2
+
+
+def share_covered(estimate, positions) -> float:
+    """Share of the phases whose 95 % region contains the user; no fix contains none."""
+    errors = (estimate.mean - positions)[estimate.fix]
+    normalised = squared_normalised(errors, estimate.covariance[estimate.fix])
+    return np.sum(normalised <= 7.815) / len(positions)
+
+
+@pytest.mark.parametrize('changes', [
+    {'user_gain_std_db': 3.0}, {'carrier_offset_std_hz': 2e3}, {'timing_std_s': 5e-8},
+    {'phase_std_rad': 7.0}, {'band_phase_std_rad': 0.2},
+    {'user_gain_std_db': 1.0, 'phase_std_rad': 0.5, 'carrier_offset_std_hz': 1e3},
+    {'element_error_rms': 0.02},
+], ids=lambda changes: ' '.join(changes))
+def test_declared_impairments_leave_consistent_estimates(codebook, changes):
+    """Undeclared, many of these signals have no fix or a wrong one."""
+    scenario, rng = dataclasses.replace(SINGLE_MODE, **changes), np.random.default_rng(2)
+    positions = scenario.sample_positions(25, rng)
+    received = MeasurementModel(scenario, codebook).sample(positions, rng)
+    silent = make_estimator('bayes', SINGLE_MODE, codebook).estimate(received)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received)
+    assert share_covered(silent, positions) < 0.8
+    assert share_covered(estimate, positions) >= 0.88
+    assert estimate.fix.all()
+    assert 75 < np.median(estimate.residual) < 110
+
+
+@pytest.mark.parametrize('std', [1e-300, 1e-12])
+def test_negligible_impairments_change_no_estimate(codebook, std):
+    scenario = dataclasses.replace(
+        SINGLE_MODE, user_gain_std_db=std, timing_std_s=std * 1e-7, band_phase_std_rad=std)
+    rng = np.random.default_rng(2)
+    positions = SINGLE_MODE.sample_positions(5, rng)
+    received = MeasurementModel(SINGLE_MODE, codebook).sample(positions, rng)
+    expected = make_estimator('bayes', SINGLE_MODE, codebook).estimate(received)
+    found = make_estimator('bayes', scenario, codebook).estimate(received)
+    np.testing.assert_allclose(found.mean, expected.mean, atol=0.02)
+    np.testing.assert_allclose(found.residual, expected.residual, rtol=0.02)
+
+
+@pytest.fixture(scope='module')
+def strong(random_beams):
+    """Positions and signals with a single mode, of few sub-bands."""
+    scenario = dataclasses.replace(SINGLE_MODE, n_subbands=2)
+    codebook = random_beams(scenario, np.random.default_rng(1))
+    positions, received = simulate_pairs(scenario, codebook, 8, 0)
+    return scenario, codebook, positions, received
+
+
+def test_no_position_nearby_is_more_likely(strong, plain):
+    """A search with the plain likelihood, from the true position, ends at the estimate."""
+    scenario, codebook, positions, received = strong
+    estimate = make_estimator('ml', scenario, codebook).estimate(received)
+    p, spatial = plain(scenario, codebook.analog, codebook.digital), multipath_covariance(scenario)
+    covariances = [p.covariance(band, spatial[band]) for band in range(3)]
+
+    def square_residual(position, signals):
+        residuals = [signals[band] - p.mean(position, band) for band in range(3)]
+        return sum((r.conj() @ np.linalg.solve(c, r)).real
+                   for r, c in zip(residuals, covariances, strict=True))
+
+    low, high = scenario.roi_bounds_m
+    for n in range(4):
+        found = minimize(square_residual, positions[n], args=(received[n],),
+                         method='Nelder-Mead', bounds=list(zip(low, high, strict=True)),
+                         options={'xatol': 1e-5, 'fatol': 1e-6})
+        deviation = np.sqrt(np.trace(estimate.covariance[n]))
+        assert np.linalg.norm(estimate.mean[n] - found.x) < 0.1 * deviation
+        assert square_residual(estimate.mean[n], received[n]) < found.fun + 0.02
+
+
+def test_the_covariance_is_the_inverse_information_at_the_estimate(strong):
+    scenario, codebook, _, received = strong
+    estimate = make_estimator('ml', scenario, codebook).estimate(received)
+    expected = np.linalg.inv(fisher_information(scenario, codebook, estimate.mean))
+    for found, bound in zip(estimate.covariance, expected, strict=True):
+        np.testing.assert_allclose(found, bound, atol=0.15 * np.trace(bound))
+
+
+def test_a_single_mode_is_not_enough_for_table_1(table1_estimator, shipped):
+    """The errors exceed those of the posterior mean, and the covariances are too small."""
+    positions, received = simulate_pairs(Scenario(), shipped, 60, 2)
+    ml = make_estimator('ml', Scenario(), shipped).estimate(received)
+    mean = table1_estimator.estimate(received)
+    errors = [np.sum((e.mean - positions)**2, axis=1) for e in (ml, mean)]
+    assert errors[0].mean() > 1.2 * errors[1].mean()
+    assert errors[0].mean() > 5 * np.trace(ml.covariance, axis1=1, axis2=2).mean()
+    low, high = Scenario().roi_bounds_m
+    assert ((ml.mean >= low) & (ml.mean <= high)).all()
+
+
+@pytest.fixture(scope='module')
+def phases(shipped):
+    rng = np.random.default_rng(5)
+    positions = Scenario().sample_positions(12, rng)
+    return simulate_received(Scenario(), shipped, positions, rng)
+
+
+def test_the_mixture_has_the_moments_of_the_estimate(table1_estimator, phases):
+    for received in phases:
+        modes = weighted_modes(table1_estimator, received)
+        estimate = table1_estimator.estimate(received)
+        assert modes.probabilities.sum() == pytest.approx(1)
+        assert (np.diff(modes.probabilities) <= 0).all()
+        mean = modes.probabilities @ modes.positions
+        assert mean == pytest.approx(estimate.mean, abs=1e-9)
+        offsets = modes.positions - mean
+        covariance = np.einsum(
+            'm,mab->ab', modes.probabilities,
+            modes.covariances + offsets[:, :, None] * offsets[:, None, :])
+        # The estimate adds the uncertainty of the mean of the samples.
+        added = estimate.covariance - covariance
+        assert np.linalg.eigvalsh(added).min() > -1e-9
+        assert np.trace(added) < 0.1 * np.trace(covariance)
+
+
+def test_the_modes_are_the_range_ambiguities_of_the_bands(table1_estimator, phases):
+    """Two bands 0.5 GHz apart repeat every 0.6 m; single bands every 0.1 m."""
+    gaps = []
+    for received in phases:
+        modes = weighted_modes(table1_estimator, received)
+        ranges = np.sort(np.linalg.norm(modes.positions[modes.probabilities > 0.05], axis=1))
+        gaps += np.diff(ranges).tolist()
+    assert np.median([gap for gap in gaps if gap > 0.3]) == pytest.approx(0.6, abs=0.06)
+
+
+def test_signals_without_a_position_have_no_modes(table1_estimator, phases):
+    assert weighted_modes(table1_estimator, np.zeros_like(phases[0])) is None
+
+
+@pytest.mark.parametrize(('signals', 'message'), [
+    (np.zeros((2, 31)), r'^received: shape \(2, 31\), expected \[N_B, N_SB F\] = \(2, 32\)'),
+    (np.zeros(64), r'^received: shape \(64,\), expected '),
+    (np.full((2, 32), np.nan), '^received: not finite, expected ')])
+def test_invalid_signals_are_errors(table1_estimator, signals, message):
+    with pytest.raises(SignalError, match=message):
+        table1_estimator.estimate(signals)
+
+
+def test_the_error_for_an_unknown_estimator_lists_all(small):
+    with pytest.raises(ValueError, match="estimator: 'oracle', expected one of") as caught:
+        make_estimator('oracle', small.scenario, small.codebook)
+    for name in ESTIMATORS:
+        assert repr(name) in str(caught.value)
+
+
+def test_a_codebook_of_other_sizes_is_an_error(small):
+    scenario = dataclasses.replace(small.scenario, n_feeds=3)
+    with pytest.raises(CodebookError, match='digital: shape'):
+        make_estimator('bayes', scenario, small.codebook)
+
+
+def test_estimators_are_registered_by_their_names():
+    assert {name: kind.name for name, kind in ESTIMATORS.items()} == {
+        name: name for name in ESTIMATORS}
+    assert 'bayes' in ESTIMATORS

@@ -1,0 +1,273 @@
+"""Modes of the posterior under sets of failed elements, and the growth of these sets."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments import DeclaredElements, ElementErrors, nuisance_of
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.coordinates import jacobian, to_polar
+from rhs_isac_ros.positioning.failures import FailureModel, FailureSearch, can_enumerate
+from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
+from rhs_isac_ros.positioning.likelihood import MIN_CURVATURE, Likelihood
+
+SCENARIO = Scenario(
+    center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+    roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1), failed_element_share=0.02)
+INTACT = dataclasses.replace(SCENARIO, failed_element_share=0.0)
+# Two bands, with which sets are ambiguous.
+AMBIGUOUS = dataclasses.replace(SCENARIO, center_frequencies_hz=(2.5e9, 3.1e9))
+POSITION = np.array([4.2, 0.3, -0.1])
+POINT = to_polar(POSITION)
+NO_VALUES = np.zeros(0)
+# Signals of the 64 measurements of two bands rarely leave a larger residual.
+USUAL_RESIDUAL = 85.0
+
+
+@pytest.fixture(scope='module')
+def codebook(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(1))
+
+
+@pytest.fixture(scope='module')
+def model(codebook):
+    return FailureModel(Likelihood(SCENARIO, codebook))
+
+
+def with_failures(elements, levels) -> ElementErrors:
+    stuck = np.full(SCENARIO.n_elements, np.nan)
+    stuck[list(elements)] = levels
+    return ElementErrors(np.ones(SCENARIO.n_elements, complex), stuck)
+
+
+def real(vectors):
+    """Real and imaginary parts of all bands, [..., 2 N_B S], for vectors [..., N_B, S]."""
+    flat = vectors.reshape(*vectors.shape[:-2], -1)
+    return np.concatenate([flat.real, flat.imag], axis=-1)
+
+
+def real_covariance(covariance):
+    """Covariance of `real` for circular signals with a covariance [N_B, S, S]."""
+    n_bands, n_rows = covariance.shape[:2]
+    whole = np.zeros((n_bands, n_rows, n_bands, n_rows), complex)
+    whole[np.arange(n_bands), :, np.arange(n_bands)] = covariance
+    whole = whole.reshape(n_bands * n_rows, -1)
+    return np.block([[whole.real, -whole.imag], [whole.imag, whole.real]]) / 2
+
+
+def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, model):
+    """Value, gradient and information follow from mean and covariance over the amplitudes.
+
+    The real amplitudes of the direct path leave no circular signals.
+    """
+    failed = (3, 17)
+    received = MeasurementModel(SCENARIO, codebook).sample(
+        POSITION[None], np.random.default_rng(2))
+    # Three-point quadrature with the moments of a uniform amplitude.
+    nodes = 0.5 + np.array([-1, 0, 1]) / 2
+    weights = np.array([1, 4, 1]) / 6
+    mean, scattered, slopes = 0.0, 0.0, 0.0
+    means, shares = [], []
+    for first, one in zip(nodes, weights, strict=True):
+        for second, two in zip(nodes, weights, strict=True):
+            surface = MeasurementModel(INTACT, codebook, with_failures(failed, (first, second)))
+            share = one * two
+            means.append(surface.mean(POSITION[None])[0])
+            shares.append(share)
+            mean = mean + share * means[-1]
+            scattered = scattered + share * surface.covariance()
+            slopes = slopes + share * surface.jacobian(POSITION[None])[0]
+    covariance = real_covariance(scattered)
+    for share, one in zip(shares, means, strict=True):
+        deviation = real(one - mean)
+        covariance = covariance + share * np.outer(deviation, deviation)
+
+    inverse = np.linalg.inv(covariance)
+    by_point = real(np.tensordot(jacobian(POINT[None])[0].T, slopes, 1))
+    information = by_point @ inverse @ by_point.T
+    residual = real(received[0] - mean)
+    energy = residual @ inverse @ residual / 2
+    gradient = by_point @ inverse @ residual
+    # Whitened signals of unit covariance have the density exp(-|y|^2), without pi.
+    volume = np.linalg.slogdet(covariance)[1] / 2 + len(residual) / 2 * np.log(2)
+    log_prior = 2 * np.log(0.02) + 34 * np.log(0.98)
+
+    signals = model.likelihood.signals(received)
+    local = model.failed_set(failed).local(POINT[None], NO_VALUES[None], signals)
+    np.testing.assert_allclose(
+        local.information[0] - np.diag(MIN_CURVATURE), information, rtol=1e-6, atol=0.1)
+    np.testing.assert_allclose(local.gradient[0], gradient, rtol=1e-6)
+    assert local.residual[0] == pytest.approx(energy, rel=1e-6)
+    average = np.linalg.slogdet(MeasurementModel(SCENARIO, codebook).covariance())[1].sum()
+    assert local.value[0] == pytest.approx(log_prior - energy - volume + average, rel=1e-6)
+
+    value, deviance = model.weigh(model.surface(failed), model.site(POINT, NO_VALUES, signals))
+    # The step exceeds no limit here.
+    gain = gradient @ np.linalg.solve(information + np.diag(MIN_CURVATURE), gradient) / 2
+    prior = 2 * np.log(0.02 / 0.98)
+    assert value == pytest.approx(prior - energy - volume + gain, rel=1e-3)
+    spread = volume - np.linalg.slogdet(scattered)[1].sum()
+    assert deviance == pytest.approx(energy - gain + spread, rel=1e-3)
+
+
+def test_a_set_is_weighed_with_nuisance_parameters_as_the_signals_without_them(codebook, model):
+    """The value at parameters is that of the signals divided by their factors."""
+    declared = dataclasses.replace(
+        SCENARIO, user_gain_std_db=1.0, carrier_offset_std_hz=500.0, phase_std_rad=0.5,
+        timing_std_s=1e-8, band_phase_std_rad=0.3)
+    nuisance, rng = nuisance_of(declared), np.random.default_rng(8)
+    received = MeasurementModel(declared, codebook).sample(POSITION[None], rng)
+    values = 0.3 * rng.normal(size=(1, len(nuisance)))
+    both = FailureModel(Likelihood(declared, codebook))
+    found = both.failed_set((3, 17)).local(
+        POINT[None], values, both.likelihood.signals(received))
+    divided = received / np.exp(np.tensordot(values, nuisance.scaled_patterns, axes=1))
+    expected = model.failed_set((3, 17)).local(
+        POINT[None], NO_VALUES[None], model.likelihood.signals(divided))
+    gain = values[0, 0] * np.log(10) / 20
+    prior = values[0] @ values[0] / 2 + 2 * received.size * gain
+    assert found.residual[0] == pytest.approx(expected.residual[0], rel=1e-9)
+    assert found.value[0] == pytest.approx(expected.value[0] - prior, rel=1e-9)
+    np.testing.assert_allclose(found.gradient[0, :3], expected.gradient[0], rtol=1e-6)
+    np.testing.assert_allclose(found.information[0, :3, :3], expected.information[0], rtol=1e-6)
+
+
+@pytest.fixture(scope='module', params=[{}, {'user_gain_std_db': 1.0, 'timing_std_s': 1e-8}],
+                ids=['position', 'gain and timing'])
+def weighing(request, codebook):
+    """A model, and the signals at the true position."""
+    scenario = dataclasses.replace(SCENARIO, **request.param)
+    received = MeasurementModel(scenario, codebook).sample(
+        POSITION[None], np.random.default_rng(3))
+    model = FailureModel(Likelihood(scenario, codebook))
+    return model, model.site(
+        POINT, np.full(len(request.param), 0.1), model.likelihood.signals(received))
+
+
+def tolerance(model):
+    """The covariance of the smaller set gives the information about nuisance parameters."""
+    return {'rel': 0, 'abs': 0.1} if len(model.likelihood.nuisance) else {'rel': 1e-9}
+
+
+def test_a_further_failure_is_weighed_as_the_larger_set(weighing):
+    model, site = weighing
+    values = model.weigh_extensions(model.surface((5, 20)), site)
+    for element in (0, 12, 35):
+        surface = model.surface(tuple(sorted((5, 20, element))))
+        assert values[element] == pytest.approx(model.weigh(surface, site)[0], **tolerance(model))
+
+
+def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
+    model, site = weighing
+    values = model.weigh_extensions(model.surface((5,)), site, 0.3)
+    remainder = 0.3 * DeclaredElements(SCENARIO).error_covariance(SCENARIO, codebook)
+    for element in (0, 35):
+        surface = model.surface(tuple(sorted((5, element))))
+        larger = surface._replace(covariance=surface.covariance + remainder)
+        whitening = larger.whitening(model.likelihood.nuisance)
+        monkeypatch.setattr(model, '_whitening', lambda _, whitening=whitening: whitening)
+        assert values[element] == pytest.approx(model.weigh(larger, site)[0], **tolerance(model))
+
+
+def test_the_second_search_follows_the_covariance_of_a_set(codebook):
+    """With the covariance of the search itself, it finds the peaks of the grid."""
+    likelihood = Likelihood(SCENARIO, codebook)
+    table, (n_bands, n_rows) = (
+        TemplateTable(SCENARIO, tabulate(likelihood.model)), likelihood.model.shape)
+    received = MeasurementModel(SCENARIO, codebook).sample(
+        POSITION[None], np.random.default_rng(4))
+    (whitened,) = likelihood.signals(received).whitened
+    identity = np.broadcast_to(np.eye(n_rows), (n_bands, n_rows, n_rows))
+    points = table.starts_under(whitened, likelihood.nuisance, identity, 4).points
+    assert len(points) == 4
+    values = table.log_likelihood(whitened)
+    cell, fine = np.unravel_index(np.argmax(values), values.shape)
+    best = table.points[cell] + [table.range_offsets_m[fine], 0, 0]
+    np.testing.assert_allclose(points[0], best, atol=1e-6)
+
+
+def test_a_few_failures_cost_little_accuracy(codebook):
+    """One Gaussian for all failures has several times the error."""
+    rng = np.random.default_rng(5)
+    positions = SCENARIO.sample_positions(12, rng)
+    estimator = make_estimator('bayes', SCENARIO, codebook)
+    exact = make_estimator('bayes', INTACT, codebook)
+    errors = []
+    for position in positions:
+        model = MeasurementModel(INTACT, codebook, with_failures(
+            rng.choice(36, 1, replace=False), rng.uniform(size=1)))
+        estimate = estimator.estimate(model.sample(position[None], rng)[0])
+        other = exact.estimate(MeasurementModel(INTACT, codebook).sample(position[None], rng)[0])
+        errors.append([np.sum((estimate.mean - position)**2), np.sum((other.mean - position)**2)])
+    own, undamaged = np.mean(errors, axis=0)
+    assert own < 3 * undamaged
+
+
+@pytest.mark.parametrize('share, enumerated', [(0.0, False), (0.02, True), (0.5, False)])
+def test_sets_are_searched_if_failures_are_rare(share, enumerated):
+    scenario = dataclasses.replace(SCENARIO, failed_element_share=share)
+    assert can_enumerate(scenario) is enumerated
+
+
+@pytest.fixture(scope='module')
+def ambiguous(random_beams):
+    """The model of two bands."""
+    codebook = random_beams(AMBIGUOUS, np.random.default_rng(1))
+    return FailureModel(Likelihood(AMBIGUOUS, codebook))
+
+
+def sample_with(model, failed, seed):
+    rng = np.random.default_rng(seed)
+    intact = dataclasses.replace(model.scenario, failed_element_share=0.0)
+    surface = with_failures(failed, rng.uniform(size=len(failed)))
+    return MeasurementModel(intact, model.likelihood.codebook, surface).sample(
+        POSITION[None], rng)
+
+
+def search_at_the_truth(model, received):
+    search = FailureSearch(model, model.likelihood.signals(received), 9.0, USUAL_RESIDUAL)
+    return search, search.add(POINT[None], NO_VALUES[None])
+
+
+def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
+    rng = np.random.default_rng(6)
+    for seed in range(12):
+        failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
+        search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
+        search.grow(sites, 0.3)
+        true, _ = ambiguous.weigh(ambiguous.surface(failed), search.sites[0])
+        assert search.values[search.best] >= true - 1e-6
+
+
+def test_without_a_remainder_the_growth_often_ends_with_another_set(ambiguous):
+    rng, missed = np.random.default_rng(6), 0
+    for seed in range(12):
+        failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
+        search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
+        search.grow(sites, n_extended=1)
+        true, _ = ambiguous.weigh(ambiguous.surface(failed), search.sites[0])
+        missed += search.values[search.best] < true - 1.0
+    assert missed > 0
+
+
+def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
+    scenario = dataclasses.replace(
+        AMBIGUOUS, elements_per_side=2, failed_element_share=0.1)
+    codebook = random_beams(scenario, np.random.default_rng(1))
+    model = FailureModel(Likelihood(scenario, codebook))
+    strong = 100 * MeasurementModel(scenario, codebook).mean(POSITION[None])
+    search, sites = search_at_the_truth(model, strong)
+    search.grow(sites)
+    assert max(len(failed) for failed, _ in search.values) == 4
+
+
+def test_neighbours_differ_by_one_element(ambiguous):
+    search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, (3, 17), 0))
+    search.try_neighbours(((3, 17), sites[0][1]))
+    sets = [set(failed) for failed, _ in search.values if failed]
+    assert {3} in sets
+    assert {17} in sets
+    assert all(len(one ^ {3, 17}) <= 2 for one in sets)
+    assert any(len(one) == 3 for one in sets)

@@ -1,0 +1,244 @@
+"""The likelihood of positions and nuisance parameters."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import binom
+
+from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.positioning.coordinates import to_polar, to_positions
+from rhs_isac_ros.positioning.grid import tabulate
+from rhs_isac_ros.positioning.likelihood import (
+    MIN_CURVATURE,
+    Alignment,
+    DispersedLikelihood,
+    Likelihood,
+)
+
+SCENARIO = Scenario(
+    center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+    roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
+ALL = {'user_gain_std_db': 1.0, 'carrier_offset_std_hz': 500.0, 'phase_std_rad': 0.5,
+       'timing_std_s': 1e-8, 'band_phase_std_rad': 0.3}
+
+
+@pytest.fixture(scope='module')
+def likelihood(case) -> Likelihood:
+    return Likelihood(case.scenario, case.codebook)
+
+
+@pytest.fixture(scope='module')
+def codebook(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(1))
+
+
+def declaring(**changes) -> Scenario:
+    return dataclasses.replace(SCENARIO, **changes)
+
+
+def without_values(n):
+    return np.zeros((n, 0))
+
+
+def repeated(signals, n):
+    """Return the signals of one phase for n points."""
+    return signals.take(np.zeros(n, int))
+
+
+def test_signals_are_whitened_with_the_covariance_of_the_vectors(case, likelihood):
+    """The columns of a square root of the covariance serve as signals."""
+    n_bands, n_rows = case.vectors['cov'].shape[:2]
+    roots = np.linalg.cholesky(case.vectors['cov'])
+    columns = np.moveaxis(roots, 2, 0)
+    signals = likelihood.signals(columns)
+    assert signals.received is columns
+    assert signals.whitened.shape == (n_rows, n_bands, n_rows)
+    for band in range(n_bands):
+        root = signals.whitened[:, band].T
+        np.testing.assert_allclose(root @ root.conj().T, np.eye(n_rows), atol=1e-8)
+
+
+def test_whitened_means_have_the_scalar_products_of_the_vectors(case, likelihood):
+    """Between any two positions: t1^H t2 is the sum of mu1^H Lambda^-1 mu2 over the bands."""
+    t = likelihood.model.whiten(likelihood.model.mean(case.vectors['positions']))
+    products = np.einsum('air,bir->ab', t.conj(), t)
+    expected = sum(mean.conj() @ np.linalg.solve(covariance, mean.T) for mean, covariance
+                   in zip(case.vectors['mean'], case.vectors['cov'], strict=True))
+    np.testing.assert_allclose(products, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+def test_the_value_is_the_gaussian_log_likelihood(case, likelihood):
+    """Up to a constant, it is the log density of the signals before whitening."""
+    rng = np.random.default_rng(0)
+    n_bands, n_rows = case.vectors['cov'].shape[:2]
+    noise = 1e-7 * rng.normal(size=(n_bands, n_rows, 2)) @ [1, 1j]
+    received = case.vectors['mean'][:, 0] + noise
+    exact = 0.0
+    for y, means, covariance in zip(
+            received, case.vectors['mean'], case.vectors['cov'], strict=True):
+        residual = (y - means).T
+        weighed = np.linalg.solve(covariance, residual)
+        exact = exact - np.sum(residual.conj() * weighed, axis=0).real
+    points = to_polar(case.vectors['positions'])
+    local = likelihood.local(points, without_values(len(points)),
+                             repeated(likelihood.signals(received[None]), len(points)))
+    np.testing.assert_allclose(local.value - local.value[0], exact - exact[0],
+                               rtol=1e-6, atol=1e-6 * np.abs(exact).max())
+    np.testing.assert_array_equal(local.residual, -local.value)
+
+
+def test_whitened_slopes_are_the_limit_of_differences_of_the_mean(case, likelihood):
+    positions, step, model = case.vectors['positions'], 1e-5, likelihood.model
+    mean, slopes = model.mean_and_jacobian(positions, whitened=True)
+
+    def exact(positions):
+        return model.whiten(model.mean(positions))
+
+    np.testing.assert_allclose(mean, exact(positions), rtol=1e-9, atol=1e-9)
+    assert slopes.shape == (len(positions), 3, *mean.shape[1:])
+    for u in range(3):
+        shift = step * np.eye(3)[u]
+        difference = (exact(positions + shift) - exact(positions - shift)) / (2 * step)
+        np.testing.assert_allclose(
+            slopes[:, u], difference, rtol=0, atol=1e-7 * np.abs(slopes).max())
+
+
+def test_slopes_with_respect_to_other_coordinates_follow_the_chain_rule(case, likelihood):
+    positions, model = case.vectors['positions'], likelihood.model
+    by_coordinate = np.random.default_rng(0).normal(size=(len(positions), 3, 3))
+    mean, slopes = model.mean_and_jacobian(positions, whitened=True)
+    same, by_other = model.mean_and_jacobian(positions, by_coordinate, whitened=True)
+    np.testing.assert_array_equal(same, mean)
+    expected = np.einsum('nabr,naq->nqbr', slopes, by_coordinate)
+    np.testing.assert_allclose(by_other, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_a_codebook_that_does_not_fit_is_an_error(small):
+    with pytest.raises(CodebookError, match='analog: shape'):
+        Likelihood(dataclasses.replace(small.scenario, elements_per_side=3), small.codebook)
+
+
+@pytest.mark.parametrize('changes', [{}, ALL], ids=['position', 'all parameters'])
+def test_the_gradient_is_that_of_the_log_likelihood(codebook, changes):
+    scenario, rng = declaring(**changes), np.random.default_rng(3)
+    likelihood = Likelihood(scenario, codebook)
+    position = np.array([[4.2, 0.3, -0.1]])
+    signals = likelihood.signals(MeasurementModel(scenario, codebook).sample(position, rng))
+    values = 0.3 * rng.normal(size=(1, len(likelihood.nuisance)))
+    points = to_polar(position + 0.003)
+    _, gradient, information, _ = likelihood.local(points, values, signals)
+    np.testing.assert_allclose(information, np.swapaxes(information, 1, 2), rtol=1e-9)
+    assert (np.linalg.eigvalsh(information / np.sqrt(
+        np.einsum('mp,mq->mpq', *[np.diagonal(information, axis1=1, axis2=2)] * 2))) > 0).all()
+
+    def value(change):
+        return likelihood.local(points + change[:3], values + change[3:], signals).value[0]
+
+    scale = 1e-4 / np.sqrt(np.diagonal(information[0]))
+    for index, step in enumerate(np.diag(scale)):
+        difference = (value(step) - value(-step)) / (2 * scale[index])
+        assert difference == pytest.approx(gradient[0, index], rel=1e-3, abs=1e-3 / scale[index])
+
+
+@pytest.mark.parametrize('changes', [{}, ALL], ids=['position', 'all parameters'])
+def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
+    """Averaged over signals at the true parameters, without the prior."""
+    rng = np.random.default_rng(4)
+    likelihood = Likelihood(declaring(**changes), codebook)
+    point = to_polar(np.array([[4.2, 0.3, -0.1]]))
+    received = MeasurementModel(SCENARIO, codebook).sample(
+        np.tile(to_positions(point), (2000, 1)), rng)
+    _, gradients, (information, *_), _ = likelihood.local(
+        np.tile(point, (2000, 1)), np.zeros((2000, len(likelihood.nuisance))),
+        likelihood.signals(received))
+    information -= np.diag([*MIN_CURVATURE, *likelihood.nuisance.precision])
+    scale = np.sqrt(np.diag(information))
+    found = np.cov(gradients.T) / np.outer(scale, scale)
+    np.testing.assert_allclose(found, information / np.outer(scale, scale), atol=0.15)
+
+
+def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
+    scenario = declaring(carrier_offset_std_hz=2e3, timing_std_s=1e-7)
+    likelihood = Likelihood(scenario, codebook)
+    alignment = Alignment(likelihood, tabulate(likelihood.model)['filters'])
+    rng = np.random.default_rng(5)
+    values = rng.normal(size=(20, 2))
+    positions = scenario.sample_positions(20, rng)
+    received = MeasurementModel(SCENARIO, codebook).sample(positions, rng)
+    received = received * nuisance_of(scenario).factors(values * [2e3, 1e-7])
+    found = alignment.values_of_each(received)
+    assert np.abs(found - values).max() < 0.3
+
+
+def test_errors_of_elements_have_the_covariance_at_the_position(codebook):
+    scenario = declaring(element_error_rms=0.05)
+    likelihood = Likelihood(scenario, codebook)
+    exact = MeasurementModel(scenario, codebook)
+    positions = np.array([[3.2, 0.1, 0.0], [4.8, 0.1, 0.0]])
+    received = exact.sample(positions[:1], np.random.default_rng(6))
+    local = DispersedLikelihood(likelihood).local(
+        to_polar(positions), without_values(2), repeated(likelihood.signals(received), 2))
+    # The value is relative to that of the likelihood with the average covariance.
+    average = np.sum(np.linalg.slogdet(exact.covariance())[1])
+    for n, covariance in enumerate(exact.covariance_at(positions)):
+        difference = received[0] - exact.mean(positions)[n]
+        energy = sum(np.vdot(d, np.linalg.solve(c, d)).real
+                     for d, c in zip(difference, covariance, strict=True))
+        assert local.residual[n] == pytest.approx(energy, rel=1e-6)
+        value = average - energy - np.sum(np.linalg.slogdet(covariance)[1])
+        assert local.value[n] == pytest.approx(value, rel=1e-6)
+
+
+def test_the_likelihood_is_the_average_over_the_number_of_failures(codebook):
+    scenario = declaring(element_error_rms=0.02, failed_element_share=0.02)
+    likelihood, exact = Likelihood(scenario, codebook), MeasurementModel(scenario, codebook)
+    user = np.array([[4.2, 0.3, -0.1]])
+    received = exact.sample(user, np.random.default_rng(7))
+    positions = user + [[0.001, 0.002, 0], [0, 0, 0.003]]
+    average = exact.covariance_at(positions)
+    intact = MeasurementModel(
+        dataclasses.replace(scenario, failed_element_share=0.0), codebook).covariance_at(positions)
+    residuals = received - exact.mean(positions)
+    # The probability of more than six failures is below 1e-5.
+    counts, expected = np.arange(7), np.empty(2)
+    for n in range(2):
+        values = binom.logpmf(counts, 36, 0.02)
+        for count in counts:
+            for d, first, second in zip(residuals[n], intact[n], average[n], strict=True):
+                covariance = first + count / (36 * 0.02) * (second - first)
+                values[count] -= np.vdot(d, np.linalg.solve(covariance, d)).real
+                values[count] -= np.linalg.slogdet(covariance)[1]
+        expected[n] = logsumexp(values)
+    expected += np.sum(np.linalg.slogdet(exact.covariance())[1])
+    found = DispersedLikelihood(likelihood).local(
+        to_polar(positions), without_values(2), repeated(likelihood.signals(received), 2)).value
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.01)
+    assert np.diff(found)[0] == pytest.approx(np.diff(expected)[0], abs=0.01)
+
+
+@pytest.mark.parametrize('changes', [
+    {'element_error_rms': 0.03}, {'failed_element_share': 0.02},
+    {'element_error_rms': 0.03, 'failed_element_share': 0.02},
+], ids=lambda changes: ' '.join(changes))
+def test_nuisance_parameters_and_element_errors_combine(codebook, changes):
+    """The value at parameters is that of the signals divided by their factors."""
+    scenario, rng = declaring(**ALL, **changes), np.random.default_rng(3)
+    likelihood = Likelihood(scenario, codebook)
+    position = np.array([[4.2, 0.3, -0.1]])
+    received = MeasurementModel(scenario, codebook).sample(position, rng)
+    values = 0.3 * rng.normal(size=(1, len(likelihood.nuisance)))
+    found = DispersedLikelihood(likelihood).local(
+        to_polar(position), values, likelihood.signals(received))
+    alone = Likelihood(declaring(**changes), codebook)
+    divided = received / np.exp(
+        np.tensordot(values, nuisance_of(scenario).scaled_patterns, axes=1))
+    expected = DispersedLikelihood(alone).local(
+        to_polar(position), without_values(1), alone.signals(divided))
+    gain = values[0, 0] * np.log(10) / 20
+    prior = values[0] @ values[0] / 2 + 2 * received.size * gain
+    assert found.value[0] == pytest.approx(expected.value[0] - prior, rel=1e-9)
+    assert found.residual[0] == pytest.approx(expected.residual[0], rel=1e-9)

@@ -1,0 +1,109 @@
+"""Samples of the posterior, and phases of the bands that are neither known nor uniform."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.special import i0e, ive
+from scipy.stats import qmc
+
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.posterior import BandPhases
+
+SCENARIO = Scenario(
+    center_frequencies_hz=(2.5e9, 2.54e9, 2.6e9), elements_per_side=6, angular_spread_deg=2.0,
+    roi_center_m=(8, 0, 0), roi_size_m=(8, 2, 1), band_phase_std_rad=0.8)
+N_PHASES, LOG2_POINTS, N_HARMONICS = 15, 14, 6
+UNIFORM_RAD = 2 * np.pi
+
+
+@pytest.fixture(scope='module')
+def codebook(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(1))
+
+
+def log_factors(outputs, std):
+    """The series of the factor of each band, [..., N_B], whose terms have closed forms."""
+    concentration, angle = 2 * np.abs(outputs), np.angle(outputs)
+    total = np.ones(outputs.shape)
+    for n in range(1, N_HARMONICS + 1):
+        total += (2 * np.exp(-(n * std)**2 / 2) * np.cos(n * angle)
+                  * ive(n, concentration) / i0e(concentration))
+    return np.log(total)
+
+
+def posterior_moments(scenario, codebook, received, log2_points):
+    """Means [N, 3] and covariances [N, 3, 3], from a sum over points all over the region."""
+    model = MeasurementModel(scenario, codebook)
+    low, high = scenario.roi_bounds_m
+    points = qmc.Sobol(3, seed=1).random_base2(log2_points) * (high - low) + low
+    whitened, values = np.swapaxes(model.whiten(received), 0, 1), []
+    for block in np.split(points, max(len(points) // 2**14, 1)):
+        templates = model.whiten(model.mean(block))
+        energy = np.sum(np.abs(templates)**2, axis=(1, 2))
+        outputs = np.matmul(whitened, np.conj(np.moveaxis(templates, 0, 2)))
+        concentration = 2 * np.abs(outputs)
+        value = concentration + np.log(i0e(concentration))
+        if scenario.band_phase_std_rad < UNIFORM_RAD:
+            value += log_factors(outputs, scenario.band_phase_std_rad)
+        values.append(value.sum(axis=0) - energy)
+    values = np.hstack(values)
+    weights = np.exp(values - values.max(axis=1, keepdims=True))
+    return (np.array([np.average(points, axis=0, weights=one) for one in weights]),
+            np.array([np.cov(points.T, aweights=one, ddof=0) for one in weights]))
+
+
+def test_the_mean_is_that_of_the_posterior_with_the_prior_of_the_phases(codebook):
+    scenario, rng = SCENARIO, np.random.default_rng(3)
+    positions = scenario.sample_positions(N_PHASES, rng)
+    received = MeasurementModel(scenario, codebook).sample(positions, rng)
+    uniform = dataclasses.replace(scenario, band_phase_std_rad=UNIFORM_RAD)
+    reference, _ = posterior_moments(scenario, codebook, received, LOG2_POINTS)
+    declared, silent = (
+        np.mean(np.sum((make_estimator('bayes', one, codebook).estimate(received).mean
+                        - reference)**2, axis=1)) for one in (scenario, uniform))
+    assert declared < 0.2 * silent
+
+
+@pytest.mark.parametrize('phase_std_rad', [0.0, 0.5, UNIFORM_RAD])
+def test_the_factors_average_the_series_over_a_wavelength(codebook, phase_std_rad):
+    """The carriers are close, so that the average nearly removes a phase that all bands share."""
+    scenario = dataclasses.replace(SCENARIO, phase_std_rad=phase_std_rad)
+    rng = np.random.default_rng(4)
+    outputs = rng.uniform(5, 20, (3, 50)) * np.exp(1j * rng.uniform(-np.pi, np.pi, (3, 50)))
+    found, offsets_m = BandPhases(Likelihood(scenario, codebook)).factors(outputs)
+    wavenumbers = 2 * np.pi * np.array(SCENARIO.center_frequencies_hz) / 299792458
+    wavelength = 2 * np.pi / wavenumbers.mean()
+    ranges = np.linspace(-0.5, 0.5, 200, endpoint=False) * wavelength
+    turned = outputs.T[:, None] * np.exp(1j * ranges[:, None] * wavenumbers)
+    expected = np.log(np.mean(np.exp(log_factors(turned, 0.8).sum(axis=2)), axis=1))
+    np.testing.assert_allclose(found, expected, atol=0.25 if phase_std_rad else 0.05)
+    assert np.all(np.abs(offsets_m) < wavelength / 2)
+
+
+@pytest.mark.parametrize('std_rad, is_informative', [
+    (0.0, False), (0.3, False), (0.8, True), (UNIFORM_RAD, False)])
+def test_only_broad_phases_are_left_to_the_samples(codebook, std_rad, is_informative):
+    scenario = dataclasses.replace(SCENARIO, band_phase_std_rad=std_rad)
+    assert BandPhases(Likelihood(scenario, codebook)).is_informative is is_informative
+
+
+def test_random_phases_of_the_bands_leave_the_moments_of_the_posterior(random_beams):
+    """The modes extend over the range and overlap."""
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+        roi_center_m=(14, 0, 0), roi_size_m=(8, 4, 2), band_phase_std_rad=7.0)
+    codebook = random_beams(scenario, np.random.default_rng(1))
+    rng = np.random.default_rng(7)
+    positions = scenario.sample_positions(25, rng)
+    received = MeasurementModel(scenario, codebook).sample(positions, rng)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received)
+    assert estimate.fix.all()
+    mean, covariance = posterior_moments(scenario, codebook, received, 17)
+    variance = np.trace(covariance, axis1=1, axis2=2)
+    difference = np.sum((estimate.mean - mean)**2, axis=1)
+    assert np.mean(difference) < 0.04 * np.mean(variance)
+    predicted = np.trace(estimate.covariance, axis1=1, axis2=2)
+    assert np.mean(predicted) == pytest.approx(np.mean(variance), rel=0.15)

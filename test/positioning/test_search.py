@@ -1,0 +1,196 @@
+"""The modes of the posterior."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.bounds.fisher import fisher_information
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.positioning import simulate_pairs
+from rhs_isac_ros.positioning.coordinates import (
+    jacobian,
+    likelihood_loss,
+    to_polar,
+    to_positions,
+)
+from rhs_isac_ros.positioning.grid import Starts, TemplateTable, tabulate
+from rhs_isac_ros.positioning.likelihood import (
+    MIN_CURVATURE,
+    Alignment,
+    DispersedLikelihood,
+    Likelihood,
+)
+from rhs_isac_ros.positioning.search import (
+    LONG_SEARCH_STEPS,
+    MAX_MODES,
+    ascend,
+    find_modes,
+    marginal_at,
+)
+
+SCENARIO = Scenario(
+    center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+    roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
+
+
+@pytest.fixture(scope='module')
+def setting(shipped):
+    """Likelihood, grid, signals, positions and modes of some phases of Table I."""
+    scenario = Scenario()
+    likelihood = Likelihood(scenario, shipped)
+    grid = TemplateTable(scenario, tabulate(likelihood.model))
+    positions, received = simulate_pairs(scenario, shipped, 30, 3)
+    signals = likelihood.signals(received)
+    return likelihood, grid, signals, positions, find_modes(
+        likelihood, grid, signals, np.zeros((30, 0)))
+
+
+@pytest.fixture(scope='module')
+def codebook(random_beams):
+    return random_beams(SCENARIO, np.random.default_rng(1))
+
+
+def of_each(modes):
+    return [modes.of_phase(phase) for phase in np.unique(modes.phases)]
+
+
+def square_residual(likelihood, points, whitened):
+    means = likelihood.model.whiten(likelihood.model.mean(to_positions(points)))
+    return np.sum(np.abs(whitened - means)**2, axis=(1, 2))
+
+
+def test_likelihoods_match_the_exact_model_in_the_region(setting):
+    likelihood, _, signals, _, modes = setting
+    low, high = likelihood.scenario.roi_bounds_m
+    positions = to_positions(modes.roi_points)
+    assert ((positions > low - 0.05) & (positions < high + 0.05)).all()
+    exact = -square_residual(likelihood, modes.roi_points, signals.whitened[modes.phases])
+    errors = np.abs(modes.roi_log_likelihood - exact)
+    assert np.median(errors) < 0.05
+    assert np.quantile(errors, 0.9) < 1.0
+
+
+def test_the_true_position_is_not_more_likely_than_the_best_mode(setting):
+    """The best mode is a maximum; a failure means that the search missed a mode."""
+    likelihood, _, signals, positions, modes = setting
+    truths = -square_residual(likelihood, to_polar(positions), signals.whitened)
+    best = np.array([one.roi_log_likelihood.max() for one in of_each(modes)])
+    assert (best > truths - 0.3).all()
+    # Half of a chi-square variable with three degrees of freedom.
+    assert 0.5 < np.mean(best - truths) < 4
+
+
+def test_every_phase_has_modes_the_most_likely_first(setting):
+    modes = setting[4]
+    np.testing.assert_array_equal(np.unique(modes.phases), np.arange(30))
+    assert (np.diff(modes.phases) >= 0).all()
+    for one in of_each(modes):
+        assert 1 <= len(one.points) <= MAX_MODES == 32
+        assert (np.diff(one.roi_log_likelihood) <= 0).all()
+
+
+def test_modes_are_separate(setting):
+    for modes in of_each(setting[4]):
+        offsets = modes.roi_points[:, None] - modes.roi_points
+        distance = np.einsum('nmp,npq,nmq->nm', offsets, modes.curvature, offsets)
+        before = np.tri(len(distance), k=-1, dtype=bool)
+        assert (distance[before] >= 0.5).all()
+        assert (np.abs(offsets[before]) >= [0.01, 0.02, 0.02]).any(axis=1).all()
+
+
+def test_the_modes_of_a_phase_do_not_depend_on_other_phases(setting):
+    likelihood, grid, signals, _, modes = setting
+    for phase in (0, 7, 29):
+        alone = find_modes(likelihood, grid, signals.take([phase]), np.zeros((1, 0)))
+        for found, expected in zip(alone[1:], modes.of_phase(phase)[1:], strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_curvature_is_the_information_in_polar_coordinates(setting):
+    likelihood, grid, signals, _, _ = setting
+    modes = find_modes(
+        likelihood, grid, signals.take([0]), np.zeros((1, 0)), LONG_SEARCH_STEPS)
+    by_point = jacobian(modes.points)
+    information = fisher_information(
+        likelihood.scenario, likelihood.codebook, to_positions(modes.points))
+    expected = np.swapaxes(by_point, 1, 2) @ information @ by_point + np.diag(MIN_CURVATURE)
+    inside = (np.abs(modes.roi_offset) < 1e-9).all(axis=1)
+    assert inside.any()
+    for found, exact in zip(modes.curvature[inside], expected[inside], strict=True):
+        scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
+        assert (np.abs(found - exact) / scale).max() < 0.1
+
+
+def test_noiseless_signals_give_the_exact_position(codebook):
+    likelihood = Likelihood(SCENARIO, codebook)
+    grid = TemplateTable(SCENARIO, tabulate(likelihood.model))
+    positions = SCENARIO.sample_positions(10, np.random.default_rng(2))
+    signals = likelihood.signals(likelihood.model.mean(positions))
+    found = find_modes(likelihood, grid, signals, np.zeros((10, 0)), LONG_SEARCH_STEPS)
+    for position, modes in zip(positions, of_each(found), strict=True):
+        assert np.linalg.norm(to_positions(modes.roi_points[0]) - position) < 1e-3
+        assert modes.roi_log_likelihood[0] == pytest.approx(0, abs=1e-2)
+        assert modes.residual[0] == pytest.approx(0, abs=1e-2)
+
+
+@pytest.mark.parametrize('changes', [{'user_gain_std_db': 1.0}, {'phase_std_rad': 0.5}], ids=str)
+def test_the_likelihood_of_a_mode_is_the_average_over_the_parameter(codebook, changes):
+    """The reference integrates numerically at the position of the mode."""
+    scenario, rng = dataclasses.replace(SCENARIO, **changes), np.random.default_rng(5)
+    likelihood = Likelihood(scenario, codebook)
+    signals = likelihood.signals(
+        MeasurementModel(scenario, codebook).sample(np.array([[4.2, 0.3, -0.1]]), rng))
+    modes = find_modes(likelihood, TemplateTable(scenario, tabulate(likelihood.model)), signals,
+                       np.zeros((1, 1)))
+    step = 1 / 500
+    values = modes.values[0] + step * np.arange(-1500, 1501)[:, None]
+    points = np.repeat(modes.points[:1], len(values), axis=0)
+    log_likelihood = likelihood.local(
+        points, values, signals.take(np.zeros(len(values), int))).value
+    highest = log_likelihood.max()
+    average = highest + np.log(np.sum(np.exp(log_likelihood - highest)) * step)
+    # The factors 2 pi of the integral and of the prior cancel.
+    expected = average - np.log(2 * np.pi) / 2
+    assert modes.log_likelihood[0] == pytest.approx(expected, abs=0.1)
+    # The same holds anywhere else, from other parameters.
+    found, best = marginal_at(
+        likelihood, likelihood, points[:1], modes.values[:1] + 0.1, signals)
+    assert found[0] == pytest.approx(expected, abs=0.1)
+    assert best[0] == pytest.approx(values[log_likelihood.argmax()], abs=2 * step)
+
+
+def test_the_weights_of_modes_are_likelihoods_and_no_predictions(codebook):
+    """Far from a mode, the prediction of a step may be arbitrarily wrong."""
+    scenario = dataclasses.replace(SCENARIO, carrier_offset_std_hz=3e3, user_gain_std_db=2.0)
+    rng = np.random.default_rng(8)
+    likelihood = Likelihood(scenario, codebook)
+    grid = TemplateTable(scenario, tabulate(likelihood.model))
+    alignment = Alignment(likelihood, grid.filters)
+    received = MeasurementModel(scenario, codebook).sample(scenario.sample_positions(8, rng), rng)
+    signals = likelihood.signals(received)
+    modes = find_modes(
+        likelihood, grid, signals, alignment.values_of_each(received))
+    local = likelihood.local(modes.points, modes.values, signals.take(modes.phases))
+    # Outside of the region, the residual is that of the nearest point inside.
+    beyond = likelihood_loss(modes.roi_offset, modes.curvature)
+    np.testing.assert_allclose(modes.residual - beyond, local.residual, rtol=1e-9)
+    among = np.linalg.slogdet(local.information[:, 3:, 3:])[1]
+    np.testing.assert_allclose(modes.log_likelihood, local.value - among / 2, rtol=1e-9)
+
+
+def test_a_step_predicts_the_likelihood_after_it(codebook):
+    scenario = dataclasses.replace(SCENARIO, element_error_rms=0.02, failed_element_share=0.02)
+    likelihood, user = Likelihood(scenario, codebook), np.array([[4.2, 0.3, -0.1]])
+    signals = likelihood.signals(
+        MeasurementModel(scenario, codebook).sample(user, np.random.default_rng(7)))
+    errors = DispersedLikelihood(likelihood)
+    start = to_polar(user + [[0.001, 0.002, 0]]) + [0.002, 0.005, 0.005]
+    found = []
+    for _ in range(4):
+        found.append(ascend(
+            errors, likelihood, Starts(np.zeros(1, int), start, np.zeros((1, 0))), signals, 1))
+        start = found[-1].roi_points
+    first, *_, last = (float(modes.log_likelihood[0]) for modes in found)
+    assert first == pytest.approx(last, abs=0.5)
+    np.testing.assert_allclose(found[3].points, found[2].points, atol=1e-4)
