@@ -13,9 +13,13 @@ outside of the region.
 
 The time is the median of the CPU time of an estimate, on one core.
 
+With --pairs, the rows are all pairs of declarations instead, and some triples. Its JSON file
+holds a list `pairs` with the declarations, the shares in the region and without a fix [%], the
+mean squared error, and its ratio to the posterior; figures are triples of value and interval.
+
 With --reference N, the first N positions of each declared row are compared with the exhaustive
 posterior of the declared model, paired. Element errors have their covariance at every point there.
-Failed elements have no such sum: the reference of their row is the same mixture with the true set
+Failed elements have no such sum: the reference of their rows is the same mixture with the true set
 and position among its hypotheses, so that the ratio covers only what the search misses.
 """
 
@@ -27,6 +31,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import argparse
 import copy
 import dataclasses
+import itertools
 import json
 import time
 from pathlib import Path
@@ -40,8 +45,8 @@ from scipy.special import chdtri
 from rhs_isac_ros.codebook import Codebook, random_codebook
 from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import share_percent
-from rhs_isac_ros.model import MeasurementModel, Scenario, streams
-from rhs_isac_ros.model.imperfections import SurfaceImperfection, draw_deviations
+from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario, streams
+from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.positioning import Estimate, Estimator, make_estimator
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
@@ -70,6 +75,16 @@ DEVIATIONS: dict[str, dict[str, Any]] = {
     'carrier offset 3 kHz rms': {'carrier_offset_std_hz': 3e3},
     'random phase per band': {'band_phase_std_rad': UNIFORM_RAD},
 }
+# Declarations that --pairs combines, and the triples that it adds. Uniform phases include others.
+DECLARATIONS: dict[str, dict[str, Any]] = {
+    'gain': {'user_gain_std_db': 1.0}, 'phase': {'phase_std_rad': 0.3},
+    'band phase': {'band_phase_std_rad': 0.2}, 'timing': {'timing_std_s': 1e-7},
+    'carrier': {'carrier_offset_std_hz': 300.0}, 'elements': {'element_error_rms': 0.03},
+    'failed': {'failed_element_share': 0.01},
+    'uniform band phase': {'band_phase_std_rad': UNIFORM_RAD},
+}
+TRIPLES = (('gain', 'timing', 'failed'), ('phase', 'carrier', 'elements'),
+           ('band phase', 'elements', 'failed'))
 FOUR_BANDS = 'four unequally spaced bands, random phase per band'
 OUTSIDE = {'x = 18 m': (18.0, 0.0, 0.0), 'x = 30 m': (30.0, 0.0, 0.0),
            'y = 6 m': (10.0, 6.0, 0.0), 'z = 3 m': (10.0, 0.0, 3.0)}
@@ -95,6 +110,7 @@ def main() -> None:
         help='binary logarithm of the number of points of that posterior, of which there are two')
     add('--windows', type=positive_int, default=200,
         help='number of windows to which the monitor of the residuals is applied')
+    add('--pairs', action='store_true', help='all pairs of declarations, and some triples')
     add('--json', type=Path, help='JSON file for the results')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}, estimator {options.estimator}\n')
@@ -109,6 +125,13 @@ def main() -> None:
         four, streams.generator(options.seed, streams.START)),
         {'band_phase_std_rad': UNIFORM_RAD}))
     rows = []
+    if options.pairs:
+        for names in (*itertools.combinations(DECLARATIONS, 2), *TRIPLES):
+            changes = {key: value for name in names for key, value in DECLARATIONS[name].items()}
+            if len(changes) == len(names) and wanted(' + '.join(names), options):
+                rows += inside_rows(' + '.join(names), base, codebook, changes, options)
+                save([pair(row) for row in rows], options.json, 'pairs')
+        return
     for name, silent, its_codebook, changes in cases:
         if wanted(name, options):
             rows += inside_rows(name, silent, its_codebook, changes, options)
@@ -117,10 +140,18 @@ def main() -> None:
     save(rows, options.json)
 
 
-def save(rows: list[dict[str, Any]], path: Path | None) -> None:
+def save(rows: list[dict[str, Any]], path: Path | None, key: str = '') -> None:
     """Write the rows so far: all of them take long."""
     if path:
-        path.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+        content = {key: rows} if key else rows
+        path.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+
+
+def pair(row: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a combination of declarations."""
+    return {'declared': row['signals'].split(' + '), 'in_region': row['covered_share'],
+            'no_fix': row['no_fix_share'], 'mse_m2': row['mse_m2'],
+            'mse_ratio': row.get('mse_to_reference'), 'time_ms': row['time_ms']}
 
 
 def wanted(name: str, options: argparse.Namespace) -> bool:
@@ -135,7 +166,7 @@ def inside_rows(name: str, silent: Scenario, codebook: Codebook, changes: dict[s
     positions, received, surfaces = draw(declared, codebook, options)
     rows = []
     for kind, scenario in (('silent', silent), ('declared', declared)):
-        if kind == 'silent' and not changes:
+        if kind == 'silent' and (not changes or options.pairs):
             continue
         estimator = estimator_for(scenario, codebook, options)
         estimate, time_ms = estimate_timed(estimator, received)
@@ -192,16 +223,16 @@ def estimate_timed(estimator: Estimator, received: np.ndarray) -> tuple[Estimate
 
 
 def draw(scenario: Scenario, codebook: Codebook, options: argparse.Namespace
-         ) -> tuple[np.ndarray, np.ndarray, list[SurfaceImperfection | None]]:
+         ) -> tuple[np.ndarray, np.ndarray, list[ElementErrors | None]]:
     """Draw positions, signals and surfaces; every few positions have another surface."""
     model = MeasurementModel(scenario, codebook)
     positions, received = [], []
-    surfaces: list[SurfaceImperfection | None] = []
+    surfaces: list[ElementErrors | None] = []
     for group in range(-(-options.positions // PER_SURFACE)):
         rng = streams.generator(options.seed, streams.PHASES, group)
         positions.append(scenario.sample_positions(PER_SURFACE, rng))
         # The model draws the same surface from a generator in the same state.
-        surface, _ = draw_deviations(scenario, PER_SURFACE, copy.deepcopy(rng))
+        surface, _ = draw_impairments(scenario, PER_SURFACE, copy.deepcopy(rng))
         surfaces += PER_SURFACE * [surface]
         received.append(model.sample(positions[-1], rng))
     n = options.positions

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from impairment_checks import CHECKS
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import random_codebook
@@ -48,6 +49,7 @@ def test_the_plugins_are_found():
     assert 'grid' in plugins.names(plugins.ESTIMATORS)
     assert 'circle' in plugins.names(plugins.MOBILITIES)
     assert 'patch' in plugins.names(plugins.GAIN_PATTERNS)
+    assert 'phase_noise' in plugins.names(plugins.IMPAIRMENTS)
 
 
 def test_the_estimator_locates_users():
@@ -99,6 +101,11 @@ def test_the_gain_pattern_is_a_patch(tmp_path, small):
     bare = dataclasses.replace(scenario, element_gain=scenario.element_gain.amplitude)
     np.testing.assert_allclose(crlb(bare, small.codebook, aside),
                                crlb(scenario, small.codebook, aside), rtol=1e-8)
+
+
+@pytest.mark.parametrize('check', CHECKS, ids=lambda check: check.__name__)
+def test_the_impairment_is_one(check):
+    check({'impairments': {'phase_noise': 0.05}})
 
 
 def test_the_scenario_of_the_tutorial_is_valid():

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.stats import qmc
 
+from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.positioning.estimate import estimate_each
-from rhs_isac_ros.positioning.whitened import WhitenedModel
 
 
 class GridEstimator:
@@ -17,8 +17,9 @@ class GridEstimator:
         low, high = scenario.roi_bounds_m
         self._points = low + (high - low) * qmc.Sobol(3, seed=0).random_base2(log2_points)
         # Whitening turns squared distances between signals into negative log-likelihoods.
-        self._model = WhitenedModel(scenario, codebook)
-        self._means = self._model.mean(self._points).reshape(len(self._points), -1)
+        self._model = MeasurementModel(scenario, codebook)
+        means = self._model.whiten(self._model.mean(self._points))
+        self._means = means.reshape(len(means), -1)
 
     def estimate(self, received):
         """Estimate the positions of received signals [..., N_B, N_SB F]."""
