@@ -401,6 +401,7 @@ class DispersedLikelihood:
             likelihood.surface).prepare(jacobian=True)
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
         self._scales, self._log_weights = _failure_counts(scenario.n_elements, share)
+        self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
         roots = np.linalg.cholesky(
             least + self._scales[:, None, None, None] * (average - least))
@@ -429,12 +430,9 @@ class DispersedLikelihood:
         columns = np.concatenate([
             (divided - mean)[:, None], slopes, prior.patterns * mean[:, None],
             prior.patterns * divided[:, None]], axis=1)
-        intact = self._intact.covariance_at(positions)
-        excess = self._average.covariance_at(positions) - intact
         states = []
-        for scale, log_weight, information in zip(
-                self._scales, self._log_weights, self._information, strict=True):
-            roots = np.linalg.cholesky(intact + scale * excess)
+        for roots, log_weight, information in zip(
+                self._roots_at(points), self._log_weights, self._information, strict=True):
             white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
             white = np.moveaxis(white, 3, 1).reshape(n, columns.shape[1], -1)
             n_expected = 4 + len(prior)
@@ -445,6 +443,19 @@ class DispersedLikelihood:
             states.append(local._replace(
                 value=local.value + log_weight - volume + self._base.log_volume))
         return _average_of(states)
+
+    def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:
+        """Cholesky factors at points for each number of failures, [M, N_B, N_SB F, N_SB F]."""
+        # Numerical integration evaluates many parameters at the same points. Another thread may
+        # replace the attribute at any time.
+        latest = self._latest
+        if latest is None or points is not latest[0]:
+            positions = to_positions(points)
+            intact = self._intact.covariance_at(positions)
+            excess = self._average.covariance_at(positions) - intact
+            self._latest = latest = points, [
+                np.linalg.cholesky(intact + scale * excess) for scale in self._scales]
+        return latest[1]
 
 
 def _average_of(states: list[Local]) -> Local:

@@ -35,13 +35,13 @@ _BLOCK = 4096
 # Expected number of points that a phase draws, with one covariance everywhere and with another one
 # at each position. Their probability follows from the profile, raised to a power so that points
 # which it misjudges are drawn, too.
-_N_DRAWN = 4096
-_N_DISPERSED = 800
+_N_DRAWN = 2048
+_N_DISPERSED = 600
 _POWER = 0.5
 # Log-likelihood below the best down to which parameters are integrated numerically, number of
 # values at a point, and factor of their spread.
-_MARGIN = 7.0
-_N_VALUES = 64
+_MARGIN = 6.0
+_N_VALUES = 32
 _SPREAD = 1.2
 
 
