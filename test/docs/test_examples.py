@@ -12,10 +12,13 @@ import pytest
 from impairment_checks import CHECKS
 
 from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.calibration import Pilots, calibrate
 from rhs_isac_ros.codebook import random_codebook
-from rhs_isac_ros.model import Scenario, mobility, plugins, simulate_received
+from rhs_isac_ros.experiments.sweep_settings import parse_axis, settings_of
+from rhs_isac_ros.model import Scenario, draw_surface, mobility, plugins, simulate_received
+from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import los_and_derivative
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning import Tracker, make_estimator
 
 EXAMPLES = Path(__file__).parents[2] / 'docs' / 'examples'
 
@@ -135,3 +138,62 @@ def test_first_steps_locate_users(monkeypatch, capsys):
     end = runpy.run_path(str(EXAMPLES / 'first_steps.py'))
     assert np.linalg.norm(end['fix'].mean - end['positions'], axis=1).max() < 10
     assert len(capsys.readouterr().out.splitlines()) >= 4
+
+
+def phase_noise_scenario(strength: float) -> Scenario:
+    impairments = {'phase_noise': strength} if strength else {}
+    return Scenario(n_subbands=4, elements_per_side=5, roi_center_m=(2, 0, 0),
+                    roi_size_m=(1, 1, 1), impairments=impairments)
+
+
+def test_estimators_tracks_and_bounds_take_the_impairment_into_account():
+    silent, noisy = phase_noise_scenario(0.0), phase_noise_scenario(0.1)
+    rng = np.random.default_rng(2)
+    codebook = random_codebook(silent, rng)
+    positions = noisy.sample_positions(40, rng)
+    received = simulate_received(noisy, codebook, positions, rng)
+    estimate = make_estimator('bayes', noisy, codebook).estimate(received)
+    assert estimate.fix.all()
+    errors = estimate.mean - positions
+    squares = np.einsum('na,nab,nb->n', errors, np.linalg.inv(estimate.covariance), errors)
+    assert np.mean(squares <= 7.815) > 0.85
+    unaware = make_estimator('bayes', silent, codebook).estimate(received)
+    assert not unaware.fix.all()
+    assert (crlb(noisy, codebook, positions) > crlb(silent, codebook, positions)).all()
+    tracker = Tracker(make_estimator('bayes', noisy, codebook))
+    place = np.tile(positions[:1], (8, 1))
+    for time_s, signals in enumerate(simulate_received(noisy, codebook, place, rng)):
+        track = tracker.update(float(time_s), signals)
+    assert np.linalg.norm(track.mean - place[0]) < 4 * np.sqrt(np.trace(track.covariance))
+
+
+def test_calibration_takes_the_impairment_into_account():
+    noisy, rng = phase_noise_scenario(0.1), np.random.default_rng(3)
+    codebook = random_codebook(noisy, rng)
+    surface = draw_surface(dataclasses.replace(noisy, element_error_rms=0.1), rng)
+    positions = noisy.sample_positions(150, rng)
+    received = simulate_received(noisy, codebook, positions, rng, surface)
+    residual = {}
+    for scenario in (noisy, phase_noise_scenario(0.0)):
+        found = calibrate(scenario, [Pilots(codebook, positions, received)]).surface
+        residual[scenario] = np.linalg.norm(found.gains - surface.gains)
+    assert residual[noisy] < 0.7 * np.linalg.norm(surface.gains - 1)
+    assert residual[noisy] < residual[phase_noise_scenario(0.0)]
+
+
+def test_the_channel_draws_the_impairment_for_every_cycle():
+    noisy = phase_noise_scenario(0.1)
+    factors = [draw_factors(noisy, 1, np.random.default_rng(0), np.random.default_rng(cycle))
+               for cycle in range(2)]
+    assert not np.allclose(*factors)
+    frames = np.angle(factors[0].reshape(noisy.n_bands, noisy.n_subbands, noisy.n_frames))
+    # All sub-bands of a frame have the same phase, which differs from frame to frame.
+    np.testing.assert_allclose(frames, np.broadcast_to(frames[:, :1], frames.shape))
+    assert np.ptp(frames[:, 0], axis=1).min() > 0
+
+
+def test_sweeps_vary_the_strength():
+    axis = parse_axis('impairments={phase_noise: 0.02},{phase_noise: 0.2}')
+    settings = settings_of(phase_noise_scenario(0.0), [axis], 'random', 'bayes')
+    assert [one.scenario for one in settings] == [
+        phase_noise_scenario(0.02), phase_noise_scenario(0.2)]
