@@ -78,7 +78,9 @@ def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, fl
             plugins.load(plugins.IMPAIRMENTS, name)
         except PluginError as error:
             raise ScenarioError(f'{field.name}: {error}') from None
-    return tuple((name, _number(field, strength)) for name, strength in pairs)
+    # No strength, no impairment.
+    checked_pairs = ((name, _number(field, strength)) for name, strength in pairs)
+    return tuple(pair for pair in checked_pairs if pair[1])
 
 
 def _is_number(text: str) -> bool:

@@ -275,7 +275,8 @@ class FailedSet:
             for band in range(mean.shape[1])])
         amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
         columns = np.concatenate([
-            (divided - mean)[:, None], slopes, prior.patterns * mean[:, None], amplitudes,
+            (divided - mean)[:, None], slopes, prior.patterns * prior.sources(mean, divided),
+            amplitudes,
             prior.patterns * divided[:, None]], axis=1)
         white = np.einsum('irs,mcis->mcir', self._whitener, columns, optimize=True)
         white = white.reshape(n, columns.shape[1], -1)
@@ -349,7 +350,8 @@ class FailureModel:
         by_point = jacobian(point[None])
         mean, slopes = self._model.mean_and_jacobian(position, by_point)
         divided = prior.divide(signals.received, values)
-        columns = np.concatenate([divided - mean, slopes[0], prior.patterns * mean])
+        columns = np.concatenate([
+            divided - mean, slopes[0], prior.patterns * prior.sources(mean, divided)[0]])
         gains = []
         for band in range(self.scenario.n_bands):
             gain, slope = los_and_derivative(self.scenario, position, band)
@@ -357,8 +359,9 @@ class FailureModel:
             gains.append(np.repeat(both, self.scenario.n_frames, axis=1))
         elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
         changes = elements * self._shift[:, None]
+        fixed = prior.patterns * ~prior.moves_multipath[:, None, None]
         changes = np.concatenate([
-            -changes[:, :1], changes[:, 1:], prior.patterns * changes[:, :1]], axis=1)
+            -changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
         return Site(point, values, columns, changes, elements[:, 0] * self._amplitudes)
 
     def weigh(self, surface: Surface, site: Site) -> tuple[float, float]:

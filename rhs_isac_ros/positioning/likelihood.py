@@ -191,6 +191,17 @@ class NuisancePrior:
         operators: np.ndarray = np.matmul(whitener * self.patterns[:, :, None], root)
         return operators
 
+    def sources(self, mean: np.ndarray, divided: np.ndarray) -> np.ndarray:
+        """Choose the signals whose derivatives contain the information about the parameters.
+
+        Takes mean signals and received ones without factors, [M, N_B, N_SB F] before or after
+        whitening; returns [M, Q, N_B, N_SB F]. A parameter that moves the multipath is visible in
+        the multipath that was received; the information about it varies from phase to phase.
+        """
+        chosen: np.ndarray = np.where(
+            self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
+        return chosen
+
     def slopes(self, whitened: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
         slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
@@ -301,10 +312,11 @@ class Likelihood:
         whitened = self.whitened(values, signals)
         residual = (whitened - mean).reshape(n, -1)
         if len(self.nuisance):
-            return assemble(
-                self.nuisance, values, residual,
-                np.concatenate([derivative, self.nuisance.slopes(mean)], axis=1),
-                self.nuisance.slopes(whitened))
+            observed = self.nuisance.slopes(whitened)
+            moves = self.nuisance.moves_multipath[:, None]
+            expected = np.where(moves, observed, self.nuisance.slopes(mean))
+            return assemble(self.nuisance, values, residual,
+                            np.concatenate([derivative, expected], axis=1), observed)
         # Re(a^H b) is the inner product of real and imaginary parts.
         parts = residual.view(float)
         information = quadratic_form(derivative) + np.diag(MIN_CURVATURE)
@@ -345,8 +357,8 @@ def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
     residual
         Signals without factors less their mean, complex128 [M, n].
     expected
-        Derivatives of the mean with respect to the point and of the mean times its factors,
-        complex128 [M, 3 + Q, n].
+        Derivatives of the mean with respect to the point, and of `sources` with respect to their
+        factors, complex128 [M, 3 + Q, n].
     observed
         Derivatives of the signals times their factors, [M, Q, n]; by default those of the mean,
         with which the gradient predicts no more than the whole energy.
@@ -360,8 +372,10 @@ def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
     parts = np.ascontiguousarray(residual).view(float)
     information = quadratic_form(expected)
     information += np.diag(np.concatenate([MIN_CURVATURE, prior.precision, np.ones(n_linear)]))
-    information[:, 3:n, 3:n] += (prior.information if information_of_covariance is None
-                                 else information_of_covariance)
+    # The derivatives of parameters that move the multipath include it.
+    still = ~prior.moves_multipath
+    information[:, 3:n, 3:n] += np.outer(still, still) * (
+        prior.information if information_of_covariance is None else information_of_covariance)
     if observed is not None:
         expected = np.concatenate([expected[:, :3], observed, expected[:, n:]], axis=1)
     gradient = 2 * np.matmul(
@@ -400,7 +414,8 @@ class DispersedLikelihood:
             dataclasses.replace(scenario, failed_element_share=share), likelihood.codebook,
             likelihood.surface).prepare(jacobian=True)
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
-        self._scales, self._log_weights = _failure_counts(scenario.n_elements, share)
+        self._scales, log_weights = _failure_counts(scenario.n_elements, share)
+        self._offsets = log_weights + likelihood.log_volume
         self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
         roots = np.linalg.cholesky(
@@ -424,24 +439,22 @@ class DispersedLikelihood:
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
-        prior, positions, n = self._base.nuisance, to_positions(points), len(points)
-        mean, slopes = self._average.mean_and_jacobian(positions, jacobian(points))
+        prior, n = self._base.nuisance, len(points)
+        mean, slopes = self._average.mean_and_jacobian(to_positions(points), jacobian(points))
         divided = prior.divide(signals.received, values)
         columns = np.concatenate([
-            (divided - mean)[:, None], slopes, prior.patterns * mean[:, None],
+            (divided - mean)[:, None], slopes, prior.patterns * prior.sources(mean, divided),
             prior.patterns * divided[:, None]], axis=1)
-        states = []
-        for roots, log_weight, information in zip(
-                self._roots_at(points), self._log_weights, self._information, strict=True):
+        states, n_expected = [], 4 + len(prior)
+        for roots, offset, information in zip(
+                self._roots_at(points), self._offsets, self._information, strict=True):
             white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
             white = np.moveaxis(white, 3, 1).reshape(n, columns.shape[1], -1)
-            n_expected = 4 + len(prior)
             local = assemble(
                 prior, values, white[:, 0], white[:, 1:n_expected], white[:, n_expected:],
                 information_of_covariance=information)
             volume = log_determinant(roots).sum(axis=1)
-            states.append(local._replace(
-                value=local.value + log_weight - volume + self._base.log_volume))
+            states.append(local._replace(value=local.value + offset - volume))
         return _average_of(states)
 
     def _roots_at(self, points: np.ndarray) -> list[np.ndarray]:
@@ -452,7 +465,8 @@ class DispersedLikelihood:
         if latest is None or points is not latest[0]:
             positions = to_positions(points)
             intact = self._intact.covariance_at(positions)
-            excess = self._average.covariance_at(positions) - intact
+            excess = (self._average.covariance_at(positions) - intact if any(self._scales)
+                      else np.zeros(1))
             self._latest = latest = points, [
                 np.linalg.cholesky(intact + scale * excess) for scale in self._scales]
         return latest[1]
