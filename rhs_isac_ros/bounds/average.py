@@ -1,6 +1,7 @@
 """Averages of losses that depend on a codebook through quadratic forms, with gradients.
 
-The average Cramer-Rao bound is one of them.
+The average Cramer-Rao bound is one of them. `by_radiation` is d/dRe(T_i) + i d/dIm(T_i) of an
+objective, complex128 [N_B, N_SB F, N_E].
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -9,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form, region_information
-from rhs_isac_ros.bounds.gradient import quadratic_gradients
 from rhs_isac_ros.bounds.rows import (
     PLAIN,
     CompressedRows,
@@ -22,9 +22,15 @@ from rhs_isac_ros.bounds.rows import (
 )
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
-from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.los import checked_positions, los_and_derivative, los_derivative
-from rhs_isac_ros.model.surface import Beamforming
+from rhs_isac_ros.model.impairments import AppliedBeams, nuisance_of
+from rhs_isac_ros.model.impairments.elements import (
+    element_correlation,
+    error_radiation,
+    error_terms,
+)
+from rhs_isac_ros.model.los import checked_positions, los_and_derivative
+from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
+from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import one_blas_thread
 
@@ -203,12 +209,6 @@ class AverageCrlb(Average):
         if not len(self.positions):
             raise ValueError('positions: none given, expected at least one')
         self._prior = region_information(scenario) if region_prior else np.zeros((3, 3))
-        if not len(nuisance_of(scenario)):
-            super().__init__(
-                scenario,
-                lambda block, band: los_derivative(scenario, self.positions[block], band),
-                len(self.positions), 3, self._trace_of_inverse, tolerance)
-            return
         patterns, combination = _structure(scenario)
 
         def source(block: slice, band: int) -> np.ndarray:
@@ -216,8 +216,9 @@ class AverageCrlb(Average):
             return np.concatenate([derivative, *[gain[:, None]] * len(patterns)], axis=1)
 
         super().__init__(
-            scenario, source, len(self.positions), 3 + len(patterns), self._marginal_trace,
-            tolerance, patterns, combination)
+            scenario, source, len(self.positions), 3 + len(patterns),
+            self._marginal_trace if combination else self._trace_of_inverse,
+            tolerance, patterns or PLAIN, combination)
 
     def _trace_of_inverse(
             self, block: slice, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -242,13 +243,15 @@ class AverageCrlb(Average):
         return values, whole @ by_marginal @ np.swapaxes(whole, 1, 2)
 
 
-def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination]:
+def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
     """Rows of position and nuisance parameters from those of the derivative and of the gain.
 
     A parameter whose pattern is constant in each band multiplies the row of the gain; any other
-    one has a row of its own.
+    one has a row of its own. Without parameters, the derivative is sufficient.
     """
     scaled = nuisance_of(scenario).scaled_patterns
+    if not len(scaled):
+        return [], None
     patterns: list[Pattern] = [(slice(0, 4), None)]
     index, scale = [0, 1, 2], np.ones((scenario.n_bands, 3 + len(scaled)), complex)
     for row, pattern in enumerate(scaled, 3):
@@ -274,3 +277,77 @@ def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
     # Products of single rows take many times as long as one product of arrays.
     product: np.ndarray = weights * parts if parts.shape[1] == 1 else np.matmul(weights, parts)
     return product.view(whitened.dtype)
+
+
+def quadratic_gradients(
+        model: MeasurementModel, codebook: Beamforming, mean_terms: np.ndarray,
+        covariance_terms: np.ndarray, n_items: int, surface: SurfaceEstimate | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the gradients of an average from the sums of `GradientSums` over n items.
+
+    The sums are those of all bands, complex128 [N_B, N_SB F, N_E] and [N_B, N_SB F, N_SB F].
+    Returns the gradients with respect to C and S, in the form of `Gradient`. An estimate of the
+    surface is taken as exact.
+    """
+    scenario = model.scenario
+    through_covariance = np.matmul(
+        np.conj(measurement_correlation(scenario)) * covariance_terms,
+        np.matmul(model.radiation, multipath_covariance(scenario)))
+    by_radiation = 4 * (through_covariance - mean_terms) / n_items
+    terms: list[tuple[np.ndarray | float, np.ndarray | float, np.ndarray]]
+    if surface:
+        by_radiation = np.conj(surface.band_gains)[:, None, None] * by_radiation
+        terms = [(surface.offsets, surface.gains, by_radiation)]
+    else:
+        share = scenario.failed_element_share
+        terms = [(share / 2, 1 - share, by_radiation)]
+    if not model.elements.is_exact:
+        radiation = error_radiation(scenario, codebook)
+        terms += [
+            (*term, _by_error(scenario, of_term, covariance_terms, n_items))
+            for term, of_term in zip(error_terms(scenario), radiation, strict=True)]
+    gradients = [_through_term(scenario, codebook, *term) for term in terms]
+    by_analog, by_digital = (np.sum(parts, axis=0) for parts in zip(*gradients, strict=True))
+    return by_analog, by_digital
+
+
+def _by_error(scenario: Scenario, radiation: np.ndarray, covariance_terms: np.ndarray,
+              n_items: int) -> np.ndarray:
+    """Derivative with respect to a term of `error_radiation` [N_B, N_SB F, N_E]."""
+    return np.stack([
+        4 / n_items * np.einsum(
+            'rsm,sm->rm', np.conj(element_correlation(scenario, band)) * terms[..., None], columns)
+        for band, (terms, columns) in enumerate(zip(covariance_terms, radiation, strict=True))])
+
+
+def _through_term(
+        scenario: Scenario, codebook: Beamforming, constant: np.ndarray | float,
+        slope: np.ndarray | float, by_radiation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients through a radiation matrix (constant + slope C) * (S B), numbers or [N_E]."""
+    beams = AppliedBeams(np.conj(constant + slope * codebook.analog), codebook.digital)
+    return (gradient_analog(scenario, codebook, np.conj(slope) * by_radiation),
+            gradient_digital(scenario, beams, by_radiation))
+
+
+def gradient_analog(
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+    """Implements Proposition 2. Derivative with respect to C_i, float64 [N_B, F, N_E].
+
+    The paper writes the chain rule for every pair of coordinates. Here, the pairs have already
+    been summed in the derivative with respect to T_i.
+    """
+    weights = np.matmul(codebook.digital, onboard_matrix(scenario))
+    by_radiation = by_radiation.reshape(weights.shape)
+    gradient: np.ndarray = np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
+    return gradient
+
+
+def gradient_digital(
+        scenario: Scenario, codebook: Beamforming, by_radiation: np.ndarray) -> np.ndarray:
+    """Implements Proposition 3. Derivative d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K]."""
+    onboard = onboard_matrix(scenario)
+    n_bands, n_subbands, _, n_elements = onboard.shape
+    by_radiation = by_radiation.reshape(n_bands, n_subbands, -1, n_elements)
+    weighted = by_radiation * codebook.analog[:, None]
+    gradient: np.ndarray = np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))
+    return gradient

@@ -127,18 +127,7 @@ def fisher_information(
 
 def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Compute `fisher_information` for a model, whose whitener is shared by all calls."""
-    positions = checked_positions(positions)
-    information = np.zeros((len(positions), 3, 3))
-    whiteners = model.whitener
-
-    def fill(start: int) -> None:
-        block = slice(start, start + _BLOCK)
-        for band, whitener in enumerate(whiteners):
-            whitened = model.band_jacobian(positions[block], band) @ whitener.T
-            information[block] += quadratic_form(whitened)
-
-    map_blocks(fill, range(0, len(positions), _BLOCK))
-    return information
+    return _information(model, positions, np.empty((0, *model.shape)))
 
 
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
@@ -147,17 +136,27 @@ def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.n
     Returns float64 [N, 3 + Q, 3 + Q]; nuisance parameters are scaled so that their prior is
     standard normal, and units do not matter.
     """
+    return _information(model, positions, nuisance_of(model.scenario).scaled_patterns)
+
+
+def _information(
+        model: MeasurementModel, positions: np.ndarray, patterns: np.ndarray) -> np.ndarray:
+    """Information about the position and the Q parameters of patterns [Q, N_B, N_SB F]."""
     positions = checked_positions(positions)
-    patterns = nuisance_of(model.scenario).scaled_patterns
-    size = 3 + len(patterns)
-    information = np.zeros((len(positions), size, size))
-    for start in range(0, len(positions), _BLOCK):
+    information = np.zeros((len(positions), *[3 + len(patterns)] * 2))
+    whiteners = model.whitener
+
+    def fill(start: int) -> None:
         block = slice(start, start + _BLOCK)
-        directions = patterns * model.mean(positions[block])[:, None]
-        for band, whitener in enumerate(model.whitener):
-            rows = np.concatenate(
-                [model.band_jacobian(positions[block], band), directions[:, :, band]], axis=1)
+        if len(patterns):
+            directions = patterns * model.mean(positions[block])[:, None]
+        for band, whitener in enumerate(whiteners):
+            rows = model.band_jacobian(positions[block], band)
+            if len(patterns):
+                rows = np.concatenate([rows, directions[:, :, band]], axis=1)
             information[block] += quadratic_form(rows @ whitener.T)
+
+    map_blocks(fill, range(0, len(positions), _BLOCK))
     return information
 
 
@@ -170,8 +169,10 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
     """
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(whitened.real.dtype)
-    # Products of single rows take many times as long as one sum over arrays.
-    form: np.ndarray = 2 * (np.einsum('nar,nar->na', parts, parts)[:, None]
-                            if parts.shape[1] == 1
-                            else np.matmul(parts, np.swapaxes(parts, 1, 2)))
-    return form
+    if parts.shape[1] == 1:
+        # Products of single rows take many times as long as one sum over arrays.
+        form = np.einsum('nar,nar->na', parts, parts)[..., None]
+    else:
+        form = np.matmul(parts, np.swapaxes(parts, 1, 2))
+    doubled: np.ndarray = 2 * form
+    return doubled

@@ -165,5 +165,4 @@ def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndar
 def _real(signals: np.ndarray) -> np.ndarray:
     """Complex signals [..., N_B, R] as real vectors [..., 2 N_B R]."""
     flat = np.ascontiguousarray(signals).reshape(*signals.shape[:-2], -1)
-    parts: np.ndarray = flat.view(float)
-    return parts
+    return flat.view(float)

@@ -2,19 +2,17 @@
 
 A row is a linear function of one band's line-of-sight gains, such as their derivative with respect
 to one coordinate, or their difference between two positions. Its mean is the same function of the
-mean signals; `mean_derivative`, Eq. (13), computes it. The objectives are functions of whitened
-means, whose computation takes most of their time.
+mean signals, as in Eq. (13). The objectives are functions of whitened means, whose computation
+takes most of their time.
 """
 
 import copy
-import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
-from rhs_isac_ros.model.measurement import mean_derivative
 
 # Callable that takes (block of n items, band) and returns the items' rows, complex128
 # [n, G, N_SB, N_E].
@@ -54,108 +52,151 @@ class GradientSums(NamedTuple):
     covariance_term: np.ndarray
 
 
-class Evaluation(Protocol):
+class MeasurementRows:
+    """Rows of all items and bands, as coefficients of basis vectors.
+
+    The sub-bands of a band form J groups of S, whose bases are complex128 [J, S, N_E, R]; None
+    if the coefficients are the rows themselves, with S = 1 and R = N_E.
+    """
+
+    def __init__(self, scenario: Scenario, n_items: int, n_rows: int,
+                 patterns: Sequence[Pattern], n_groups: int) -> None:
+        self.n_items, self.n_rows, self.patterns = n_items, n_rows, patterns
+        self.n_groups, self._n_in_group = n_groups, scenario.n_subbands // n_groups
+        self.bases: list[np.ndarray | None] = [None] * scenario.n_bands
+
+    def begin(self, model: MeasurementModel) -> 'Evaluation':
+        """Begin an evaluation with the radiation and whitening matrices of a model."""
+        return Evaluation(self, model)
+
+    def in_block(self, block: slice, band: int) -> np.ndarray:
+        """Return the coefficients of a block of n items, complex [J, n, G, R]."""
+        raise NotImplementedError
+
+    def means(self, band: int, radiation: np.ndarray) -> np.ndarray:
+        """Return the means of the basis vectors, complex128 [J, R, S F]."""
+        frames = radiation.reshape(self.n_groups, self._n_in_group, -1, radiation.shape[-1])
+        basis = self.bases[band]
+        means = frames if basis is None else np.matmul(frames, np.conj(basis))
+        return np.ascontiguousarray(
+            np.swapaxes(means.reshape(self.n_groups, -1, means.shape[-1]), 1, 2))
+
+    def sums(self, band: int, weights: np.ndarray) -> np.ndarray:
+        """Return the sums of weights [J, R, S F] and basis vectors, complex128 [N_SB F, N_E]."""
+        frames = np.swapaxes(weights, 1, 2).reshape(
+            self.n_groups, self._n_in_group, -1, weights.shape[1])
+        basis = self.bases[band]
+        sums = frames if basis is None else np.matmul(frames, np.swapaxes(basis, 2, 3))
+        return sums.reshape(-1, sums.shape[-1])
+
+
+class Evaluation:
     """Whitened means for one measurement model and the sums for its gradient, in blocks."""
+
+    def __init__(self, rows: MeasurementRows, model: MeasurementModel) -> None:
+        self._rows, self._whitener = rows, model.whitener
+        # The filters of a single group include patterns and whitening, which then cost no time
+        # per item. Several groups have these after their means are joined.
+        self._is_folded = rows.n_groups == 1
+        self._patterns = rows.patterns if self._is_folded else PLAIN
+        self._filters = [
+            [self._filter(rows.means(band, radiation), band, pattern)
+             for _, pattern in self._patterns]
+            for band, radiation in enumerate(model.radiation)]
+        self._weights = [[np.zeros_like(one) for one in filters] for filters in self._filters]
+        self._last = [np.empty(0)] * len(self._whitener)
+        # Sums of weighted whitened means times whitened means.
+        self._products = np.zeros_like(self._whitener)
+
+    def _filter(self, means: np.ndarray, band: int, pattern: np.ndarray | None) -> np.ndarray:
+        if pattern is not None:
+            means = means * pattern[band]
+        return np.matmul(means, self._whitener[band].T) if self._is_folded else means
 
     def whitened(self, block: slice, band: int) -> np.ndarray:
         """Compute the whitened means of a block of n items, complex128 [n, G, N_SB F]."""
-        ...
+        rows = self._rows.in_block(block, band)
+        n_groups, n, n_rows, rank = rows.shape
+        means = np.empty((n, n_rows, n_groups, self._filters[band][0].shape[2]), rows.dtype)
+        for (part, _), filters in zip(self._patterns, self._filters[band], strict=True):
+            chosen = means[:, part]
+            product = np.matmul(rows[:, :, part].reshape(n_groups, -1, rank),
+                                filters.astype(rows.dtype, copy=False))
+            chosen[...] = np.moveaxis(
+                product.reshape(n_groups, *chosen.shape[:2], -1), 0, 2)
+        whitened = means.reshape(n, n_rows, -1)
+        if not self._is_folded:
+            for part, pattern in self._rows.patterns:
+                if pattern is not None:
+                    whitened[:, part] *= pattern[band]
+            whitened = self._last[band] = np.matmul(whitened, self._whitener[band].T)
+        return whitened
 
     def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
         """Add a block's weighted whitened means, complex128 [n, G, N_SB F], to the sums.
 
         The last call of `whitened` for this band must have been for the same block.
         """
-        ...
+        if not self._is_folded:
+            flat, last = (one.reshape(-1, one.shape[2]) for one in (weighted, self._last[band]))
+            self._products[band] += flat.T @ np.conj(last)
+            weighted = np.matmul(weighted, np.conj(self._whitener[band]))
+            for part, pattern in self._rows.patterns:
+                if pattern is not None:
+                    weighted[:, part] *= np.conj(pattern[band])
+        rows = self._rows.in_block(block, band)
+        n_groups, n, n_rows, rank = rows.shape
+        # Accumulate the conjugate, so that the coefficients need not be copied.
+        grouped = np.conj(weighted).reshape(n, n_rows, n_groups, -1)
+        for (part, _), weights in zip(self._patterns, self._weights[band], strict=True):
+            chosen = rows[:, :, part].reshape(n_groups, -1, rank)
+            weights += np.matmul(
+                np.swapaxes(chosen, 1, 2),
+                np.moveaxis(grouped[:, part], 2, 0).reshape(n_groups, chosen.shape[1], -1))
 
     def sums(self, band: int) -> GradientSums:
         """Return the sums over the blocks that were accumulated."""
-        ...
+        whitener, products = self._whitener[band], self._products[band]
+        total: np.ndarray = np.zeros(())
+        for (_, pattern), filters, gathered in zip(
+                self._patterns, self._filters[band], self._weights[band], strict=True):
+            weights = np.conj(gathered)
+            if self._is_folded:
+                products = products + weights[0].T @ np.conj(filters[0])
+                weights = np.matmul(weights, np.conj(whitener))
+            if pattern is not None:
+                weights = weights * np.conj(pattern[band])
+            total = total + weights
+        return GradientSums(
+            self._rows.sums(band, total), np.conj(whitener.T) @ products @ whitener)
 
 
-class MeasurementRows(Protocol):
-    """Rows of all items and bands."""
-
-    n_items: int
-
-    def begin(self, model: MeasurementModel) -> Evaluation:
-        """Begin an evaluation with the radiation and whitening matrices of a model."""
-        ...
-
-
-class ExactRows:
+class ExactRows(MeasurementRows):
     """Rows without approximation, kept between evaluations if they fit within the memory limit."""
 
     def __init__(
             self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
             patterns: Sequence[Pattern] = PLAIN) -> None:
-        self.n_items, self._source, self.patterns = n_items, source, patterns
+        super().__init__(scenario, n_items, n_rows, patterns, n_groups=scenario.n_subbands)
+        self._source = source
         size = 16 * n_items * n_rows * scenario.n_bands * scenario.n_subbands * scenario.n_elements
         self._keeps_all = size <= _CACHE_BYTES
         # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
         self._kept: dict[tuple[int, int], np.ndarray] = {}
 
-    def begin(self, model: MeasurementModel) -> Evaluation:
-        """Begin an evaluation with the radiation and whitening matrices of a model."""
-        return _ExactEvaluation(self, model)
-
-    def rows(self, block: slice, band: int) -> np.ndarray:
-        """Return the rows of a block, complex128 [n, G, N_SB, N_E], sub-bands first in memory."""
+    def in_block(self, block: slice, band: int) -> np.ndarray:
+        """Return the rows of a block, complex128 [N_SB, n, G, N_E]."""
         key = block.start, band
         if key not in self._kept:
             if not self._keeps_all and any(start != block.start for start, _ in self._kept):
                 self._kept.clear()
-            rows = self._source(block, band)
             # With sub-bands first, every matrix product reads contiguous memory.
-            rows = np.moveaxis(np.ascontiguousarray(np.moveaxis(rows, 2, 0)), 0, 2)
-            self._kept[key] = rows
+            self._kept[key] = np.ascontiguousarray(
+                np.moveaxis(self._source(block, band), 2, 0))
         return self._kept[key]
 
 
-class _ExactEvaluation:
-    """One evaluation of `ExactRows`; keeps the whitened means of the last block."""
-
-    def __init__(self, rows: ExactRows, model: MeasurementModel) -> None:
-        self._rows, self._radiation, self._whitener = rows, model.radiation, model.whitener
-        self._mean_term = np.zeros_like(self._radiation)
-        self._covariance_term = np.zeros_like(self._whitener)
-        self._last: list[np.ndarray] = [np.empty(0)] * len(self._radiation)
-
-    def whitened(self, block: slice, band: int) -> np.ndarray:
-        means = mean_derivative(self._rows.rows(block, band), self._radiation[band])
-        for rows, pattern in self._rows.patterns:
-            if pattern is not None:
-                means[:, rows] *= pattern[band]
-        self._last[band] = means @ self._whitener[band].T
-        return self._last[band]
-
-    def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
-        whitener = self._whitener[band]
-        n_measurements = len(whitener)
-        zeta = self._last[band].reshape(-1, n_measurements) @ np.conj(whitener)
-        weights = weighted.reshape(-1, n_measurements) @ np.conj(whitener)
-        self._covariance_term[band] += weights.T @ np.conj(zeta)
-        rows = self._rows.rows(block, band)
-        n, n_rows, n_subbands, n_elements = rows.shape
-        for part, pattern in self._rows.patterns:
-            if pattern is not None:
-                weights.reshape(n, n_rows, -1)[:, part] *= np.conj(pattern[band])
-        stacked = np.moveaxis(rows, 2, 0).reshape(n_subbands, n * n_rows, n_elements)
-        weights = np.conj(weights).reshape(n * n_rows, n_subbands, -1).transpose(1, 2, 0)
-        self._mean_term[band] += np.conj(np.matmul(weights, stacked)).reshape(-1, n_elements)
-
-    def sums(self, band: int) -> GradientSums:
-        return GradientSums(self._mean_term[band], self._covariance_term[band])
-
-
-def blocks(n_items: int, n_rows: int = 3) -> Iterator[slice]:
-    """Split items of `n_rows` rows each, in order, into blocks that fit into the cache."""
-    size = max(3 // n_rows, 1) * _BLOCK
-    for start in range(0, n_items, size):
-        yield slice(start, min(start + size, n_items))
-
-
-class CompressedRows:
+class CompressedRows(MeasurementRows):
     """Rows as coefficients in a basis: less memory, and one large matrix product per band.
 
     Over a region of interest, the rows of all positions and sub-bands span, to a given accuracy,
@@ -170,22 +211,19 @@ class CompressedRows:
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                  tolerance: float, patterns: Sequence[Pattern] = PLAIN) -> None:
-        self.n_items, self._n_rows, self._patterns = n_items, n_rows, patterns
-        n_subbands, n_elements = scenario.n_subbands, scenario.n_elements
-
-        def flat_rows(block: slice, band: int) -> np.ndarray:
-            # A single item can have another memory layout, of which a view as real numbers fails.
-            return np.ascontiguousarray(
-                source(block, band).reshape(-1, n_subbands * n_elements))
-
+        super().__init__(scenario, n_items, n_rows, patterns, n_groups=1)
         self.coefficients: list[np.ndarray] = []
-        self.bases: list[np.ndarray] = []
         for band in range(scenario.n_bands):
+            def flat_rows(block: slice, band: int = band) -> np.ndarray:
+                # A single item can have another memory layout, of which a view as real numbers
+                # fails.
+                rows = source(block, band)
+                return np.ascontiguousarray(rows.reshape(-1, rows.shape[2] * rows.shape[3]))
+
             coefficients, basis = _compress(
-                functools.partial(flat_rows, band=band), n_items, n_rows, tolerance,
-                _first_sketch(scenario))
+                flat_rows, n_items, n_rows, tolerance, _first_sketch(scenario))
             self.coefficients.append(coefficients)
-            self.bases.append(basis.reshape(n_subbands, n_elements, -1))
+            self.bases[band] = basis.reshape(1, scenario.n_subbands, scenario.n_elements, -1)
 
     def chosen(self, items: np.ndarray) -> 'CompressedRows':
         """Return the rows of some items, int [n], with coefficients in single precision.
@@ -195,7 +233,7 @@ class CompressedRows:
         """
         rows = copy.copy(self)
         rows.n_items = len(items)
-        numbers = (items[:, None] * self._n_rows + np.arange(self._n_rows)).ravel()
+        numbers = (items[:, None] * self.n_rows + np.arange(self.n_rows)).ravel()
         rows.coefficients = [
             coefficients[numbers].astype(np.complex64) for coefficients in self.coefficients]
         return rows
@@ -203,78 +241,24 @@ class CompressedRows:
     @property
     def ranks(self) -> tuple[int, ...]:
         """Dimensions of the basis of each band."""
-        return tuple(basis.shape[-1] for basis in self.bases)
+        return tuple(coefficients.shape[1] for coefficients in self.coefficients)
 
-    def begin(self, model: MeasurementModel) -> Evaluation:
-        """Begin an evaluation with the radiation and whitening matrices of a model."""
-        return _CompressedEvaluation(
-            self.coefficients, self.bases, self._n_rows, self._patterns, model)
+    def in_block(self, block: slice, band: int) -> np.ndarray:
+        """Return the coefficients of a block, complex [1, n, G, R]."""
+        rows = self.coefficients[band][block.start * self.n_rows:block.stop * self.n_rows]
+        return rows.reshape(1, -1, self.n_rows, rows.shape[1])
 
 
-class _CompressedEvaluation:
-    """One evaluation of `CompressedRows`, in the basis of each band."""
-
-    def __init__(self, coefficients: Sequence[np.ndarray], bases: Sequence[np.ndarray],
-                 n_rows: int, patterns: Sequence[Pattern], model: MeasurementModel) -> None:
-        self._coefficients, self._bases, self._n_rows = coefficients, bases, n_rows
-        self._patterns, self._whitener = patterns, model.whitener
-        # The filters of a pattern include whitening, which therefore costs no time per item.
-        self._filters: list[list[np.ndarray]] = []
-        for band, (basis, whitener) in enumerate(zip(bases, model.whitener, strict=True)):
-            means = _filters(basis, model.radiation[band])
-            self._filters.append([
-                (means if pattern is None else means * pattern[band]) @ whitener.T
-                for _, pattern in patterns])
-        self._weights = [[np.zeros_like(one) for one in filters] for filters in self._filters]
-
-    def _rows(self, block: slice, band: int) -> np.ndarray:
-        rows = self._coefficients[band][block.start * self._n_rows:block.stop * self._n_rows]
-        return rows.reshape(-1, self._n_rows, rows.shape[1])
-
-    def whitened(self, block: slice, band: int) -> np.ndarray:
-        rows = self._rows(block, band)
-        n_measurements = self._filters[band][0].shape[1]
-        whitened = np.empty((*rows.shape[:2], n_measurements), rows.dtype)
-        for (part, _), filters in zip(self._patterns, self._filters[band], strict=True):
-            chosen = rows[:, part]
-            product = chosen.reshape(-1, chosen.shape[-1]) @ filters.astype(rows.dtype, copy=False)
-            whitened[:, part] = product.reshape(*chosen.shape[:2], n_measurements)
-        return whitened
-
-    def accumulate(self, block: slice, band: int, weighted: np.ndarray) -> None:
-        rows = self._rows(block, band)
-        for (part, _), weights in zip(self._patterns, self._weights[band], strict=True):
-            chosen, of_part = rows[:, part], weighted[:, part]
-            # Accumulate the conjugate, so that the coefficients need not be copied.
-            weights += (chosen.reshape(-1, chosen.shape[-1]).T
-                        @ np.conj(of_part.reshape(-1, of_part.shape[-1])))
-
-    def sums(self, band: int) -> GradientSums:
-        basis, whitener = self._bases[band], self._whitener[band]
-        n_subbands, n_elements, _ = basis.shape
-        total: np.ndarray = np.zeros(())
-        covariance_term = np.zeros_like(whitener)
-        for (_, pattern), filters, gathered in zip(
-                self._patterns, self._filters[band], self._weights[band], strict=True):
-            weights = np.conj(gathered) @ np.conj(whitener)
-            covariance_term += weights.T @ np.conj(filters @ np.conj(whitener))
-            total = total + (weights if pattern is None else weights * np.conj(pattern[band]))
-        frames = np.moveaxis(total.reshape(len(total), n_subbands, -1), 1, 0)
-        mean_term = np.swapaxes(np.matmul(basis, frames), 1, 2).reshape(-1, n_elements)
-        return GradientSums(mean_term, covariance_term)
+def blocks(n_items: int, n_rows: int = 3) -> Iterator[slice]:
+    """Split items of `n_rows` rows each, in order, into blocks that fit into the cache."""
+    size = max(3 // n_rows, 1) * _BLOCK
+    for start in range(0, n_items, size):
+        yield slice(start, min(start + size, n_items))
 
 
 def _first_sketch(scenario: Scenario) -> int:
     """Columns of the first sketch: enough for Table I, and more for larger surfaces."""
     return max(_MIN_SKETCH, scenario.n_elements // 2)
-
-
-def _filters(basis: np.ndarray, radiation: np.ndarray) -> np.ndarray:
-    """Means of the vectors of a basis, complex128 [R, N_SB F]."""
-    n_subbands, n_elements, rank = basis.shape
-    frames = radiation.reshape(n_subbands, -1, n_elements)
-    products = np.matmul(frames, np.conj(basis))
-    return np.ascontiguousarray(products.reshape(-1, rank).T)
 
 
 def _compress(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
@@ -290,45 +274,44 @@ def _compress(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
         wanted = tolerance if len(used) == len(every) else _SKETCH_MARGIN * tolerance
         n_used = sum(block.stop - block.start for block in used) * n_rows
         basis = _sketch(rows_of, used, min(size, n_used))
-        coefficients, norms = _project(rows_of, used, basis)
-        keep, error = _leading(coefficients, norms, wanted)
-        if error <= wanted or basis.shape[1] < size:
-            if len(used) == len(every):
-                return coefficients @ keep, basis @ keep
-            basis = basis @ keep
-            coefficients, norms = _project(rows_of, every, basis)
-            if _missing(coefficients, norms) <= tolerance**2:
-                return coefficients, basis
-            used = every
-        else:
+        coefficients, relative = _project(rows_of, used, basis)
+        keep, error = _leading(relative, wanted)
+        if error > wanted and basis.shape[1] == size:
             size *= 2
+            continue
+        if len(used) == len(every):
+            return coefficients @ keep, basis @ keep
+        basis = basis @ keep
+        coefficients, relative = _project(rows_of, every, basis)
+        if _missing(relative) <= tolerance**2:
+            return coefficients, basis
+        used = every
 
 
 def _project(rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice],
              basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of the rows of some blocks [n, R], and the rows' norms [n]."""
+    """Coefficients [n, R] of the rows of some blocks, and of those not zero, at unit length."""
     coefficients, norms = [], []
     for block in chosen:
         rows = rows_of(block)
         coefficients.append(rows @ basis)
         norms.append(np.linalg.norm(rows, axis=1))
-    return np.concatenate(coefficients), np.concatenate(norms)
+    whole, lengths = np.concatenate(coefficients), np.concatenate(norms)
+    return whole, whole[lengths > 0] / lengths[lengths > 0, None]
 
 
-def _leading(coefficients: np.ndarray, norms: np.ndarray,
-             tolerance: float) -> tuple[np.ndarray, float]:
+def _leading(relative: np.ndarray, tolerance: float) -> tuple[np.ndarray, float]:
     """Directions to keep [S, R], and the error with all of them, in the measure of `tolerance`."""
-    relative = coefficients[norms > 0] / norms[norms > 0, None]
     values, vectors = np.linalg.eigh(np.conj(relative.T) @ relative / max(len(relative), 1))
-    missing = _missing(coefficients, norms)
+    missing = _missing(relative)
     tails = missing + np.concatenate([[0.0], np.cumsum(np.maximum(values, 0.0))])
     cut = int(np.searchsorted(tails, tolerance**2, side='right')) - 1
     return vectors[:, max(cut, 0):], missing**0.5
 
 
-def _missing(coefficients: np.ndarray, norms: np.ndarray) -> float:
+def _missing(relative: np.ndarray) -> float:
     """Mean square of the part of the rows, of unit length, that lies outside of the basis."""
-    lengths = np.linalg.norm(coefficients[norms > 0], axis=1) / norms[norms > 0]
+    lengths = np.linalg.norm(relative, axis=1)
     return max(1.0 - float(np.sum(lengths**2)) / max(len(lengths), 1), 0.0)
 
 
@@ -343,5 +326,4 @@ def _sketch(
         weights = rng.normal(size=(size, len(rows))) / np.where(norms == 0, 1.0, norms)
         # A real product takes a quarter of the operations of a complex one.
         mixtures = mixtures + weights @ rows.view(float)
-    basis: np.ndarray = np.linalg.qr(np.conj(mixtures.view(complex).T))[0]
-    return basis
+    return np.linalg.qr(np.conj(mixtures.view(complex).T))[0]

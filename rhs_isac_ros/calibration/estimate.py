@@ -231,12 +231,10 @@ class PilotStatistics:
         # Thermal noise is not subject to the gain.
         excess = scenario.noise_power_w * (1 / np.abs(gains)**2 - 1)
         total += excess[:, None, None] * np.eye(total.shape[1])
-        whiteners: np.ndarray = np.linalg.inv(np.linalg.cholesky(total))
-        return whiteners
+        return np.linalg.inv(np.linalg.cholesky(total))
 
     def _factors(self, values: np.ndarray) -> np.ndarray:
-        factors: np.ndarray = np.exp(-np.tensordot(values, self._patterns, axes=1))
-        return factors
+        return np.exp(-np.tensordot(values, self._patterns, axes=1))
 
     def _align(self, part: '_Block', signals: np.ndarray, values: np.ndarray) -> None:
         """Set the phases to those of the expected signals."""
@@ -274,8 +272,7 @@ class PilotStatistics:
         are visible there. Their derivatives are therefore those of the signals, not of the mean.
         """
         sources = np.where(self._is_sharp[:, None, None], aligned[:, None], part.plain[:, None])
-        directions: np.ndarray = self._patterns * sources
-        return directions
+        return self._patterns * sources
 
     def _curvature(self, slopes: np.ndarray) -> np.ndarray:
         n, n_values = slopes.shape[:2]

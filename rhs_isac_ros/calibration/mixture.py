@@ -66,34 +66,28 @@ class Posterior(NamedTuple):
     def complex_mean(self) -> np.ndarray:
         """Return the mean, complex128 [P]."""
         real, imag = np.split(self.mean, 2)
-        mean: np.ndarray = real + 1j * imag
-        return mean
+        return real + 1j * imag
 
     def complex_covariance(self) -> np.ndarray:
         """Return the covariance E[z z^H] of the errors z, complex128 [P, P]."""
-        p = len(self.mean) // 2
-        c = self.covariance
-        covariance: np.ndarray = (
-            c[:p, :p] + c[p:, p:] + 1j * (c[p:, :p] - c[:p, p:]))
+        top, bottom = np.split(self.covariance, 2)
+        (rr, ri), (ir, ii) = np.split(top, 2, axis=1), np.split(bottom, 2, axis=1)
+        covariance: np.ndarray = rr + ii + 1j * (ir - ri)
         return covariance
 
 
 def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> Posterior:
     """Return the prior, which `surface_posterior` also yields from no information."""
-    n, size = n_elements, 2 * n_elements + band_rms.shape[1]
-    share, variance = prior.failed_element_share, max(prior.element_error_rms, _MIN_RMS)**2 / 2
-    mixing = share * (1 - share)
-    mean, variances = np.zeros(2 * size), np.zeros(2 * size)
-    mean[:n], mean[n:2 * n] = 1 - share, share / 2
-    variances[:n] = (1 - share) * variance + mixing
-    variances[n:2 * n] = share * (1 / 12 + variance / 3) + mixing / 4
-    variances[size:size + n] = (1 - share) * variance
-    variances[size + n:size + 2 * n] = share * variance / 3
-    variances[2 * n:size], variances[size + 2 * n:] = np.maximum(band_rms, _MIN_RMS)**2
-    covariance = np.diag(variances)
-    gains = np.arange(n)
-    covariance[gains, gains + n] = covariance[gains + n, gains] = -mixing / 2
-    return Posterior(mean, covariance, np.zeros(n, bool), np.full(n, share))
+    n, n_bands = n_elements, band_rms.shape[1]
+    size = 2 * (2 + n_bands)
+    one = surface_posterior(np.zeros((size, size)), np.zeros(size), prior, band_rms,
+                            np.zeros(1, bool))
+    # Every element is like that one, and independent of the others.
+    like = np.repeat(np.arange(size), [n, n, *[1] * n_bands] * 2)
+    owner = np.tile([*range(n), *range(n), *[n] * n_bands], 2)
+    covariance = one.covariance[np.ix_(like, like)] * (owner[:, None] == owner)
+    return Posterior(one.mean[like], covariance, np.repeat(one.failed, n),
+                     np.repeat(one.failed_probability, n))
 
 
 def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: SurfacePrior,
@@ -189,36 +183,34 @@ class _Search:
         """Log odds of the other state of each element, given the states of the others [N_E]."""
         active, inactive = self._indices(failed), self._indices(~failed)
         mean, covariance = self._solve(active)
-        half = len(active) // 2
+        # Real and imaginary part of each element [N_E, 2].
+        own = np.arange(self._n_elements)[:, None] + [0, len(active) // 2]
+        pairs = own[:, :, None], own[:, None]
+        # Information about each element with all others eliminated, as it is ...
+        curvature = np.linalg.inv(covariance[pairs])
+        gradient = np.einsum('mxy,my->mx', curvature, mean[own])
+        # ... and in its other state. Conditional on the element itself, it is smaller by the part
+        # that the element explains.
         coupling = self._information[np.ix_(active, inactive)]
         product = covariance @ coupling
-        result = np.empty(self._n_elements)
-        for m in range(self._n_elements):
-            own = np.array([m, m + half])
-            block = covariance[:, own]
-            inverse = np.linalg.inv(block[own])
-            # Marginal of the element given all others, as it is.
-            present = self._log_evidence(active[own], inverse, inverse @ mean[own])
-            # The same for the other state, after the element was removed from the others.
-            column = coupling[:, own].copy()
-            reduced = product[:, own] - block @ column[own]
-            column[own] = 0.0
-            without = mean - block @ self._shift[active[own]]
-            removed = column.T @ block @ inverse
-            schur = column.T @ reduced - removed @ (block.T @ column)
-            moved = column.T @ without - removed @ without[own]
-            x = inactive[own]
-            curvature = np.diag(self._precision[x]) + self._information[np.ix_(x, x)] - schur
-            absent = self._log_evidence(x, curvature, self._shift[x] - moved)
-            prior = self._log_prior_odds if not failed[m] else -self._log_prior_odds
-            result[m] = absent - present + prior
-        return result
+        explained, columns = product[pairs], coupling[:, own]
+        x = inactive[own]
+        other_curvature = (
+            self._information[x[:, :, None], x[:, None]] + self._precision[x, None] * np.eye(2)
+            - np.einsum('imx,imy->mxy', columns, product[:, own])
+            + np.swapaxes(explained, 1, 2) @ curvature @ explained)
+        other_gradient = (self._shift[x] - np.einsum('imx,i->mx', columns, mean)
+                          + np.einsum('myx,my->mx', explained, gradient))
+        odds = np.where(failed, -self._log_prior_odds, self._log_prior_odds)
+        odds += self._log_evidence(x, other_curvature, other_gradient)
+        odds -= self._log_evidence(active[own], curvature, gradient)
+        return odds
 
     def _log_evidence(
-            self, indices: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> float:
-        """Log evidence of two parameters, relative to their absence."""
+            self, indices: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Log evidence of two parameters of each element, relative to their absence [N_E]."""
         precision, mean = self._precision[indices], self._mean[indices]
-        determinant = curvature[0, 0] * curvature[1, 1] - curvature[0, 1] * curvature[1, 0]
-        value = np.log(precision).sum() - np.log(determinant)
-        value += gradient @ np.linalg.solve(curvature, gradient) - precision @ mean**2
-        return float(value) / 2
+        best = np.linalg.solve(curvature, gradient[..., None])[..., 0]
+        exponents = np.log(precision) + gradient * best - precision * mean**2
+        evidence: np.ndarray = exponents.sum(axis=1) - np.linalg.slogdet(curvature)[1]
+        return evidence / 2

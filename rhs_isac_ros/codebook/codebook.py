@@ -14,7 +14,7 @@ import yaml
 from rhs_isac_ros.codebook import provenance_text
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.shapes import check_shape
+from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
 
 # The node whose parameters a codebook file holds, in any namespace.

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import yaml
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.fields import checked
 from rhs_isac_ros.model.gain_pattern import GainPattern
+from rhs_isac_ros.model.scenario import checked
 
 # What can be varied besides the fields of the scenario.
 CODEBOOK, ESTIMATOR = 'codebook', 'estimator'

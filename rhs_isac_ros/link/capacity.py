@@ -10,7 +10,7 @@ import numpy as np
 from rhs_isac_ros.link.band_link import arrays, band_index
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_sums
-from rhs_isac_ros.model.shapes import check_shape
+from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.model.threads import one_blas_thread
 

@@ -30,10 +30,8 @@ def los_gain_at(scenario: Scenario, position: np.ndarray, bands: Sequence[int]) 
     The bands share the distances. Returns complex128 [n, N_SB, N_E].
     """
     offsets, distances = _separation(scenario, np.asarray(position)[None])
-    frequencies = subband_frequencies_hz(scenario)[list(bands), :, None]
-    gain: np.ndarray = np.exp((-2j * np.pi / SPEED_OF_LIGHT_MPS) * (frequencies * distances))
-    gain *= _amplitude(scenario, offsets) / distances / frequencies
-    return gain
+    amplitude = _amplitude(scenario, offsets)
+    return np.concatenate([_gain(scenario, distances, band, amplitude) for band in bands])
 
 
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
@@ -109,7 +107,7 @@ def los_derivative_terms(
     radial *= gain
     if not _has_pattern(scenario):
         return gain, radial, None
-    by_angle = _gain(scenario, distances, band, _amplitude_slope(scenario, offsets))
+    by_angle = _gain(scenario, distances, band, _amplitude(scenario, offsets, slope=True))
     # On boresight, where dtheta/dp has no direction, a smooth pattern has zero slope.
     boresight_offsets = np.hypot(offsets[..., 1], offsets[..., 2])
     sine = np.maximum(boresight_offsets, _MIN_BORESIGHT_OFFSET_M) / distances
@@ -145,29 +143,22 @@ def _has_pattern(scenario: Scenario) -> bool:
                for gain in (scenario.element_gain, scenario.user_gain))
 
 
-def _boresight_angles(offsets: np.ndarray) -> np.ndarray:
-    """Angles [rad] between the boresight and vectors from elements to the user."""
-    angles: np.ndarray = np.arctan2(np.hypot(offsets[..., 1], offsets[..., 2]), offsets[..., 0])
-    return angles
+def _amplitude(
+        scenario: Scenario, offsets: np.ndarray, *, slope: bool = False) -> float | np.ndarray:
+    """Gain times distance and frequency: a number, or float64 [N, N_E] [m Hz].
 
-
-def _amplitude(scenario: Scenario, offsets: np.ndarray) -> float | np.ndarray:
-    """Gain times distance and frequency: a number, or float64 [N, N_E] [m Hz]."""
-    element, user = scenario.element_gain, scenario.user_gain
-    if not isinstance(element, GainPattern) and not isinstance(user, GainPattern):
-        return SPEED_OF_LIGHT_MPS * element * user / (4 * np.pi)
-    angles = _boresight_angles(offsets)
-    gains = amplitude_of(element, angles), amplitude_of(user, angles)
-    return SPEED_OF_LIGHT_MPS * gains[0] * gains[1] / (4 * np.pi)
-
-
-def _amplitude_slope(scenario: Scenario, offsets: np.ndarray) -> float | np.ndarray:
-    """Derivative of `_amplitude` with respect to the angle, float64 [N, N_E] [m Hz/rad]."""
-    angles = _boresight_angles(offsets)
+    On request, its derivative with respect to the angle from the boresight instead [m Hz/rad].
+    """
     gains = scenario.element_gain, scenario.user_gain
-    slopes = [gain.slope(angles) if isinstance(gain, GainPattern) else 0.0 for gain in gains]
+    angles: np.ndarray = np.zeros(())
+    if _has_pattern(scenario):
+        angles = np.arctan2(np.hypot(offsets[..., 1], offsets[..., 2]), offsets[..., 0])
     element, user = (amplitude_of(gain, angles) for gain in gains)
-    return SPEED_OF_LIGHT_MPS * (slopes[0] * user + element * slopes[1]) / (4 * np.pi)
+    if slope:
+        by_element, by_user = (
+            gain.slope(angles) if isinstance(gain, GainPattern) else 0.0 for gain in gains)
+        return SPEED_OF_LIGHT_MPS * (by_element * user + element * by_user) / (4 * np.pi)
+    return SPEED_OF_LIGHT_MPS * element * user / (4 * np.pi)
 
 
 def _gain(scenario: Scenario, distances: np.ndarray, band: int,

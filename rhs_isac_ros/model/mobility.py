@@ -46,11 +46,16 @@ class Leg(NamedTuple):
 
 @runtime_checkable
 class StraightMobility(Mobility, Protocol):
-    """Path of straight legs."""
+    """Path of straight legs; a subclass needs to define `leg` only."""
 
     def leg(self, now_s: float) -> Leg:
         """Return the leg at a time; the times of all calls must not decrease."""
         ...
+
+    def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position [3] [m] and velocity [3] [m/s] on the current leg."""
+        leg = self.leg(now_s)
+        return leg.origin + leg.velocity * (now_s - leg.departure_s), leg.velocity.copy()
 
 
 class Crowd:
@@ -82,15 +87,11 @@ class Crowd:
         return position, velocity
 
 
-class Static:
+class Static(StraightMobility):
     """User that stands still at a position, float64 [3] [m]."""
 
     def __init__(self, position: ArrayLike) -> None:
         self._position = _checked_position(position)
-
-    def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the fixed position [3] [m] and velocity 0 [3] [m/s]."""
-        return self._position.copy(), np.zeros(3)
 
     def leg(self, now_s: float) -> Leg:
         """Return a leg that never ends."""
@@ -126,7 +127,7 @@ class Waypoints:
                 self._speed_mps * self._directions[leg])
 
 
-class RandomWalk:
+class RandomWalk(StraightMobility):
     """User that walks in straight lines between random positions of the region of interest.
 
     The first position is random, unless it is given as `start`, float64 [3] [m].
@@ -140,11 +141,6 @@ class RandomWalk:
         self._target = self._draw()
         self._departure_s: float | None = None
         self._begin_leg()
-
-    def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [3] [m] and velocity [3] [m/s] on the current leg."""
-        leg = self.leg(now_s)
-        return leg.origin + leg.velocity * (now_s - leg.departure_s), leg.velocity.copy()
 
     def leg(self, now_s: float) -> Leg:
         """Return the current leg; the next one begins when it ends."""

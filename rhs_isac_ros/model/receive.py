@@ -15,7 +15,7 @@ _BLOCK = 256
 
 def received_signal(
         los: np.ndarray, multipath: np.ndarray | float, radiation: np.ndarray,
-        noise: np.ndarray | float, symbol: complex = 1.0) -> np.ndarray:
+        noise: np.ndarray | float, symbol: complex | np.ndarray = 1.0) -> np.ndarray:
     """Implements Eq. (8). Received signals y_i of one band, complex128 [..., N_SB F].
 
     Parameters
@@ -29,7 +29,7 @@ def received_signal(
     noise
         Thermal noise e, complex128 [..., N_SB F], or 0.
     symbol
-        The user's symbol x.
+        The user's symbol x, or one for each measurement, complex128 [..., N_SB F].
     """
     n_subbands = los.shape[-2]
     frames = radiation.reshape(n_subbands, -1, radiation.shape[-1])
@@ -77,12 +77,9 @@ def simulate_received(
             los = los_gain(scenario, block, band)
             gains = draw_multipath(scenario, band, len(block), rng)
             noise = amplitude * complex_normal((len(block), n_measurements), rng)
-            if factors is None:
-                block_received = received_signal(los, gains, radiation[band], noise)
-            else:
-                block_received = received_signal(los, gains, radiation[band], 0.0)
-                block_received = block_received * factors[start:start + _BLOCK, band] + noise
-            received[start:start + _BLOCK, band] = block_received
+            symbol = 1.0 if factors is None else factors[start:start + _BLOCK, band]
+            received[start:start + _BLOCK, band] = received_signal(
+                los, gains, radiation[band], noise, symbol)
     return received
 
 

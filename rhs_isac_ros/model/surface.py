@@ -10,8 +10,7 @@ from rhs_isac_ros.model.geometry import (
     feed_positions,
     subband_frequencies_hz,
 )
-from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
-from rhs_isac_ros.model.shapes import check_shape
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario, check_shape
 
 
 class Beamforming(Protocol):

@@ -11,20 +11,15 @@ import hashlib
 
 import numpy as np
 
-from rhs_isac_ros.model.impairments.elements import AppliedBeams
+from rhs_isac_ros.model.impairments.elements import AppliedBeams, DirectErrors, SurfaceModel
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 
-# Quasi-random positions over which the covariance is averaged.
-_LOG2_NODES = 7
-# Positions evaluated at a time.
-_BLOCK = 32
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SurfaceEstimate:
+class SurfaceEstimate(SurfaceModel):
     """Mean and covariance of the coefficients of a surface.
 
     Attributes
@@ -62,8 +57,7 @@ class SurfaceEstimate:
     @property
     def failed(self) -> np.ndarray:
         """Return which elements have probably failed, bool [N_E]."""
-        failed: np.ndarray = self.failed_probability > 0.5
-        return failed
+        return self.failed_probability > 0.5
 
     def std(self) -> np.ndarray:
         """Return the standard deviations of the rows of `factor`, float64 [2 N_E + N_B]."""
@@ -84,52 +78,20 @@ class SurfaceEstimate:
         return AppliedBeams(
             self.applied(beams.analog), self.band_gains[:, None, None, None] * beams.digital)
 
-    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
-        """Compute the covariance of the signals due to the errors of the estimate.
-
-        The result is averaged over the region of interest, complex128 [N_B, N_SB F, N_SB F] [W].
-        """
-        from scipy.stats import qmc
-
-        low, high = scenario.roi_bounds_m
-        positions = low + qmc.Sobol(3, seed=0).random(2**_LOG2_NODES) * (high - low)
-        covariance = self._scattered(scenario, beams)
-        for band in range(scenario.n_bands):
-            for start in range(0, len(positions), _BLOCK):
-                errors = self._direct(scenario, beams, band, positions[start:start + _BLOCK])
-                stacked = np.swapaxes(errors, 0, 1).reshape(errors.shape[1], -1)
-                covariance[band] += stacked @ np.conj(stacked.T) / len(positions)
-        return covariance
-
-    def error_covariance_at(
-            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
-        """Compute `error_covariance` at positions [N, 3], complex128 [N, N_B, N_SB F, N_SB F]."""
-        covariance = np.repeat(self._scattered(scenario, beams)[None], len(positions), axis=0)
-        for band in range(scenario.n_bands):
-            for start in range(0, len(positions), _BLOCK):
-                block = slice(start, start + _BLOCK)
-                errors = self._direct(scenario, beams, band, positions[block])
-                covariance[block, band] += np.matmul(errors, np.conj(np.swapaxes(errors, 1, 2)))
-        return covariance
-
-    def _scattered(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
-        """Covariance from the multipath at erroneous elements [N_B, N_SB F, N_SB F] [W]."""
+    def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
+        """Return the errors, as `SurfaceModel` describes."""
         radiation = element_radiation(scenario, beams)
-        n = 2 * scenario.n_elements
-        errors = self.factor[:n] @ np.conj(self.factor[:n].T)
-        covariance = scattered_errors(scenario, radiation, errors)
-        covariance *= np.abs(self.band_gains[:, None, None])**2
-        return covariance
+        of_elements, of_bands = np.split(self.factor, [2 * scenario.n_elements])
+        scattered = scattered_errors(scenario, radiation, of_elements @ np.conj(of_elements.T))
 
-    def _direct(self, scenario: Scenario, beams: Beamforming, band: int,
-                positions: np.ndarray) -> np.ndarray:
-        """Errors of the direct path for unit white numbers, complex128 [N, N_SB F, R]."""
-        design = direct_design(scenario, element_radiation(scenario, beams), band, positions)
-        errors = design @ self.factor[:2 * scenario.n_elements]
-        mean = design @ np.concatenate([self.gains, self.offsets])
-        errors += mean[..., None] * self.factor[2 * scenario.n_elements + band]
-        scaled: np.ndarray = self.band_gains[band] * errors
-        return scaled
+        def direct(band: int, positions: np.ndarray) -> np.ndarray:
+            design = direct_design(scenario, radiation, band, positions)
+            mean = design @ np.concatenate([self.gains, self.offsets])
+            errors: np.ndarray = self.band_gains[band] * (
+                design @ of_elements + mean[..., None] * of_bands[band])
+            return errors
+
+        return scattered * np.abs(self.band_gains[:, None, None])**2, direct
 
 
 def element_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
@@ -140,8 +102,7 @@ def element_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
     weights = np.matmul(beams.digital, onboard_matrix(scenario))
     configured = beams.analog[:, None] * weights
     both = np.concatenate([configured, weights], axis=-1)
-    radiation: np.ndarray = both.reshape(scenario.n_bands, -1, 2 * scenario.n_elements)
-    return radiation
+    return both.reshape(scenario.n_bands, -1, 2 * scenario.n_elements)
 
 
 def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,

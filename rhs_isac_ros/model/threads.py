@@ -12,21 +12,15 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import Protocol, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy  # noqa: F401 - loads the BLAS that `one_blas_thread` limits
 from threadpoolctl import ThreadpoolController
 
 _Item = TypeVar('_Item')
 _Result = TypeVar('_Result')
-
-
-class _Library(Protocol):
-    """The setting of a BLAS library, as threadpoolctl represents it."""
-
-    def get_num_threads(self) -> int | None: ...
-
-    def set_num_threads(self, num_threads: int) -> None: ...
+# A BLAS library, as threadpoolctl represents it, which has no types.
+_Library: TypeAlias = Any
 
 
 class _OneBlasThread(contextlib.ContextDecorator):
@@ -104,8 +98,8 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
 def _limit(libraries: Iterable[_Library]) -> list[tuple[_Library, int]]:
     """Set libraries to one thread; return those that had more, with the number."""
-    numbers = [(library, library.get_num_threads() or 1) for library in libraries]
-    saved = [(library, number) for library, number in numbers if number > 1]
+    saved = [(library, number) for library in libraries
+             if (number := library.get_num_threads() or 1) > 1]
     for library, _ in saved:
         _set(library, 1)
     return saved
@@ -140,9 +134,8 @@ def map_blocks(
     also applies here. The function must not change data that other blocks use.
     """
     with one_blas_thread:
-        if len(blocks) < 2 or getattr(_worker, 'busy', False):
-            return [function(block) for block in blocks]
-        n_threads = min(one_blas_thread.allowed(), _n_cores(), len(blocks))
+        is_serial = len(blocks) < 2 or getattr(_worker, 'busy', False)
+        n_threads = 1 if is_serial else min(one_blas_thread.allowed(), _n_cores(), len(blocks))
         if n_threads < 2:
             return [function(block) for block in blocks]
         with ThreadPoolExecutor(n_threads, initializer=_mark_worker) as pool:

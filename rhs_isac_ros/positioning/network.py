@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model.archive import ArchiveError, read_archive, write_archive
+from rhs_isac_ros.model.files import ArchiveError, read_archive, write_archive
 from rhs_isac_ros.positioning.estimate import stack_parts
 
 _FORMAT = 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb
-from rhs_isac_ros.bounds.gradient import gradient_analog, gradient_digital
+from rhs_isac_ros.bounds.average import gradient_analog, gradient_digital
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.impairments import AppliedBeams
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate

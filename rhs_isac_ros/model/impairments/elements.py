@@ -15,7 +15,8 @@ differ in phase.
 import dataclasses
 import functools
 import hashlib
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,8 +32,14 @@ from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 # Nodes along each side of the region of interest. Products of the gains of two sub-bands have no
 # carrier and are smooth.
 _ROI_NODES = 8
+# Quasi-random positions over which other covariances are averaged.
+_LOG2_NODES = 7
 # Positions evaluated at a time.
 _BLOCK = 32
+
+# Callable that takes a band and positions, float64 [N, 3] [m], and returns errors of the direct
+# path's signals per unit of R white numbers, complex128 [N, N_SB F, R].
+DirectErrors = Callable[[int, np.ndarray], np.ndarray]
 
 
 class AppliedBeams(NamedTuple):
@@ -42,8 +49,57 @@ class AppliedBeams(NamedTuple):
     digital: np.ndarray
 
 
+class SurfaceModel:
+    """Knowledge of the elements of a surface: expected coefficients and the errors of these.
+
+    A subclass defines `applied_beams`, and if there are errors `is_exact` and `errors`.
+    """
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether there are no errors."""
+        return True
+
+    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
+        """Return the expected beamforming in effect."""
+        raise NotImplementedError
+
+    def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
+        """Return the covariance from the multipath [N_B, N_SB F, N_SB F] and the direct errors."""
+        n_rows = scenario.n_subbands * scenario.n_frames
+        return (np.zeros((scenario.n_bands, n_rows, n_rows), complex),
+                lambda band, positions: np.zeros((len(positions), n_rows, 0), complex))
+
+    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
+        """Compute the covariance due to errors, complex128 [N_B, N_SB F, N_SB F] [W].
+
+        It is the average over the region of interest, and includes the errors of the direct path
+        and of the multipath.
+        """
+        from scipy.stats import qmc
+
+        low, high = scenario.roi_bounds_m
+        nodes = low + qmc.Sobol(3, seed=0).random(2**_LOG2_NODES) * (high - low)
+        covariance: np.ndarray = np.mean([
+            self.error_covariance_at(scenario, beams, block).mean(axis=0)
+            for block in np.split(nodes, len(nodes) // _BLOCK)], axis=0)
+        return covariance
+
+    def error_covariance_at(
+            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
+        """Compute `error_covariance` at positions [N, 3] [m] instead, [N, N_B, N_SB F, N_SB F]."""
+        scattered, direct = self.errors(scenario, beams)
+        covariance = np.repeat(scattered[None], len(positions), axis=0)
+        for band in range(scenario.n_bands):
+            for start in range(0, len(positions), _BLOCK):
+                block = slice(start, start + _BLOCK)
+                errors = direct(band, positions[block])
+                covariance[block, band] += np.matmul(errors, np.conj(np.swapaxes(errors, 1, 2)))
+        return covariance
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
-class ElementErrors:
+class ElementErrors(SurfaceModel):
     """Errors of the elements of one surface, the same in all bands and frames.
 
     Attributes
@@ -56,7 +112,6 @@ class ElementErrors:
 
     gains: np.ndarray
     stuck: np.ndarray
-    is_exact = True
 
     @property
     def id(self) -> str:
@@ -80,48 +135,18 @@ class ElementErrors:
         """Return the beamforming in effect."""
         return AppliedBeams(self.applied(beams.analog), beams.digital)
 
-    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
-        """Return the covariance of `SurfaceModel`: zero."""
-        return np.zeros((scenario.n_bands, *[scenario.n_subbands * scenario.n_frames] * 2))
 
-    def error_covariance_at(
-            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
-        """Return the covariance of `SurfaceModel` at positions: zero."""
-        return np.repeat(self.error_covariance(scenario, beams)[None], len(positions), axis=0)
+class DeclaredElements(SurfaceModel):
+    """The distribution of the elements that a scenario declares."""
 
-
-class SurfaceModel(Protocol):
-    """Knowledge of the elements of a surface: expected coefficients and the errors of these."""
+    def __init__(self, scenario: Scenario) -> None:
+        self._is_exact = not has_errors(scenario)
+        self._failed_share = scenario.failed_element_share
 
     @property
     def is_exact(self) -> bool:
-        """Whether there are no errors."""
-        ...
-
-    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
-        """Return the expected beamforming in effect."""
-        ...
-
-    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
-        """Compute the covariance due to errors, complex128 [N_B, N_SB F, N_SB F] [W].
-
-        It is the average over the region of interest, and includes the errors of the direct path
-        and of the multipath.
-        """
-        ...
-
-    def error_covariance_at(
-            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
-        """Compute `error_covariance` at positions [N, 3] [m] instead, [N, N_B, N_SB F, N_SB F]."""
-        ...
-
-
-class DeclaredElements:
-    """The distribution of the elements that a scenario declares: a `SurfaceModel`."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.is_exact = not has_errors(scenario)
-        self._failed_share = scenario.failed_element_share
+        """Whether the scenario declares no errors."""
+        return self._is_exact
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
         """Return the beamforming in effect, averaged over surfaces."""
@@ -130,33 +155,28 @@ class DeclaredElements:
         return AppliedBeams(analog, beams.digital)
 
     def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
-        """Compute the covariance, as `SurfaceModel` describes."""
-        radiation = error_radiation(scenario, beams)
-        covariance = np.empty((scenario.n_bands, *[radiation.shape[2]] * 2), complex)
-        for band in range(scenario.n_bands):
-            products = np.einsum('trm,tsm->rsm', radiation[:, band], np.conj(radiation[:, band]))
-            covariance[band] = np.sum(products * element_correlation(scenario, band), axis=2)
-        return covariance
+        """Compute the covariance, as `SurfaceModel` describes, from cached correlations."""
+        covariance = []
+        for band, radiation in enumerate(np.swapaxes(error_radiation(scenario, beams), 0, 1)):
+            products = np.einsum('trm,tsm->rsm', radiation, np.conj(radiation))
+            covariance.append(np.sum(products * element_correlation(scenario, band), axis=2))
+        return np.stack(covariance)
 
-    def error_covariance_at(
-            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
-        """Compute the covariance at positions, as `SurfaceModel` describes."""
-        radiation = error_radiation(scenario, beams)
-        _, n_bands, n_rows, _ = radiation.shape
-        covariance = np.empty((len(positions), n_bands, n_rows, n_rows), complex)
-        for band in range(n_bands):
-            stacked = np.moveaxis(radiation[:, band], 0, 1)
-            power = np.diagonal(multipath_covariance(scenario)[band]).real
-            flat = (stacked * np.sqrt(power)).reshape(n_rows, -1)
-            scattered = measurement_correlation(scenario)[band] * (flat @ np.conj(flat.T))
-            for start in range(0, len(positions), _BLOCK):
-                block = slice(start, start + _BLOCK)
-                gains = np.repeat(
-                    los_gain(scenario, positions[block], band), scenario.n_frames, axis=1)
-                direct = (stacked * gains[:, :, None]).reshape(len(gains), n_rows, -1)
-                covariance[block, band] = scattered + np.matmul(
-                    direct, np.conj(np.swapaxes(direct, 1, 2)))
-        return covariance
+    def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
+        """Return the errors, as `SurfaceModel` describes."""
+        # [N_B, N_SB F, T, N_E]
+        radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
+        n_bands, n_rows, n_terms, n_elements = radiation.shape
+        power = np.diagonal(multipath_covariance(scenario), axis1=1, axis2=2).real
+        flat = (radiation * np.sqrt(power)[:, None, None]).reshape(n_bands, n_rows, -1)
+        scattered = np.matmul(flat, np.conj(np.swapaxes(flat, 1, 2)))
+
+        def direct(band: int, positions: np.ndarray) -> np.ndarray:
+            gains = np.repeat(los_gain(scenario, positions, band), scenario.n_frames, axis=1)
+            errors: np.ndarray = radiation[band] * gains[:, :, None]
+            return errors.reshape(len(gains), n_rows, n_terms * n_elements)
+
+        return measurement_correlation(scenario) * scattered, direct
 
 
 def has_errors(scenario: Scenario) -> bool:

@@ -114,8 +114,7 @@ class Nuisance:
     @property
     def scaled_phases(self) -> np.ndarray:
         """The columns of `phases` that are not zero, float64 [N_B, q]."""
-        chosen: np.ndarray = self.phases[:, self.phases.any(axis=0)]
-        return chosen
+        return self.phases[:, self.phases.any(axis=0)]
 
     def factors(self, values: np.ndarray) -> np.ndarray:
         """Compute the factors exp(x P) for values x [..., Q], complex128 [..., N_B, N_SB F]."""
