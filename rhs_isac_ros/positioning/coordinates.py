@@ -86,6 +86,11 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray)
         Lower and upper corner of the region, float64 [2, 3] [m].
     """
     positions = to_positions(points)
+    result = np.zeros_like(points)
+    outside = np.flatnonzero(~is_inside(positions, bounds))
+    if not len(outside):
+        return result
+    points, positions, curvature = points[outside], positions[outside], curvature[outside]
     for _ in range(_N_PROJECTIONS):
         nearest = to_polar(np.clip(positions, *bounds))
         offset: np.ndarray = nearest - points
@@ -96,7 +101,8 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray)
     excess = np.sign(offset[:, 0]) * np.maximum(np.abs(offset[:, 0]) - _RANGE_TOLERANCE_M, 0.0)
     coupling = np.einsum('mq,mq->m', curvature[:, 0, 1:], offset[:, 1:]) / curvature[:, 0, 0]
     offset[:, 0] = excess - coupling
-    return offset
+    result[outside] = offset
+    return result
 
 
 def likelihood_loss(offset: np.ndarray, curvature: np.ndarray) -> np.ndarray:

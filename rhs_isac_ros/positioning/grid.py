@@ -40,10 +40,10 @@ _N_EDGE = 33
 STEPS_PER_WAVELENGTH = 8
 # Number of phases to search at a time.
 _N_PHASES = 32
-# Peaks closer than this in all of (r in wavelengths, u, v) are one mode; in metres of range if the
-# phases of the bands carry no information.
-_MIN_SEPARATION = (0.3, 0.05, 0.05)
-_MIN_COARSE_SEPARATION_M = 0.6
+# Peaks closer than an ellipsoid of these radii in (r in wavelengths, u, v) are one mode; in metres
+# of range if the phases of the bands carry no information.
+_MIN_SEPARATION = (0.37, 0.062, 0.062)
+_MIN_COARSE_SEPARATION_M = 0.75
 # Number of points to compare with each other at a time.
 _N_COMPARED = 64
 _EARLIER = np.tri(_N_COMPARED, k=-1, dtype=bool)
@@ -241,7 +241,7 @@ class TemplateTable:
         points, values = self._at(cells, peaks, prior)
         order = np.argsort(-peaks.value, axis=1)[:, :np.isfinite(peaks.value).sum()]
         points, values = points[0, order], values[0, order[0]]
-        chosen = suppress(_within_boxes(points / self._separation(prior)),
+        chosen = suppress(_closer_than_one(points / self._separation(prior)),
                           np.ones(order.shape, bool), max_points)[0]
         return Starts(np.zeros(chosen.sum(), int), points[0, chosen], values[chosen])
 
@@ -263,7 +263,7 @@ class TemplateTable:
         valid = value >= value[:, :1] - margin - _GRID_ERROR * self._energy[best]
         order, rows = order[:, :valid.sum(axis=1).max()], np.arange(len(cell))[:, None]
         points, values = points[rows, order], values[rows, order]
-        chosen = suppress(_within_boxes(points / self._separation(prior)),
+        chosen = suppress(_closer_than_one(points / self._separation(prior)),
                           valid[:, :order.shape[1]], effort.modes)
         return Starts(np.nonzero(chosen)[0], points[chosen], values[chosen])
 
@@ -374,7 +374,7 @@ class TemplateTable:
         return np.zeros(1) if prior.is_coarse else self.range_offsets_m
 
     def _separation(self, prior: NuisancePrior) -> np.ndarray:
-        """Smallest distance of modes in (r [m], u, v)."""
+        """Radii of the ellipsoid in (r [m], u, v) that contains one mode."""
         separation = np.array(_MIN_SEPARATION) * (self.wavelength_m, 1, 1)
         if prior.is_coarse:
             separation[0] = _MIN_COARSE_SEPARATION_M
@@ -480,15 +480,18 @@ def suppress(are_close: Closeness, valid: np.ndarray, max_points: int) -> np.nda
     return chosen & (np.cumsum(chosen, axis=1) <= max_points)
 
 
-def _within_boxes(points: np.ndarray) -> Closeness:
-    """Return whether points [L, N, 3] are closer than 1 in all coordinates."""
+def _closer_than_one(points: np.ndarray) -> Closeness:
+    """Return whether points [L, N, 3] are closer than 1."""
+    rows = np.arange(len(points))[:, None]
+    # Small coordinates leave more digits to single precision.
+    points = (points - points.mean(axis=(0, 1))).astype(np.float32)
+    squares = np.einsum('lnu,lnu->ln', points, points)
+
     def are_close(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        rows = np.arange(len(points))[:, None]
-        left, right = points[rows, first], points[rows, second]
-        close = np.ones((len(points), first.shape[1], second.shape[1]), bool)
-        # A reduction over the coordinates takes several times as long.
-        for axis in range(points.shape[2]):
-            close &= np.abs(left[:, :, None, axis] - right[:, None, :, axis]) < 1
+        distance = np.matmul(points[rows, first], np.swapaxes(-2 * points[rows, second], 1, 2))
+        distance += squares[rows, first][:, :, None]
+        distance += squares[rows, second][:, None]
+        close: np.ndarray = distance < 1
         return close
 
     return are_close
