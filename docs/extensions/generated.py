@@ -22,7 +22,6 @@ from rhs_isac_ros.experiments.measures import MEASURES
 from rhs_isac_ros.model.deviations import Deviations
 from rhs_isac_ros.model.table1 import Table1
 from rhs_isac_ros.protocol import diagram
-from rhs_isac_ros.protocol.delivery import DELIVERIES, USER
 from rhs_isac_ros.protocol.outcomes import Kind, Outcome
 from rhs_isac_ros.ros import parameters, qos, recording, topics
 
@@ -92,19 +91,6 @@ def topic_table():
             'rhs_isac_msgs') else code(text)
         rows.append((code(name), shown, f'reliable, {kept}'))
     return table(('topic', 'type', 'quality of service'), rows, '25 45 30')
-
-
-def delivery_table():
-    """Return the topics of single recipients."""
-    rows = []
-    for name in dict.fromkeys(topics.delivery(one.kind, one.recipient) for one in DELIVERIES):
-        ones = [one for one in DELIVERIES if topics.delivery(one.kind, one.recipient) == name]
-        names = [name]
-        if ones[0].recipient == USER:
-            names.append(topics.delivery(ones[0].kind, f'{USER}_<n>'))
-        rows.append((', '.join(map(code, names)), code(ones[0].kind.__name__),
-                     ', '.join(one.sender for one in ones), ones[0].recipient))
-    return table(('topic', 'type', 'publishers', 'subscriber'), rows, '46 22 18 14')
 
 
 def message_list():
@@ -188,7 +174,7 @@ def module_list(package):
 
 
 FUNCTIONS = {function.__name__: function for function in (
-    parameter_table, scenario_table, measure_table, topic_table, delivery_table, message_list,
+    parameter_table, scenario_table, measure_table, topic_table, message_list,
     state_picture, state_table, cycle_sequence, outcome_table, module_list, dependency_table)}
 
 

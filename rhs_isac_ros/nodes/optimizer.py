@@ -23,6 +23,7 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.parameter_service import GroupParameterService
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
@@ -131,8 +132,8 @@ class OptimizerNode(ParameterizedNode):
             self.destroy_publisher(self._publisher)
             self._publisher = None
         if not stands_by:
-            self._publisher = self._publisher or self.create_publisher(
-                ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
+            self._publisher = self._publisher or create_publisher(
+                self, ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
             self._publish(self._codebook_of(self._codebook_values()))
 
     def _publish(self, codebook: Codebook) -> None:

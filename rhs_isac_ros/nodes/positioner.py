@@ -26,7 +26,6 @@ from rhs_isac_ros.positioning import (
 )
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import (
     Action,
     BuildEstimator,
@@ -39,6 +38,7 @@ from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
+from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.parameter import ParameterError
 from rhs_isac_ros.ros.parameters import calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -53,8 +53,8 @@ class PositionerNode(RoleNode[Positioner]):
         super().__init__('positioner', **node_options)
         settings = self.make_settings(self.values)
         self._worker = BackgroundWorker(self)
-        self._pose = self.create_publisher(
-            PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
+        self._pose = create_publisher(
+            self, PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
         self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped})
         self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry})
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
@@ -145,9 +145,9 @@ class PositionerNode(RoleNode[Positioner]):
         if isinstance(event, EstimatorReady):
             self.subscribe()
 
-    def publish(self, message: m.Message, to: tuple[Recipient, ...] = ()) -> bool:
+    def publish(self, message: m.Message) -> bool:
         """Publish a message, and poses for an estimate; return False if it is invalid."""
-        is_published = super().publish(message, to)
+        is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
             pose = convert.pose(message, self.get_clock().now().to_msg())
             for publisher in (self._pose, *self._user_poses.publishers(message.user)):

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model import mobility, plugins, streams
-from rhs_isac_ros.protocol.delivery import OBSERVERS
 from rhs_isac_ros.protocol.events import PeersChanged
 from rhs_isac_ros.protocol.user import User, timeouts
 from rhs_isac_ros.ros.parameter import ParameterError
@@ -91,7 +90,7 @@ class UserNode(RoleNode[User]):
     def _publish_ground_truth(self) -> None:
         role, now_s = self.role, self.now_s()
         self.publish(role.ground_truths(now_s) if len(role.users) > 1
-                     else role.ground_truth(role.users[0], now_s), to=(OBSERVERS,))
+                     else role.ground_truth(role.users[0], now_s))
 
 
 main = entry('user', lambda: [UserNode()])

@@ -23,7 +23,6 @@ from rhs_isac_ros.protocol.phase_times import PhaseTimes
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.state_machine import StateMachine
 from rhs_isac_ros.protocol.user_instances import UserInstances
-from rhs_isac_ros.protocol.user_recipients import UserRecipients
 from rhs_isac_ros.protocol.user_scheduler import UserScheduler
 
 
@@ -38,7 +37,6 @@ class BaseStationGuards(StateMachine[State]):
         self._scenario, self._receiver = scenario, receiver
         self._users = UserScheduler(settings.policy, rng)
         self._instances = UserInstances()
-        self._recipients = UserRecipients(self._users, self._instances)
         self._settings = PendingSettings(settings)
         # Whether an operator has requested a pause, which begins after the current cycle.
         self._pausing = False

@@ -152,14 +152,12 @@ class BaseStationSteps(BaseStationGuards):
         self._codebook = self._offered  # nothing before the grant depends on the codebook
         self._times.start(now_s)
         first, last = self._users.invite(self._cycle.attempt)
-        beacon = m.Beacon(cycle_id=self._cycle.id, attempt=self._cycle.attempt,
-                          first_user=first, last_user=last)
-        return [Send(beacon, self._recipients.of_beacon(beacon, now_s))]
+        return [Send(m.Beacon(cycle_id=self._cycle.id, attempt=self._cycle.attempt,
+                              first_user=first, last_user=last))]
 
     def count_ack(self, event: m.Ack, now_s: float) -> None:
-        """Count an ack against the user's rate, and record its node."""
+        """Count an ack against the user's rate."""
         self._ack_filter.count(event.user, now_s)
-        self._recipients.add_answer(event.cycle_id, event.sender)
 
     def accept_ack(self, event: m.Ack, now_s: float) -> None:
         """Add a user to those that may be granted the cycle."""
@@ -186,7 +184,7 @@ class BaseStationSteps(BaseStationGuards):
         cycle.user = self._users.select()
         cycle.user_instance = self._instances.owner(cycle.user)
         grant = m.Grant(cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance)
-        return [Send(grant, self._recipients.of_grant()), *lost]
+        return [Send(grant), *lost]
 
     def _lose_absent(self, now_s: float) -> list[Action]:
         """Count the invited users that did not answer, and remove those that no longer do."""
@@ -226,7 +224,7 @@ class BaseStationSteps(BaseStationGuards):
         cycle = self._cycle
         return [Send(m.PilotRequest(
             cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance,
-            band=cycle.band, n_frames=self._scenario.n_frames), (cycle.user_instance,))]
+            band=cycle.band, n_frames=self._scenario.n_frames))]
 
     def store_signals(self, event: m.FeedSignals, now_s: float) -> None:
         """Store the feed signals of a band; those of all bands come from the same instances."""

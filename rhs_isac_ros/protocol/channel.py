@@ -12,7 +12,6 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.nuisance import draw_user_cycle, nuisance_factors, nuisance_parameters
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered
 from rhs_isac_ros.protocol.fading import Fading
 from rhs_isac_ros.protocol.impairments import Impairments
@@ -181,7 +180,7 @@ class Channel(PlainRole):
                 continue
             answer = self._answer(event, cycle)
             if answer is not None:
-                actions.append(Send(answer, _recipients(answer, cycle.truth)))
+                actions.append(Send(answer))
                 del self._pending[serial]
         return actions
 
@@ -230,13 +229,6 @@ class Channel(PlainRole):
         rate_bps = float(capacity(self._scenario, used, truth.position[None])[0])
         bits = min(data.bits, rate_bps * data.duration_s // 1)
         return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)
-
-
-def _recipients(answer: m.Message, truth: m.GroundTruth) -> tuple[Recipient, ...]:
-    """Return the recipient of an answer in the cycle of a true position."""
-    if isinstance(answer, m.Data) and answer.direction is m.Direction.UPLINK:
-        return ('bs',)
-    return (truth.sender,)
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:

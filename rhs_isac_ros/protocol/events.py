@@ -5,7 +5,6 @@ from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import Estimator, TrackEstimate
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.messages import Message
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
@@ -86,16 +85,9 @@ Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | 
 
 @dataclasses.dataclass(frozen=True)
 class Send:
-    """Publish a message.
-
-    Attributes
-    ----------
-    to
-        Recipients among those of `DELIVERIES`; empty: all.
-    """
+    """Publish a message."""
 
     message: Message
-    to: tuple[Recipient, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

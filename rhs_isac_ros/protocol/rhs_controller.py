@@ -101,7 +101,7 @@ class RhsControllerSteps(StateMachine[State]):
         analog = self._codebooks.take(event.codebook_id).analog[event.band]
         return [Send(m.RhsConfiguration(
             cycle_id=event.cycle_id, mode=m.Mode.POSITIONING, band=event.band,
-            codebook_id=event.codebook_id, analog=analog), to=('bs', 'channel'))]
+            codebook_id=event.codebook_id, analog=analog))]
 
     def apply_beam(self, event: m.Beam, now_s: float) -> list[Action]:
         """Report the configuration of a beam."""

@@ -10,6 +10,7 @@ from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.timers import steady_timer
 
 _PERIOD_S = 1.0
@@ -46,8 +47,8 @@ class Diagnostics:
 
     def __init__(self, node: Node, report: Callable[[], Report]) -> None:
         self._node, self._report = node, report
-        self._publisher = node.create_publisher(
-            DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE)
+        self._publisher = create_publisher(
+            node, DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE)
         steady_timer(node, _PERIOD_S, self._publish)
 
     def _publish(self) -> None:

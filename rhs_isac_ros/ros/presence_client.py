@@ -11,7 +11,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.presences import PERIOD_S, Presence, Presences
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.subscriptions import subscribe
+from rhs_isac_ros.ros.endpoints import create_publisher, subscribe
 from rhs_isac_ros.ros.timers import steady_timer
 
 _last_instance = 0
@@ -42,8 +42,7 @@ class PresenceClient:
         self._node, self._on_change, self._rival = node, on_change, 0
         self._presences = Presences(Presence(
             instance, scenario.id, role, node.get_fully_qualified_name(), scenario.fields()))
-        self._publisher = node.create_publisher(
-            ros.Presence, topics.PRESENCE, qos.LATCHED)
+        self._publisher = create_publisher(node, ros.Presence, topics.PRESENCE, qos.LATCHED)
         subscribe(node, ros.Presence, topics.PRESENCE, self._receive, qos.PRESENCES, raw=True)
         self._timer = steady_timer(node, PERIOD_S, self._on_timer)
         self._timer.cancel()

@@ -1,14 +1,16 @@
 """The adapter between a role of the protocol and ROS 2."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+from rclpy.publisher import Publisher
+
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import (
     Action,
     Event,
@@ -21,15 +23,14 @@ from rhs_isac_ros.protocol.events import (
 from rhs_isac_ros.protocol.instance import started
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.endpoints import create_publisher, subscribe
 from rhs_isac_ros.ros.log_once import LogOnce
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
 from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
-from rhs_isac_ros.ros.role_publishers import RolePublishers
-from rhs_isac_ros.ros.role_subscriptions import RoleSubscriptions
 from rhs_isac_ros.ros.timers import steady_timer
 
 # Maximum number of senders whose wrong scenario is logged, which bounds the log.
@@ -81,9 +82,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._foreign: set[int] = set()
         self._presence: PresenceClient | None = None
         self._is_advertised = self._stands_by = False
-        self._role_publishers = RolePublishers(self, executable)
-        self._role_subscriptions = RoleSubscriptions(
-            self, executable, self.instance, self._receive_bytes)
+        self._sending: dict[type[m.Message], Publisher] = {}
+        self._receiving: set[type[m.Message]] = set()
         self._log_once = LogOnce(self)
         self._statistics = RoleStatistics()
         # One timer serves all deadlines. It is set again only if it would expire too late, or
@@ -103,7 +103,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.role = role
         if advertise:
             self.advertise()
-        self._diagnostics = Diagnostics(self, self._report_regularly)
+        self._diagnostics = Diagnostics(self, self.report)
         if self.is_unique:
             self._presence = PresenceClient(
                 self, self._executable, self.instance, self.scenario, self._on_presence)
@@ -116,12 +116,19 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         A node that stands by creates them when it resumes.
         """
         self._is_advertised = True
-        if not self._stands_by:
-            self._role_publishers.advertise(self.role.SENDS)
+        for kind in () if self._stands_by else self.role.SENDS:
+            if kind not in self._sending:
+                self._sending[kind] = create_publisher(
+                    self, convert.ros_type(kind), topics.NAMES[kind], qos.profile_for(kind))
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
-        self._role_subscriptions.subscribe(self.role.RECEIVES)
+        for kind in self.role.RECEIVES:
+            if kind not in self._receiving:
+                self._receiving.add(kind)
+                subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
+                          functools.partial(self._receive_bytes, kind), qos.profile_for(kind),
+                          raw=True)
 
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
@@ -136,10 +143,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             return report
         return dataclasses.replace(
             report, fault=True, summary='; '.join(conflicts), values=values)
-
-    def _report_regularly(self) -> Report:
-        self._role_subscriptions.examine_senders()
-        return self.report()
 
     @property
     def is_standing_by(self) -> bool:
@@ -159,7 +162,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if stands_by:
             self.stand_by()
             # Subscriptions remain: the executor may hold messages for them. They are ignored.
-            self._role_publishers.withdraw()
+            for publisher in self._sending.values():
+                self.destroy_publisher(publisher)
+            self._sending.clear()
         else:
             if self._is_advertised:
                 self.advertise()
@@ -190,15 +195,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self._timer_due_s is None or deadline_s < self._timer_due_s):
             self._set_timer(deadline_s - now_s, deadline_s)
 
-    def publish(self, message: m.Message, to: tuple[Recipient, ...] = ()) -> bool:
+    def publish(self, message: m.Message) -> bool:
         """Publish a valid message and return True, or log its error and return False.
 
         A node that stands by publishes nothing.
-
-        Parameters
-        ----------
-        to
-            Recipients, as in `Send`.
         """
         if self._stands_by:
             return False
@@ -209,7 +209,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         except m.MessageError as error:
             self._log_error('not sent', error)
             return False
-        self._role_publishers.publish(type(message), content, to)
+        self._sending[type(message)].publish(content)
         return True
 
     def execute(self, action: Action) -> None:
@@ -255,8 +255,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _perform(self, action: Action) -> None:
         match action:
-            case Send(message, to):
-                self.publish(message, to)
+            case Send(message):
+                self.publish(message)
             case LogMessage(text, True):
                 self.get_logger().warning(text)  # type: ignore[no-untyped-call]
             case LogMessage(text):

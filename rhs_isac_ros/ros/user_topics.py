@@ -7,6 +7,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from rhs_isac_ros.ros import qos
+from rhs_isac_ros.ros.endpoints import create_publisher
 
 # Every topic takes time in discovery, and the ids of the users come from messages.
 MAX_USERS = 64
@@ -41,7 +42,7 @@ class UserTopics:
             return ()
         if user not in self._publishers:
             self._publishers[user] = tuple(
-                self._node.create_publisher(kind, name.format(user=user), qos.EXCHANGE)
+                create_publisher(self._node, kind, name.format(user=user), qos.EXCHANGE)
                 for name, kind in self._kinds.items())
         self._used_s.pop(user, None)
         self._used_s[user] = now_s

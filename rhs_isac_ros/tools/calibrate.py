@@ -38,9 +38,9 @@ from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
 from rhs_isac_ros.tools.republish import topic_prefix
 
 _CYCLES = 200

@@ -20,7 +20,6 @@ from rhs_isac_ros.nodes.optimizer import PUSHER_NODE
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.delivery import USER, Delivery, deliveries_from, deliveries_to
 from rhs_isac_ros.protocol.positioner import Positioner
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.transmission import Transmission
@@ -74,52 +73,40 @@ def permissions(users: int) -> dict[str, Permissions]:
     """
     diagnostics = (topics.DIAGNOSTICS,)
     nodes = {
-        'bs': _with_codebook(_unique('bs', BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)
+        'bs': _with_codebook(_unique(BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)
                              )._replace(reply=(*_OFFERED_SERVICES, *_CYCLE_SERVICES)),
-        'channel': _unique('channel', Channel.SENDS, Channel.RECEIVES, diagnostics),
-        'optimizer': _unique('optimizer', (), (), (*diagnostics, topics.CODEBOOK)),
+        'channel': _unique(Channel.SENDS, Channel.RECEIVES, diagnostics),
+        'optimizer': _unique((), (), (*diagnostics, topics.CODEBOOK)),
         'positioner': _with_codebook(_unique(
-            'positioner', Positioner.SENDS, Positioner.RECEIVES, (
+            Positioner.SENDS, Positioner.RECEIVES, (
                 *diagnostics, topics.POSITION, *_of_users(users, topics.POSE)))),
         'rhs_controller': _with_codebook(_unique(
-            'rhs_controller', RhsController.SENDS, RhsController.RECEIVES, diagnostics)),
+            RhsController.SENDS, RhsController.RECEIVES, diagnostics)),
         'transmission': _with_codebook(_unique(
-            'transmission', Transmission.SENDS, Transmission.RECEIVES, diagnostics)),
-        'visualizer': _of_messages('visualizer', (), SCENE_RECEIVES, (
+            Transmission.SENDS, Transmission.RECEIVES, diagnostics)),
+        'visualizer': _of_messages((), SCENE_RECEIVES, (
             topics.MARKERS, topics.TF, topics.TF_STATIC,
             *_of_users(users, topics.PATH, topics.TRUE_PATH))),
-        **{f'user_{number}': _of_messages(USER, User.SENDS, User.RECEIVES, diagnostics)
+        **{f'user_{number}': _of_messages(User.SENDS, User.RECEIVES, diagnostics)
            for number in range(1, users + 1)},
     }
     return {**nodes, 'operator': _operator(nodes, users)}
 
 
 def _of_messages(
-        role: str, sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
+        sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
         publishes: Iterable[str]) -> Permissions:
-    """Return permissions for messages of a role, and for publishing other topics by name."""
-    # A node also subscribes to the topics for all nodes if a publisher uses no others.
+    """Return permissions for messages, and for publishing other topics by name."""
     return Permissions(
-        publish=(*sorted([*(topics.NAMES[kind] for kind in sends),
-                          *_delivery_topics(deliveries_from(role)), *publishes]),
-                 *_RCLPY_TOPICS),
-        subscribe=tuple(sorted([
-            *(topics.NAMES[kind] for kind in receives),
-            *_delivery_topics(deliveries_to(role))])))
-
-
-def _delivery_topics(deliveries: Iterable[Delivery]) -> set[str]:
-    """Return the topics of deliveries; the instances of nodes of users are not known before."""
-    return {
-        topics.delivery(one.kind, recipient) for one in deliveries
-        for recipient in ((USER, f'{USER}_*') if one.recipient == USER else (one.recipient,))}
+        publish=(*sorted([*(topics.NAMES[kind] for kind in sends), *publishes]), *_RCLPY_TOPICS),
+        subscribe=tuple(sorted(topics.NAMES[kind] for kind in receives)))
 
 
 def _unique(
-        role: str, sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
+        sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
         publishes: Iterable[str]) -> Permissions:
     """Return the permissions of `_of_messages`, and those to announce and detect a second node."""
-    permissions = _of_messages(role, sends, receives, (*publishes, topics.PRESENCE))
+    permissions = _of_messages(sends, receives, (*publishes, topics.PRESENCE))
     return permissions._replace(
         subscribe=tuple(sorted([*permissions.subscribe, topics.PRESENCE])))
 

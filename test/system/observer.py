@@ -17,8 +17,8 @@ from rhs_isac_ros.monitoring import cycle_log, invariants
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, qos, topics
+from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.subscriptions import subscribe
 
 
 class NetworkObserver(CycleObserver):

@@ -1,15 +1,27 @@
-"""Subscriptions without the events that slow down executors."""
+"""Publishers and subscriptions without event handlers.
+
+Those of subscriptions slow down executors. Those of publishers end a node that destroys one while
+an observer with an incompatible quality of service is present (ros2/rclpy#1644).
+"""
 
 import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+
+
+def create_publisher(node: Node, kind: type, name: str, profile: QoSProfile) -> Publisher:
+    """Create a publisher of a ROS type on a topic."""
+    return node.create_publisher(
+        kind, name, profile,
+        event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
 
 
 def subscribe(
