@@ -11,31 +11,19 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 # Time of `time.monotonic` at which the program began, before anything slow was imported [s].
 STARTED_S = time.monotonic()
 # Environment variable with the process id of a parent that its children must not outlive.
 PARENT_ID = 'RHS_ISAC_ROS_PARENT_ID'
 _PR_SET_PDEATHSIG = 1
+# Executables in `tools`; the others are the modules of `nodes`.
+_TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
 # Subpackage of each executable.
 EXECUTABLES = {
-    'bs': 'nodes',
-    'calibrate': 'tools',
-    'channel': 'nodes',
-    'demo': 'tools',
-    'network': 'nodes',
-    'optimizer': 'nodes',
-    'positioner': 'nodes',
-    'record': 'tools',
-    'replay': 'tools',
-    'rhs_controller': 'nodes',
-    'snapshot': 'tools',
-    'transmission': 'nodes',
-    'user': 'nodes',
-    'view': 'tools',
-    'visualizer': 'nodes',
-    'watch': 'tools',
-}
+    **{path.stem: 'nodes' for path in (Path(__file__).parent / 'nodes').glob('[a-z]*.py')},
+    **dict.fromkeys(_TOOLS, 'tools')}
 
 
 def __getattr__(name: str) -> Callable[[], int]:

@@ -39,15 +39,12 @@ from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PositionerSettings
 from rhs_isac_ros.protocol.transmission import Transmission
+from rhs_isac_ros.ros.roster import ROSTER
 
-ROLES = {'bs': BaseStation, 'user': user_role.User, 'rhs_controller': RhsController,
-         'channel': Channel, 'positioner': Positioner, 'transmission': Transmission}
+ROLES = {name: member.role for name, member in ROSTER.items() if member.role}
 SUBSCRIPTIONS = {name: role.RECEIVES for name, role in ROLES.items()}
-PEERS = {
-    'bs': ('rhs_controller', 'channel', 'positioner', 'transmission'),
-    'user': ('channel', 'bs'),
-}
-USE_CODEBOOKS = ('bs', 'rhs_controller', 'positioner', 'transmission')
+PEERS = {name: ROSTER[name].requires for name in ('bs', 'user')}
+USE_CODEBOOKS = tuple(name for name, member in ROSTER.items() if member.has_codebook)
 LATENCY_S = 1e-3
 DATA_DURATION_S = 1e-3
 # A model file that does not match any codebook.

@@ -27,7 +27,7 @@ from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.parameter_service import GroupParameterService
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
-from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
+from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.push import PushError, push
 from rhs_isac_ros.ros.run import run
 
@@ -58,8 +58,9 @@ class OptimizerNode(ParameterizedNode):
             [Parameter(name, value=value)
              for name, value in self._first_codebook(file).to_parameters().items()])
         self._announce(False)
-        self._presence = PresenceClient(
-            self, topics.OPTIMIZER_NODE, self._instance, self._scenario, self._announce)
+        self._peers = Peers(
+            self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
+            self._announce)
         self._diagnostics = Diagnostics(self, self._report)
         self.add_pre_set_parameters_callback(self._normalize)
         self.add_on_set_parameters_callback(self._check_codebook)
@@ -121,7 +122,7 @@ class OptimizerNode(ParameterizedNode):
             self._publish(self._codebook_of(given))
 
     def _report(self) -> Report:
-        conflicts = self._presence.conflicts()
+        conflicts = self._peers.conflicts()
         values = {'codebook_id': self._codebook_id, 'dropped.wrong_codebook': str(self._refused),
                   **conflicts}
         return Report(bool(conflicts), '; '.join(conflicts.values()) or 'no fault', values)
@@ -133,7 +134,7 @@ class OptimizerNode(ParameterizedNode):
             self._publisher = None
         if not stands_by:
             self._publisher = self._publisher or create_publisher(
-                self, ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
+                self, ros.Codebook, topics.CODEBOOK, qos.LATCHED)
             self._publish(self._codebook_of(self._codebook_values()))
 
     def _publish(self, codebook: Codebook) -> None:

@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model import mobility, plugins, streams
-from rhs_isac_ros.protocol.events import PeersChanged
 from rhs_isac_ros.protocol.user import User, timeouts
 from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.peer_monitor import REQUIRED_BY_USER, PeerMonitor
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.timers import steady_timer
@@ -18,16 +16,12 @@ from rhs_isac_ros.ros.timers import steady_timer
 class UserNode(RoleNode[User]):
     """One or many users of the network."""
 
-    is_unique = False
-
     def __init__(self, name: str = '', **node_options: Any) -> None:
         super().__init__('user', name, **node_options)
         values = self.values
         self.start(User(
             self._mobilities(), timeouts(values.step_timeout_s, values.beacon_timeout_s),
             self.instance))
-        self._peers = PeerMonitor(
-            self, REQUIRED_BY_USER, lambda missing: self.dispatch(PeersChanged(missing)))
         steady_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
 
     def _mobilities(self) -> dict[int, mobility.Mobility]:

@@ -16,14 +16,11 @@ from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.model import Scenario, mobility, plugins
 from rhs_isac_ros.model.arguments import ArgumentParser
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.protocol.impairments import Impairments
-from rhs_isac_ros.protocol.settings import (
-    BaseStationSettings,
-    PositionerSettings,
-    TransmissionSettings,
-)
+from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
+from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.parameter import Parameter, ParameterError
+from rhs_isac_ros.ros.roster import ROSTER
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -38,28 +35,27 @@ class _Dataclass(Protocol):
 _Settings = TypeVar('_Settings', bound=_Dataclass)
 
 
-def _declared_by(settings: type[_Dataclass]) -> dict[str, Parameter]:
+def _declared_by(settings: type[_Dataclass] | None) -> dict[str, Parameter]:
     """Return the parameters, by name, that the fields of a settings class declare."""
-    return {field.name: Parameter(field.name, getattr(settings, field.name), **field.metadata)
-            for field in dataclasses.fields(settings)}
+    return {} if settings is None else {
+        field.name: Parameter(field.name, getattr(settings, field.name), **field.metadata)
+        for field in dataclasses.fields(settings)}
 
 
 _SCENARIO = Parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
 _SEED = Parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
-_BASE_STATION = _declared_by(BaseStationSettings)
-_POSITIONER = _declared_by(PositionerSettings)
 
-NODES: Mapping[str, tuple[Parameter, ...]] = {
+# Parameters of roles that are not settings.
+_OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
-        _SCENARIO, _SEED,
-        *_BASE_STATION.values(),
+        _SEED,
         Parameter('first_cycle', 0,
                   'Id of the first cycle; 0: derived from the clock, so that no id is reused '
                   'after a restart.', low=0, high=2**53),
     ),
     'user': (
-        _SCENARIO, _SEED,
+        _SEED,
         Parameter('user_id', 1, 'Id of the user, or the first of several.', low=1,
                   high=2**31 - 1),
         Parameter('user_count', 1, 'Number of users of the node, with consecutive ids.', low=1,
@@ -75,28 +71,23 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
                   'm/s', 0.0, 1e4),
         Parameter('ground_truth_period_s', 0.5,
                   'Period at which the true position is published.', 's', 0.01, 60.0),
-        _BASE_STATION['step_timeout_s'],
+        _declared_by(BaseStationSettings)['step_timeout_s'],
         Parameter('beacon_timeout_s', 1.5,
                   'Time without a beacon after which a warning is logged.', 's', 0.1, 7200.0),
     ),
-    'rhs_controller': (_SCENARIO,),
-    'channel': (_SCENARIO, _SEED, *_declared_by(Impairments).values()),
+    'channel': (_SEED,),
     'positioner': (
-        _SCENARIO,
-        _POSITIONER['estimator'],
         Parameter('table_folder', '',
                   'Directory in which tables are cached; empty: the cache directory of the user.'),
-        _POSITIONER['model_file'],
-        _POSITIONER['reject_outside'],
-        _POSITIONER['calibration_file'],
-        _POSITIONER['prior'],
-        _POSITIONER['track_speed_mps'],
     ),
-    'transmission': (_SCENARIO, *_declared_by(TransmissionSettings).values()),
-    'optimizer': (
-        _SCENARIO,
+    topics.OPTIMIZER_NODE: (
         Parameter('codebook_file', '', 'Codebook file; empty: the default codebook.'),
     ),
+}
+
+NODES: Mapping[str, tuple[Parameter, ...]] = {
+    **{name: (_SCENARIO, *_declared_by(member.settings).values(), *_OTHERS.get(name, ()))
+       for name, member in sorted(ROSTER.items())},
     'visualizer': (
         _SCENARIO,
         Parameter('period_s', 0.2, 'Period at which the scene is published.', 's', 0.01, 60.0),

@@ -15,6 +15,7 @@ from rhs_isac_ros.protocol.events import (
     Action,
     Event,
     LogMessage,
+    PeersChanged,
     RevertSettings,
     Send,
     SettingsOffered,
@@ -30,7 +31,8 @@ from rhs_isac_ros.ros.endpoints import create_publisher, subscribe
 from rhs_isac_ros.ros.log_once import LogOnce
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
-from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
+from rhs_isac_ros.ros.peers import Peers, new_instance
+from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.ros.timers import steady_timer
 
 # Maximum number of senders whose wrong scenario is logged, which bounds the log.
@@ -69,8 +71,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """
 
     role: _RoleT
-    # Whether only one node may serve in the role, so that others stand by.
-    is_unique = True
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(executable, name, **node_options)
@@ -80,8 +80,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.instance = new_instance()
         self._identity = self.instance, self.scenario.id
         self._foreign: set[int] = set()
-        self._presence: PresenceClient | None = None
         self._is_advertised = self._stands_by = False
+        self._has_optimizer = True
         self._sending: dict[type[m.Message], Publisher] = {}
         self._receiving: set[type[m.Message]] = set()
         self._log_once = LogOnce(self)
@@ -104,9 +104,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if advertise:
             self.advertise()
         self._diagnostics = Diagnostics(self, self.report)
-        if self.is_unique:
-            self._presence = PresenceClient(
-                self, self._executable, self.instance, self.scenario, self._on_presence)
+        self._peers = Peers(
+            self, self._executable, self.instance, self.scenario, self._on_missing,
+            self._on_rival)
         if subscribe:
             self.subscribe()
 
@@ -136,8 +136,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         report = self._statistics.report(
             '' if state is None else state.value, self.role.counters,
             state in self.role.BLOCKED_STATES, self.role.status())
-        own = self._presence.conflicts() if self._presence else {}
-        values = {**report.values, **own}
+        values = {**report.values, **self._peers.conflicts()}
         conflicts = [text for key, text in values.items() if key.startswith('conflict.')]
         if not conflicts:
             return report
@@ -155,7 +154,25 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def resume(self) -> None:
         """Handle that the node serves again."""
 
-    def _on_presence(self, stands_by: bool) -> None:
+    def _on_missing(self, missing: dict[str, str]) -> None:
+        if self._stands_by:
+            return
+        self._statistics.missing = tuple(missing.values())
+        if ROSTER[self._executable].requires:
+            self.dispatch(PeersChanged(tuple(
+                text for role, text in missing.items() if role != topics.OPTIMIZER_NODE)))
+        has_optimizer = topics.OPTIMIZER_NODE not in missing
+        if has_optimizer == self._has_optimizer:
+            return
+        self._has_optimizer = has_optimizer
+        if has_optimizer:
+            self.get_logger().info('optimizer is present again')  # type: ignore[no-untyped-call]
+        else:
+            self.get_logger().warning(  # type: ignore[no-untyped-call]
+                'optimizer is not present; the codebook in use is '
+                f'{self._codebook_client.codebook_id or "none"}')
+
+    def _on_rival(self, stands_by: bool) -> None:
         if stands_by == self._stands_by:
             return
         self._stands_by = stands_by
@@ -169,6 +186,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             if self._is_advertised:
                 self.advertise()
             self.resume()
+            # The other nodes have to discover the publishers again.
+            self._peers.restart()
 
     def on_settings_changed(self, settings: Any) -> None:
         """Pass new settings to the role."""
@@ -176,9 +195,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def follow_codebook(self, on_codebook: Callable[[Codebook], None]) -> None:
         """Call a function with the current codebook of the optimizer and with each later one."""
-        self._codebook_client = CodebookClient(
-            self, self.scenario, on_codebook,
-            lambda present: self._statistics.set_available(topics.OPTIMIZER_NODE, present))
+        self._codebook_client = CodebookClient(self, self.scenario, on_codebook)
 
     @staticmethod
     def now_s() -> float:

@@ -178,7 +178,7 @@ def test_a_node_withdraws_publishers_despite_an_observer_with_incompatible_qos(b
 
     def change():
         changes.append(len(changes) % 2 == 0)
-        node._on_presence(changes[-1])
+        node._on_rival(changes[-1])
         timer.timer_period_ns = int(1e9 * next(periods_s))
     timer = steady_timer(node, 1e-3, change)
     # An exception would end the executor of a node; `until` ignores it.

@@ -5,13 +5,8 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.positioner import Positioner
-from rhs_isac_ros.protocol.rhs_controller import RhsController
-from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.roster import ROSTER
 from system.chaos.trial import (
     TIMEOUT_S,
     ChaosError,
@@ -23,15 +18,8 @@ from system.chaos.trial import (
 from system.observer import NetworkObserver
 
 # Messages that each node publishes.
-PUBLISHES = {
-    'bs': BaseStation.SENDS,
-    'rhs_controller': RhsController.SENDS,
-    'channel': Channel.SENDS,
-    'positioner': Positioner.SENDS,
-    'transmission': Transmission.SENDS,
-    'optimizer': (),
-    'user_1': User.SENDS,
-}
+PUBLISHES = {name if member.is_unique else f'{name}_1': member.role.SENDS if member.role else ()
+             for name, member in ROSTER.items()}
 NODES = tuple(PUBLISHES)
 PHASES = tuple(m.Phase)
 # A killed node is restarted after this time [s]. Until then, the other nodes must report that it

@@ -30,7 +30,7 @@ _MAX_ORIGINALS = 32
 _PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
 # Topics with other messages.
 _OTHERS = {
-    topics.CODEBOOK: (ros.Codebook, qos.LATCHED_WITH_LEASE),
+    topics.CODEBOOK: (ros.Codebook, qos.LATCHED),
     topics.PRESENCE: (ros.Presence, qos.PRESENCES),
     topics.POSITION: (PoseWithCovarianceStamped, qos.EXCHANGE),
     topics.DIAGNOSTICS: (DiagnosticArray, qos.EXCHANGE),

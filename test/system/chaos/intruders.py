@@ -11,6 +11,7 @@ import yaml
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.roster import UNIQUE
 from system.chaos.crashes import PUBLISHES
 from system.chaos.trial import (
     TIMEOUT_S,
@@ -23,8 +24,7 @@ from system.observer import NetworkObserver
 
 # A channel of another scenario, a node with the number of user 1, and a second node of each role.
 SCENARIO, USER = 'scenario', 'user'
-INTRUDERS = (
-    'bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'optimizer', USER, SCENARIO)
+INTRUDERS = (*UNIQUE, USER, SCENARIO)
 SECONDS = 4.0
 _PROCESS = 'intruder'
 _USER_NODE = 'user_1'
