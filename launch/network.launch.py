@@ -124,20 +124,24 @@ def _node(given: dict[str, str], executable: str, name: str | None, **values: in
 def _recorder(given: dict[str, str]) -> list[Node]:
     if not given['record']:
         return []
-    # Not restarted, because a second process would replace the recording.
-    return [_process(given, 'record', False, [], executable='record', name='recorder',
-                     arguments=[given['record'], '--config', given['config']])]
+    # Not restarted, because a second process would replace the recording. If the disk is full, the
+    # network does not end with the recorder.
+    return [_process(given, 'record', False, [], is_optional=True, executable='record',
+                     name='recorder', arguments=[given['record'], '--config', given['config']])]
 
 
 def _process(
         given: dict[str, str], exec_name: str, respawn: bool, ros_arguments: list[str],
-        **options: Any) -> Node:
-    """Return an action for a process of the package, named `exec_name` in the output."""
+        is_optional: bool = False, **options: Any) -> Node:
+    """Return an action for a process of the package, named `exec_name` in the output.
+
+    If it fails and is neither restarted nor optional, the launch ends.
+    """
     return Node(
         package=PACKAGE, exec_name=exec_name, output='screen', prefix=END_WITH_LAUNCH,
         namespace=given['namespace'], respawn=respawn, respawn_delay=RESPAWN_DELAY_S,
         ros_arguments=['--log-level', given['log_level'], *ros_arguments],
-        on_exit=functools.partial(_end_if_failed, respawn), **options)
+        on_exit=functools.partial(_end_if_failed, respawn or is_optional), **options)
 
 
 def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
@@ -154,14 +158,14 @@ def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
         namespace=given['namespace'], prefix=END_WITH_LAUNCH, arguments=['-d', file])]
 
 
-def _end_if_failed(respawn: bool, event: ProcessExited, context: LaunchContext) -> None:
-    """End the launch, with exit code 1, if a process failed and is not restarted.
+def _end_if_failed(may_fail: bool, event: ProcessExited, context: LaunchContext) -> None:
+    """End the launch, with exit code 1, if a process failed that may not, or is invalid.
 
     Raises
     ------
     RuntimeError
         ``launch`` logs it and ends; its action ``Shutdown`` would result in exit code 0.
     """
-    restarted = respawn and event.returncode != INVALID
-    if event.returncode and not restarted and not context.is_shutdown:
+    is_tolerated = may_fail and event.returncode != INVALID
+    if event.returncode and not is_tolerated and not context.is_shutdown:
         raise RuntimeError(f'{event.process_name} ended with exit code {event.returncode}')

@@ -20,9 +20,9 @@ ROOT = Path(__file__).parents[1]
 def installed():
     """Names of the executables that setup.py installs."""
     printed = subprocess.run(
-        [sys.executable, '-c', 'import setuptools\n'
-         'setuptools.setup = lambda **options: print(*options["entry_points"]["console_scripts"])\n'
-         'exec(compile(open("setup.py").read(), "setup.py", "exec"), {"__file__": "setup.py"})'],
+        [sys.executable, '-c', 'import runpy, setuptools\n'
+         'setuptools.setup = lambda **options: print(*options["entry_points"].popitem()[1])\n'
+         'runpy.run_path("setup.py")'],
         cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout
     return re.findall(r'(\w+) = ', printed)
 

@@ -8,12 +8,13 @@ import types
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import plugins
+from rhs_isac_ros.model import plugins, simulate_received
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     REGION_ESTIMATORS,
@@ -110,7 +111,12 @@ class PositionerNode(RoleNode[Positioner]):
             options['reject_outside'] = settings.reject_outside
         if settings.calibration_file:
             options['surface'] = load_surface(settings.calibration_file, self.scenario)
-        return make_estimator(settings.estimator, self.scenario, codebook, **options)
+        estimator = make_estimator(settings.estimator, self.scenario, codebook, **options)
+        # The first estimate takes longer than all others. A user does not wait for it.
+        center = np.array([self.scenario.roi_center_m])
+        estimator.estimate(simulate_received(
+            self.scenario, codebook, center, np.random.default_rng(0))[0])
+        return estimator
 
     def execute(self, action: Action) -> None:
         """Build an estimator in the background, or publish the odometry of a track.

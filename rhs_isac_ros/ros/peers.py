@@ -43,7 +43,7 @@ def new_instance() -> int:
 class Peers:
     """Polls the ROS graph for all that a node needs to know about others.
 
-    A role is missing without one of its `identifying_endpoints`, and present once two polls in a
+    A role is missing if no node has all `identifying_endpoints`, and present once two polls in a
     row have found them, which gives it time to discover this node as well. A node of a unique role
     also announces its instance on a latched topic: of two with the same role, the newer serves,
     until the graph lacks it. Endpoints that cannot exchange messages, because one requests a
@@ -69,6 +69,8 @@ class Peers:
             on_rival: Callable[[bool], None]) -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
         self._required = {name: identifying_endpoints(name) for name in ROSTER[role].needed}
+        # By role: what it lacked, by the number of endpoints of each topic at the last poll.
+        self._found: dict[str, dict[tuple[int, ...], str]] = {name: {} for name in self._required}
         # Number of endpoints by topic at the last poll, and incompatible ones by topic and node.
         self._counts: list[tuple[str, int, int]] = []
         self._incompatible: dict[tuple[str, str], str] = {}
@@ -129,15 +131,21 @@ class Peers:
         """Return a missing role with the endpoints that it lacks; empty if it lacks none."""
         node, (publishers, subscriptions) = self._node, self._required[name]
         # The counts do not apply remapping rules.
-        absent = [*(f'no publisher of {topic}' for topic in map(
-                        node.resolve_topic_name, publishers) if not node.count_publishers(topic)),
-                  *(f'no subscriber of {topic}' for topic in map(
-                        node.resolve_topic_name, subscriptions)
-                    if not node.count_subscribers(topic))]
-        if not absent:
-            return ''
-        is_gone = len(absent) == len(publishers) + len(subscriptions)
-        return name if is_gone else f'{name} ({", ".join(absent)})'
+        endpoints = [*(('publisher', node.resolve_topic_name(topic)) for topic in publishers),
+                     *(('subscriber', node.resolve_topic_name(topic)) for topic in subscriptions)]
+        counts = tuple(node.count_publishers(topic) if kind == 'publisher'
+                       else node.count_subscribers(topic) for kind, topic in endpoints)
+        if counts not in self._found[name]:
+            # Observers have single endpoints, so that only a node with all of them is present.
+            nodes = [{_full_name(info) for info in (
+                node.get_publishers_info_by_topic(topic) if kind == 'publisher'
+                else node.get_subscriptions_info_by_topic(topic))} for kind, topic in endpoints]
+            absent = [f'no {kind} of {topic}' for (kind, topic), names in zip(
+                endpoints, nodes, strict=True) if not names & nodes[0]]
+            is_gone = len(absent) == len(endpoints)
+            text = name if is_gone else f'{name} ({", ".join(absent)})' if absent else ''
+            self._found[name] = {counts: text}
+        return self._found[name][counts]
 
     # Quality of service
 

@@ -95,8 +95,8 @@ def test_the_lacking_endpoint_of_a_role_is_described(bench, monitor, role, name,
     node = bench.add(Node, name)
     create_endpoints(node, partial)
     reports = monitor(role)
-    kind = 'publisher' if side == 0 else 'subscriber'
-    text = f'{name} (no {kind} of /{topic})' if any(partial) else name
+    # Observers subscribe as well, so that a role without a publisher is missing as a whole.
+    text = name if side == 0 else f'{name} (no subscriber of /{topic})'
     bench.until(lambda: reports and reports[-1].get(name) == text, 'the description')
     create_endpoints(node, ([topic], []) if side == 0 else ([], [topic]))
     bench.until(lambda: name not in reports[-1], f'presence of {name}')
@@ -105,11 +105,15 @@ def test_the_lacking_endpoint_of_a_role_is_described(bench, monitor, role, name,
 def test_a_role_is_present_from_the_second_poll_in_a_row_that_finds_it():
     node, reports = mock.MagicMock(), []
     node.get_fully_qualified_name.return_value = '/user'
+    node.resolve_topic_name.side_effect = '/{}'.format
     Peers(node, 'user', 1, Scenario(), reports.append, lambda stands_by: None)
     poll = node.create_timer.call_args.args[1]
 
     def poll_while(present):
         node.count_publishers.return_value = node.count_subscribers.return_value = int(present)
+        node.get_publishers_info_by_topic.return_value = (
+            node.get_subscriptions_info_by_topic.return_value) = present * [mock.Mock(
+                node_name='other', node_namespace='/', qos_profile=qos.EXCHANGE)]
         poll()
         return {} in reports
 
@@ -120,6 +124,20 @@ def test_a_role_is_present_from_the_second_poll_in_a_row_that_finds_it():
     assert reports == [{'channel': 'channel', 'bs': 'bs'}]
     assert not poll_while(present=True)
     assert poll_while(present=True)
+
+
+def test_an_observer_does_not_stand_for_a_role(bench, monitor):
+    """The positioner publishes from its start, and subscribes when it has an estimator."""
+    publishers, subscriptions = REQUIRED['bs']['positioner']
+    positioner = bench.add(Node, 'positioner')
+    create_endpoints(positioner, (publishers, ()))
+    observer = bench.add(Node, 'observer')
+    create_endpoints(observer, ((), subscriptions))
+    reports = monitor('bs')
+    text = 'positioner (no subscriber of /received_signals)'
+    bench.until(lambda: reports and reports[-1]['positioner'] == text, 'a report')
+    create_endpoints(positioner, ((), subscriptions))
+    bench.until(lambda: 'positioner' not in reports[-1], 'presence')
 
 
 def test_only_the_own_namespace_counts(bench, monitor):
