@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station_steps import State
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send
 from rhs_isac_ros.protocol.outcomes import Outcome, kind_of
 

@@ -135,11 +135,12 @@ class RhsConfiguration(Message):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PilotRequest(Message):
-    """Request to a user to send the pilots of a band."""
+    """Request to a user to send the pilots of a range of bands, in order."""
 
     user: int = number(1, _LAST_USER)
     user_instance: int = 0
     band: int = index('N_B')
+    last_band: int = index('N_B')
     n_frames: int = size('F')
 
 

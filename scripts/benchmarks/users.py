@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from parts.hops import hops_of, ping_pong
+from parts.hops import CHAIN, ping_pong
 from system.observer import NetworkObserver
 
 from rhs_isac_ros.codebook import default_codebook_file
@@ -70,7 +70,7 @@ def main() -> int:
         hop_s = np.median(ping_pong(scenario)) / 2
     finally:
         rclpy.try_shutdown()
-    hops = hops_of(scenario)
+    hops = len(CHAIN)
     rate_hz = np.mean([run['rate_hz'] for run in few])
     for run in many.values():
         run['rate_ratio'] = run['rate_hz'] / rate_hz

@@ -25,7 +25,7 @@ SIZES = SCENARIO.sizes
 COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
          m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'],
          m.RhsConfiguration: SIZES['N_B'] + 1,
-         m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'],
+         m.PilotRequest: 1, m.Pilot: SIZES['N_B'],
          m.FeedSignals: SIZES['N_B'], m.Data: 4, m.ProtocolState: 4}
 # Parameters of the nodes, in another order than in test_start_and_stop.
 BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.02, 'ack_timeout_s': 0.3},
