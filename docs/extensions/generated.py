@@ -11,6 +11,7 @@ import pkgutil
 import re
 from pathlib import Path
 
+import diagram
 import sequence
 from docutils import nodes
 from docutils.statemachine import StringList
@@ -21,7 +22,6 @@ from visualization_msgs.msg import MarkerArray
 from rhs_isac_ros.experiments.measures import MEASURES
 from rhs_isac_ros.model.deviations import Deviations
 from rhs_isac_ros.model.table1 import Table1
-from rhs_isac_ros.protocol import diagram
 from rhs_isac_ros.protocol.outcomes import Kind, Outcome
 from rhs_isac_ros.ros import parameters, qos, recording, topics
 

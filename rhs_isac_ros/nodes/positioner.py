@@ -39,12 +39,10 @@ from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
-from rhs_isac_ros.ros.endpoints import create_publisher
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.parameters import calibrated_surface, settings_of
+from rhs_isac_ros.ros.endpoints import UserTopics, create_publisher
+from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.user_topics import UserTopics
 
 
 class PositionerNode(RoleNode[Positioner]):

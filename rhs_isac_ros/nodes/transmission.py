@@ -10,8 +10,7 @@ from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.parameters import calibrated_surface, settings_of
+from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 

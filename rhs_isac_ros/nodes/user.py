@@ -7,10 +7,10 @@ import numpy as np
 
 from rhs_isac_ros.model import mobility, plugins, streams
 from rhs_isac_ros.protocol.user import User, timeouts
-from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.endpoints import steady_timer
+from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.timers import steady_timer
 
 
 class UserNode(RoleNode[User]):

@@ -14,11 +14,14 @@ from rhs_isac_ros.link import Beam, beam_pattern
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import markers, parameters, qos, topics, transforms
-from rhs_isac_ros.ros.endpoints import create_publisher, subscribe_messages
+from rhs_isac_ros.ros.endpoints import (
+    UserTopics,
+    create_publisher,
+    steady_timer,
+    subscribe_messages,
+)
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.timers import steady_timer
 from rhs_isac_ros.ros.transforms import TransformPublisher
-from rhs_isac_ros.ros.user_topics import UserTopics
 
 
 class VisualizerNode(Node):

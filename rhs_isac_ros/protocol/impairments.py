@@ -12,8 +12,7 @@ import numpy as np
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Timeout
-from rhs_isac_ros.protocol.pending_settings import PendingSettings
-from rhs_isac_ros.protocol.role import Role
+from rhs_isac_ros.protocol.role import PendingSettings, Role
 from rhs_isac_ros.protocol.settings import setting
 
 

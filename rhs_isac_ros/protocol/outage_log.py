@@ -5,8 +5,25 @@ from collections.abc import Iterable, Sequence
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
-from rhs_isac_ros.protocol.user_lists import join_users
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
+
+# Maximum number of users that one text names.
+MAX_NAMED = 8
+
+
+def join_users(users: Iterable[int]) -> str:
+    """Return the numbers of users as a list, which ends with a count of those beyond `MAX_NAMED`.
+
+    Examples
+    --------
+    >>> join_users(range(1, 12))
+    '1, 2, 3, 4, 5, 6, 7, 8 and 3 others'
+    """
+    names = [str(user) for user in users]
+    n_others = len(names) - MAX_NAMED
+    others = f' and {n_others} other{"s" * (n_others > 1)}' if n_others > 0 else ''
+    return f'{", ".join(names[:MAX_NAMED])}{others}'
+
 
 # The reasons that concern one user; all others concern the whole network.
 _USER_REASONS = {Outcome.USER_GONE.value, Outcome.NO_FIX.value}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rhs_isac_ros.protocol.events import LogMessage
-from rhs_isac_ros.protocol.instance import started
+from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.newest import NewestDict
 
 # Maximum number of nodes in conflict with this one, which bounds the memory.

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, LogMessage, Send
-from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.newest import CodebookCache, NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
 

@@ -10,7 +10,7 @@ import numpy as np
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, LogMessage, PeersChanged, Send, Timeout
-from rhs_isac_ros.protocol.instance import started
+from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition

@@ -17,10 +17,9 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import subscribe
-from rhs_isac_ros.ros.log_once import LogOnce
+from rhs_isac_ros.ros.diagnostics import LogOnce
+from rhs_isac_ros.ros.endpoints import steady_timer, subscribe
 from rhs_isac_ros.ros.parameters import CODEBOOK
-from rhs_isac_ros.ros.timers import steady_timer
 
 _NAMES = list(CODEBOOK)
 _RETRY_S = 0.1

@@ -1,20 +1,29 @@
-"""Publishers and subscriptions without event handlers.
+"""Timers, and publishers and subscriptions without event handlers.
 
 Those of subscriptions slow down executors. Those of publishers end a node that destroys one while
 an observer with an incompatible quality of service is present (ros2/rclpy#1644).
 """
 
 import functools
+import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.timer import Timer
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+
+
+def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
+    """Create a running timer on the steady clock, which the deadlines of the roles refer to."""
+    return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def create_publisher(node: Node, kind: type, name: str, profile: QoSProfile) -> Publisher:
@@ -78,3 +87,58 @@ def subscribe_messages(
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
                   functools.partial(receive, kind), qos.profile_for(kind, exchange), raw=True)
+
+
+# Every topic takes time in discovery, and the ids of the users come from messages.
+MAX_USERS = 64
+# A user without messages for this time [s] gives up its topics if another user needs them.
+_IDLE_S = 60.0
+
+
+class UserTopics:
+    """Publishers for each of the first `MAX_USERS` users.
+
+    Parameters
+    ----------
+    kinds
+        Types by name of the topic, which contains ``{user}``.
+    """
+
+    def __init__(self, node: Node, kinds: Mapping[str, type]) -> None:
+        self._node, self._kinds = node, kinds
+        self._publishers: dict[int, tuple[Publisher, ...]] = {}
+        # Time of the latest use [s], by user; the user idle for longest comes first.
+        self._used_s: dict[int, float] = {}
+
+    def publishers(self, user: int) -> tuple[Publisher, ...]:
+        """Return the publishers for a user, in the order of `kinds`; empty if there are too many.
+
+        They are created on first use.
+        """
+        now_s = time.monotonic()
+        if user not in self._publishers and not self._has_space(now_s):
+            self._node.get_logger().warning(
+                f'no topics for user {user}: {MAX_USERS} users have topics', once=True)
+            return ()
+        if user not in self._publishers:
+            self._publishers[user] = tuple(
+                create_publisher(self._node, kind, name.format(user=user), qos.EXCHANGE)
+                for name, kind in self._kinds.items())
+        self._used_s.pop(user, None)
+        self._used_s[user] = now_s
+        return self._publishers[user]
+
+    def remove(self, user: int) -> None:
+        """Destroy the publishers for a user, if any."""
+        self._used_s.pop(user, None)
+        for publisher in self._publishers.pop(user, ()):
+            self._node.destroy_publisher(publisher)
+
+    def _has_space(self, now_s: float) -> bool:
+        if len(self._publishers) < MAX_USERS:
+            return True
+        idle, used_s = next(iter(self._used_s.items()))
+        if now_s < used_s + _IDLE_S:
+            return False
+        self.remove(idle)
+        return True

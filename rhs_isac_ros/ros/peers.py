@@ -14,9 +14,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.presences import Presence, Presences
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, subscribe
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
-from rhs_isac_ros.ros.timers import steady_timer
 
 # Poll period while a role is missing or nodes are in conflict, and otherwise. A poll takes half a
 # millisecond, which adds up over many users.

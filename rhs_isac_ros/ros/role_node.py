@@ -21,19 +21,17 @@ from rhs_isac_ros.protocol.events import (
     SettingsOffered,
     Timeout,
 )
-from rhs_isac_ros.protocol.instance import started
+from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
-from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.endpoints import create_publisher, subscribe
-from rhs_isac_ros.ros.log_once import LogOnce
+from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.roster import ROSTER
-from rhs_isac_ros.ros.timers import steady_timer
 
 # Maximum number of senders whose wrong scenario is logged, which bounds the log.
 _MAX_LOGGED = 16

@@ -5,8 +5,10 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import rclpy
+from ament_index_python.packages import get_package_share_directory
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
@@ -18,8 +20,13 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.ros import command_line, parameters
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.resources import discovery_profile_file
+from rhs_isac_ros.ros.parameters import ParameterError
+
+
+def discovery_profile_file() -> Path:
+    """Return the path of the Fast DDS discovery profile, ``config/discovery.xml``."""
+    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'discovery.xml'
+
 
 # Maximum time between two checks for a signal.
 _POLL_S = 0.1

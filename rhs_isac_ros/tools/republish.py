@@ -19,10 +19,9 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import create_publisher
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.timers import steady_timer
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]

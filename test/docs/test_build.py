@@ -14,8 +14,9 @@ for library in ('sphinx', 'furo', 'myst_parser', 'matplotlib'):
     pytest.importorskip(library, reason=f'{library} is not installed')
 pytest.importorskip('rclpy', reason='the pages of the interfaces need ROS')
 
+import diagram  # noqa: E402
+
 from rhs_isac_ros.model import Scenario  # noqa: E402
-from rhs_isac_ros.protocol import diagram  # noqa: E402
 from rhs_isac_ros.ros import parameters, topics  # noqa: E402
 
 ROOT = Path(__file__).parents[2]

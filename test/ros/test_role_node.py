@@ -11,8 +11,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.role import PlainRole
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.endpoints import steady_timer
 from rhs_isac_ros.ros.role_node import RoleNode
-from rhs_isac_ros.ros.timers import steady_timer
 
 
 class Scripted(PlainRole):

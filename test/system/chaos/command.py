@@ -24,7 +24,6 @@ from rhs_isac_ros.model.arguments import (
     positive_int,
 )
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.monitoring.invariants import CHECK_DELAY_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.processes import Processes, private_domain
@@ -32,6 +31,7 @@ from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.process_network import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.chaos.trial import ChaosError, Trial
+from system.invariants import CHECK_DELAY_S
 from system.observer import NetworkObserver
 
 # Pause between cycles [s]; a longer one during fuzzing leaves room for messages in the queues.
