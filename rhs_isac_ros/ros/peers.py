@@ -73,7 +73,8 @@ class Peers:
         # Number of endpoints by topic at the last poll, and incompatible ones by topic and node.
         self._counts: list[tuple[str, int, int]] = []
         self._incompatible: dict[tuple[str, str], str] = {}
-        self._n_logged = 0
+        # Endpoints that were logged; those that are created again are not logged again.
+        self._logged: set[tuple[str, str]] = set()
         self._presences = Presences(Presence(
             instance, scenario.id, role, node.get_fully_qualified_name(), scenario.fields()))
         self._is_announced = ROSTER[role].is_unique
@@ -160,10 +161,9 @@ class Peers:
         self._counts = counts
         found = {(topic, name): text for topic, _, _ in counts
                  for name, text in self._mismatches(topic)}
-        for key in found.keys() - self._incompatible.keys():
-            self._n_logged += 1
-            if self._n_logged <= _MAX_LOGGED:
-                node.get_logger().warning(found[key])
+        for key in sorted(found.keys() - self._logged)[:_MAX_LOGGED - len(self._logged)]:
+            self._logged.add(key)
+            node.get_logger().warning(found[key])
         self._incompatible = found
 
     def _mismatches(self, topic: str) -> Iterator[tuple[str, str]]:

@@ -140,7 +140,7 @@ def _crash(
     phases = [m.Phase[name.upper()] for name in options.phases or _PHASES]
     return crashes.crash_all(
         observer, processes, options.nodes or crashes.NODES, phases,
-        lambda trial: print(report.crash_line(trial), flush=True))
+        lambda trial: print(report.crash_line(trial), flush=True), options.repeat)
 
 
 def _intrude(
@@ -178,6 +178,8 @@ def _parser() -> argparse.ArgumentParser:
                         help=f'only kill these nodes; one or more of {", ".join(crashes.NODES)}')
     parser.add_argument('--phases', nargs='+', choices=_PHASES, metavar='PHASE',
                         help=f'only kill nodes in these phases; of {", ".join(_PHASES)}')
+    parser.add_argument('--repeat', type=positive_int, default=1, metavar='N',
+                        help='number of times that each node is killed in each phase')
     parser.add_argument('--intruders', nargs='+', choices=intruders.INTRUDERS, metavar='NODE',
                         help='only start these second nodes, which may be repeated; of '
                              f'{", ".join(intruders.INTRUDERS)}')

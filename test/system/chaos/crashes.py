@@ -1,6 +1,7 @@
 """Crash trials: kill each node in each phase, restart it, and measure the time to recover."""
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
 
@@ -46,7 +47,8 @@ class CrashTrial(Trial):
 
 def crash_all(
         observer: NetworkObserver, processes: Processes, nodes: Sequence[str],
-        phases: Iterable[m.Phase], on_trial: Callable[[CrashTrial], None]) -> list[CrashTrial]:
+        phases: Iterable[m.Phase], on_trial: Callable[[CrashTrial], None],
+        repetitions: int = 1) -> list[CrashTrial]:
     """Kill every node in every phase.
 
     Parameters
@@ -57,6 +59,8 @@ def crash_all(
         Names of the nodes to kill.
     on_trial
         Called after each trial.
+    repetitions
+        Number of trials of each node and phase.
 
     Raises
     ------
@@ -65,7 +69,7 @@ def crash_all(
     """
     trials = []
     for node in nodes:
-        for phase in phases:
+        for phase in itertools.chain.from_iterable(itertools.repeat(tuple(phases), repetitions)):
             trials.append(crash(observer, processes, node, phase))
             on_trial(trials[-1])
     return trials
