@@ -107,7 +107,7 @@ def _program() -> str:
     spec = getattr(sys.modules['__main__'], '__spec__', None)
     if spec is None:
         return os.path.basename(sys.argv[0])
-    return f'python -m {spec.name.removesuffix(".__main__")}'
+    return f'python3 -m {spec.name.removesuffix(".__main__")}'
 
 
 def exit_code_of(

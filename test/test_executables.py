@@ -87,8 +87,8 @@ def test_a_missing_package_is_named_in_one_line(
 
 @pytest.mark.parametrize(('spec', 'expected'), [
     (None, 'fig4.py: error: x\n'),
-    (types.SimpleNamespace(name='lab.__main__'), 'python -m lab: error: x\n'),
-    (types.SimpleNamespace(name='lab.tool'), 'python -m lab.tool: error: x\n')])
+    (types.SimpleNamespace(name='lab.__main__'), 'python3 -m lab: error: x\n'),
+    (types.SimpleNamespace(name='lab.tool'), 'python3 -m lab.tool: error: x\n')])
 def test_an_error_names_the_program_of_the_process_by_default(spec, expected, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, '__main__', types.SimpleNamespace(__spec__=spec))
     monkeypatch.setattr(sys, 'argv', ['/lab/fig4.py', 'x'])

@@ -1,7 +1,7 @@
 """The declarations of all ROS parameters: the source of descriptors, checks and documentation.
 
-``python -m rhs_isac_ros.ros.parameters`` prints the table of the README. Parameters that belong to
-the settings of a role are declared there.
+``python3 -m rhs_isac_ros.ros.parameters`` prints the table of the README. Parameters that belong
+to the settings of a role are declared there.
 """
 
 from __future__ import annotations
@@ -337,6 +337,6 @@ def table() -> str:
 
 
 if __name__ == '__main__':
-    ArgumentParser(prog='python -m rhs_isac_ros.ros.parameters',
+    ArgumentParser(prog='python3 -m rhs_isac_ros.ros.parameters',
                    description='Print the table of all ROS parameters.').parse_args()
     print(table())

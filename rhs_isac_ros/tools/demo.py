@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scenario, codebook_file = load_files(options.config, options.codebook)
         recorder = Recorder(options.record, scenario) if options.record else None
     except CodebookError as error:
-        print_error(f'{error}; to create a codebook for a scenario: python -m '
+        print_error(f'{error}; to create a codebook for a scenario: python3 -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
         return 2
     except (ScenarioError, RecordingError) as error:

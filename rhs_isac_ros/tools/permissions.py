@@ -1,6 +1,6 @@
 """Permissions of the nodes for topics and services, as a policy for SROS2.
 
-``python -m rhs_isac_ros.tools.permissions`` prints the policy; ``config/sros2/policy.xml`` is the
+``python3 -m rhs_isac_ros.tools.permissions`` prints the policy; ``config/sros2/policy.xml`` is the
 policy for two users.
 """
 
@@ -139,8 +139,8 @@ def policy(namespace: str = '/', users: int = 2) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the policy, and return the exit code 0."""
     parser = ArgumentParser(
-        prog='python -m rhs_isac_ros.tools.permissions', description='Print the SROS2 policy of a '
-        'network.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        prog='python3 -m rhs_isac_ros.tools.permissions',
+        description='Print the SROS2 policy of a network.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')

@@ -1,6 +1,6 @@
 """``scripts/topic``: ``ros2 topic``, which the wheels lack, with the same output.
 
-``python -m rhs_isac_ros.tools.topic --help`` lists the commands.
+``python3 -m rhs_isac_ros.tools.topic --help`` lists the commands.
 """
 
 import argparse
