@@ -68,8 +68,8 @@ class Peers:
             on_rival: Callable[[bool], None]) -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
         self._required = {name: identifying_endpoints(name) for name in ROSTER[role].needed}
-        # By role: what it lacked, by the number of endpoints of each topic at the last poll.
-        self._found: dict[str, dict[tuple[int, ...], str]] = {name: {} for name in self._required}
+        # By role that was found last: the number of endpoints of each topic then.
+        self._present: dict[str, tuple[int, ...]] = {}
         # Number of endpoints by topic at the last poll, and incompatible ones by topic and node.
         self._counts: list[tuple[str, int, int]] = []
         self._incompatible: dict[tuple[str, str], str] = {}
@@ -135,17 +135,21 @@ class Peers:
                      *(('subscriber', node.resolve_topic_name(topic)) for topic in subscriptions)]
         counts = tuple(node.count_publishers(topic) if kind == 'publisher'
                        else node.count_subscribers(topic) for kind, topic in endpoints)
-        if counts not in self._found[name]:
-            # Observers have single endpoints, so that only a node with all of them is present.
-            nodes = [{_full_name(info) for info in (
-                node.get_publishers_info_by_topic(topic) if kind == 'publisher'
-                else node.get_subscriptions_info_by_topic(topic))} for kind, topic in endpoints]
-            absent = [f'no {kind} of {topic}' for (kind, topic), names in zip(
-                endpoints, nodes, strict=True) if not names & nodes[0]]
+        if counts == self._present.get(name):
+            return ''
+        # Observers have single endpoints, so that only a node with all of them is present. Names
+        # of nodes may arrive after their endpoints.
+        nodes = [{_full_name(info) for info in (
+            node.get_publishers_info_by_topic(topic) if kind == 'publisher'
+            else node.get_subscriptions_info_by_topic(topic)) if info.node_name != _UNNAMED}
+            for kind, topic in endpoints]
+        absent = [f'no {kind} of {topic}' for (kind, topic), names in zip(
+            endpoints, nodes, strict=True) if not names & nodes[0]]
+        if absent:
             is_gone = len(absent) == len(endpoints)
-            text = name if is_gone else f'{name} ({", ".join(absent)})' if absent else ''
-            self._found[name] = {counts: text}
-        return self._found[name][counts]
+            return name if is_gone else f'{name} ({", ".join(absent)})'
+        self._present[name] = counts
+        return ''
 
     # Quality of service
 
@@ -158,13 +162,20 @@ class Peers:
                   for topic in sorted(ours.difference(_FOREIGN))]
         if counts == self._counts:
             return
-        self._counts = counts
+        # Names of nodes may arrive after their endpoints; the next poll then examines them again.
+        self._counts = counts if all(self._is_named(topic) for topic, _, _ in counts) else []
         found = {(topic, name): text for topic, _, _ in counts
                  for name, text in self._mismatches(topic)}
         for key in sorted(found.keys() - self._logged)[:_MAX_LOGGED - len(self._logged)]:
             self._logged.add(key)
             node.get_logger().warning(found[key])
         self._incompatible = found
+
+    def _is_named(self, topic: str) -> bool:
+        """Return whether the nodes of all endpoints of a topic are known."""
+        return not any(info.node_name == _UNNAMED for info in (
+            *self._node.get_publishers_info_by_topic(topic),
+            *self._node.get_subscriptions_info_by_topic(topic)))
 
     def _mismatches(self, topic: str) -> Iterator[tuple[str, str]]:
         """Yield node and description of each incompatible endpoint of a topic."""
@@ -175,7 +186,8 @@ class Peers:
                 names = {_full_name(publisher), _full_name(subscription)}
                 compatibility, reason = qos_check_compatible(
                     publisher.qos_profile, subscription.qos_profile)
-                if own in names and compatibility == QoSCompatibility.ERROR:
+                is_named = _UNNAMED not in (publisher.node_name, subscription.node_name)
+                if own in names and is_named and compatibility == QoSCompatibility.ERROR:
                     (name,) = names - {own} or {own}
                     reason = reason.removeprefix('ERROR: ').rstrip(';. ')
                     yield name, f'{topic}: no messages between this node and {name}: {reason}'

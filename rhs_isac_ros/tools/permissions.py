@@ -140,7 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the policy, and return the exit code 0."""
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.tools.permissions',
-        description='Print the SROS2 policy of a network.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        description='Print the SROS2 policy of a network.',
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')

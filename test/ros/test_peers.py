@@ -140,6 +140,25 @@ def test_an_observer_does_not_stand_for_a_role(bench, monitor):
     bench.until(lambda: 'positioner' not in reports[-1], 'presence')
 
 
+def test_nodes_whose_names_arrive_late_are_found():
+    node, reports = mock.MagicMock(), []
+    node.get_fully_qualified_name.return_value = '/user'
+    node.resolve_topic_name.side_effect = '/{}'.format
+    node.count_publishers.return_value = node.count_subscribers.return_value = 1
+    info = mock.Mock(node_name='_NODE_NAME_UNKNOWN_', node_namespace='/', qos_profile=qos.EXCHANGE)
+    node.get_publishers_info_by_topic.return_value = (
+        node.get_subscriptions_info_by_topic.return_value) = [info]
+    Peers(node, 'user', 1, Scenario(), reports.append, lambda stands_by: None)
+    poll = node.create_timer.call_args.args[1]
+    for _ in range(20):
+        poll()
+    assert reports == [{'channel': 'channel', 'bs': 'bs'}]
+    info.node_name = 'other'
+    for _ in range(2):
+        poll()
+    assert reports[1:] == [{}]
+
+
 def test_only_the_own_namespace_counts(bench, monitor):
     endpoints = REQUIRED['transmission'][topics.OPTIMIZER_NODE]
     create_endpoints(bench.add(Node, 'there', namespace='/b'), endpoints)
