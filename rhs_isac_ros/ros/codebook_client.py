@@ -81,6 +81,7 @@ class CodebookClient:
         self._announced += 1
         self._announced_s = time.monotonic()
         self._timer.reset()
+        self._request()
 
     def _fits(self, message: ros.Codebook, codebook: Codebook) -> bool:
         """Return whether a codebook fits the scenario, or log that it does not."""
