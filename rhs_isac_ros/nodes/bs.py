@@ -15,7 +15,6 @@ from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.events import (
     Action,
-    CodebookOffered,
     PauseRequested,
     Reply,
     Resumed,
@@ -44,7 +43,6 @@ class BsNode(RoleNode[BaseStation]):
         for name, event in ((topics.PAUSE, PauseRequested()), (topics.RESUME, ResumeRequested()),
                             (topics.STEP, StepRequested())):
             self.create_service(Trigger, name, functools.partial(self._on_request, event))
-        self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
     def stand_by(self) -> None:
         """Abandon the cycle, and wait."""

@@ -30,7 +30,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     Action,
     BuildEstimator,
-    CodebookOffered,
     EstimatorFailed,
     EstimatorReady,
     PublishTrack,
@@ -57,7 +56,6 @@ class PositionerNode(RoleNode[Positioner]):
         self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped})
         self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry})
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
-        self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
         """Return the settings for parameter values.

@@ -1,6 +1,7 @@
 """Who is in the network: the nodes and topics of the ROS graph."""
 
 import collections
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -162,8 +163,7 @@ class Peers:
                   for topic in sorted(ours.difference(_FOREIGN))]
         if counts == self._counts:
             return
-        # Names of nodes may arrive after their endpoints; the next poll then examines them again.
-        self._counts = counts if all(self._is_named(topic) for topic, _, _ in counts) else []
+        self._counts = counts
         found = {(topic, name): text for topic, _, _ in counts
                  for name, text in self._mismatches(topic)}
         for key in sorted(found.keys() - self._logged)[:_MAX_LOGGED - len(self._logged)]:
@@ -171,23 +171,20 @@ class Peers:
             node.get_logger().warning(found[key])
         self._incompatible = found
 
-    def _is_named(self, topic: str) -> bool:
-        """Return whether the nodes of all endpoints of a topic are known."""
-        return not any(info.node_name == _UNNAMED for info in (
-            *self._node.get_publishers_info_by_topic(topic),
-            *self._node.get_subscriptions_info_by_topic(topic)))
-
     def _mismatches(self, topic: str) -> Iterator[tuple[str, str]]:
         """Yield node and description of each incompatible endpoint of a topic."""
         own = self._node.get_fully_qualified_name()
+        publishers = self._node.get_publishers_info_by_topic(topic)
         subscriptions = self._node.get_subscriptions_info_by_topic(topic)
-        for publisher in self._node.get_publishers_info_by_topic(topic):
-            for subscription in subscriptions:
-                names = {_full_name(publisher), _full_name(subscription)}
+        for publisher, subscription in itertools.product(publishers, subscriptions):
+            names = {_full_name(publisher), _full_name(subscription)}
+            if _UNNAMED in (publisher.node_name, subscription.node_name):
+                # The name may arrive after the endpoint; the next poll examines it again.
+                self._counts = []
+            elif own in names:
                 compatibility, reason = qos_check_compatible(
                     publisher.qos_profile, subscription.qos_profile)
-                is_named = _UNNAMED not in (publisher.node_name, subscription.node_name)
-                if own in names and is_named and compatibility == QoSCompatibility.ERROR:
+                if compatibility == QoSCompatibility.ERROR:
                     (name,) = names - {own} or {own}
                     reason = reason.removeprefix('ERROR: ').rstrip(';. ')
                     yield name, f'{topic}: no messages between this node and {name}: {reason}'

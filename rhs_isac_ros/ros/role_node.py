@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from rclpy.publisher import Publisher
@@ -13,6 +12,7 @@ from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     Action,
+    CodebookOffered,
     Event,
     LogMessage,
     PeersChanged,
@@ -90,23 +90,28 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._timer.cancel()
         self._timer_due_s: float | None = None
 
-    def start(self, role: _RoleT, *, advertise: bool = True, subscribe: bool = True) -> None:
+    def start(
+            self, role: _RoleT, *, subscribe: bool = True, needs_codebook: bool = False) -> None:
         """Connect the role to its topics and publish its diagnostics.
 
         Parameters
         ----------
-        advertise, subscribe
-            Whether to call these methods now; a role that is not ready yet calls them later.
+        subscribe
+            Whether to subscribe now; a role that is not ready yet calls `subscribe` later.
+        needs_codebook
+            Whether to advertise and to subscribe when the first codebook arrives.
         """
-        self.role = role
-        if advertise:
+        self.role, self._needs_codebook = role, needs_codebook
+        if not needs_codebook:
             self.advertise()
         self._diagnostics = Diagnostics(self, self.report)
         self._peers = Peers(
             self, self._executable, self.instance, self.scenario, self._on_missing,
             self._on_rival)
-        if subscribe:
+        if subscribe and not needs_codebook:
             self.subscribe()
+        if ROSTER[self._executable].has_codebook:
+            self._codebook_client = CodebookClient(self, self.scenario, self._on_codebook)
 
     def advertise(self) -> None:
         """Create the publishers of the role; the graph then shows that the role is present.
@@ -191,9 +196,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """Pass new settings to the role."""
         self.dispatch(SettingsOffered(settings))
 
-    def follow_codebook(self, on_codebook: Callable[[Codebook], None]) -> None:
-        """Call a function with the current codebook of the optimizer and with each later one."""
-        self._codebook_client = CodebookClient(self, self.scenario, on_codebook)
+    def _on_codebook(self, codebook: Codebook) -> None:
+        """Pass a codebook to the role, which may begin to serve with the first."""
+        self.dispatch(CodebookOffered(codebook))
+        if self._needs_codebook:
+            self.advertise()
+            self.subscribe()
 
     @staticmethod
     def now_s() -> float:

@@ -152,7 +152,7 @@ def test_messages_keep_their_order(each_bench, start):
 def test_a_role_may_connect_to_its_topics_later_and_only_once(bench, probe):
     role = Scripted(sends=[m.Grant], receives=[m.Ack])
     node = bench.add(RoleNode, 'channel', 'scripted')
-    node.start(role, advertise=False, subscribe=False)
+    node.start(role, needs_codebook=True)
     assert not node.count_publishers('grant')
     assert not node.count_subscribers('ack')
     for _ in range(2):
