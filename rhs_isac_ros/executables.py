@@ -47,6 +47,7 @@ def __getattr__(name: str) -> Callable[[], int]:
             signal.signal(number, lambda *_: os._exit(0))
         _end_with_parent()
         try:
+            _join_network(name)
             module = importlib.import_module(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
         except ModuleNotFoundError as error:
             missing = str(error.name).partition('.')[0]
@@ -71,6 +72,20 @@ def _what_provides(missing: str) -> str:
                 '`ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`, then repeat colcon build '
                 'and source install/setup.bash')
     return f'{missing}, which is not installed'
+
+
+def _join_network(name: str) -> None:
+    """Have a node discover the other processes while its modules are imported."""
+    arguments = sys.argv[1:]
+    if EXECUTABLES[name] != 'nodes' or arguments[:1] not in ([], ['--ros-args']):
+        return
+    # Before NumPy, which ROS imports, so that the limits of its threads apply.
+    importlib.import_module('rhs_isac_ros.nodes')
+    try:
+        importlib.import_module('rhs_isac_ros.ros.early').join([name, *arguments])
+    except RuntimeError:
+        # Invalid ROS arguments, which the executable reports.
+        return
 
 
 def _end_with_parent() -> None:
