@@ -59,6 +59,8 @@ def test_an_entry_point_runs_its_module_and_returns_the_exit_code(
         imported.append(module)
         return types.SimpleNamespace(main=lambda: 7)
     monkeypatch.setattr(importlib, 'import_module', import_module)
+    # With ROS arguments alone, a node joins the network first.
+    monkeypatch.setattr(sys, 'argv', [name, '--help'])
     assert getattr(executables, name)() == 7
     assert imported == [f'rhs_isac_ros.{folder}.{name}']
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -129,7 +131,7 @@ executables.bs()
     process = subprocess.Popen(
         [sys.executable, '-c', code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(str, [ROOT, *sys.path]))})
-    assert process.stdout.readline() == 'importing rhs_isac_ros.nodes.bs\n'
+    assert process.stdout.readline() == 'importing rhs_isac_ros.nodes\n'
     process.send_signal(number)
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (0, '')

@@ -92,15 +92,11 @@ class CodebookClient:
                     f'scenario {message.scenario_id}, expected {self._scenario.id}')
         except CodebookError as error:
             self._log_once.error(
-                'codebook', f'codebook of {self._optimizer} rejected: {error}',
+                'codebook', f'codebook of the optimizer rejected: {error}',
                 repeat_if_changed=True)
             return False
         self._log_once.clear('codebook')
         return True
-
-    @property
-    def _optimizer(self) -> str:
-        return f'{self._node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
 
     def _request(self) -> None:
         if self._fetched == self._announced:

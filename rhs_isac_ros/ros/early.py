@@ -1,7 +1,6 @@
-"""Discovery of other processes while a node imports its modules.
+"""Discovery of other processes while a node imports its modules; this one imports little.
 
-Fast DDS takes a tenth of a second to discover the others, and a second longer whenever it misses
-one of the messages that follow. This module imports little, so that the nodes need not wait.
+Fast DDS takes a tenth of a second, and a second longer for each message that it misses.
 """
 
 import os

@@ -6,7 +6,7 @@ the documentation derive from `ROSTER`.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
@@ -88,22 +88,14 @@ ROSTER: Mapping[str, Member] = {
 UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
 
 
-class Endpoints(NamedTuple):
-    """Topics that are published and received."""
+def identifying_endpoints(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the topics that a present role publishes, and those to which it subscribes.
 
-    publishers: tuple[str, ...]
-    subscriptions: tuple[str, ...]
-
-
-def identifying_endpoints(name: str) -> Endpoints:
-    """Return the endpoints that show the presence of a role.
-
-    These are the first topic that no other role publishes, and the first to which no other role
-    subscribes, if any. One of each is enough, because a node creates its publishers together and
-    its subscriptions together.
+    These are the first that no other role publishes, and the first to which no other role
+    subscribes. One of each is enough, because a node creates them together.
     """
     others = [member for other, member in ROSTER.items() if other != name]
     sent = {topic for member in others for topic in member.sent}
     received = {topic for member in others for topic in member.received}
-    return Endpoints(tuple(topic for topic in ROSTER[name].sent if topic not in sent)[:1],
-                     tuple(topic for topic in ROSTER[name].received if topic not in received)[:1])
+    return (tuple(topic for topic in ROSTER[name].sent if topic not in sent)[:1],
+            tuple(topic for topic in ROSTER[name].received if topic not in received)[:1])
