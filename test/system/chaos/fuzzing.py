@@ -15,6 +15,7 @@ from visualization_msgs.msg import MarkerArray
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.processes import Processes
@@ -26,6 +27,7 @@ from system.observer import NetworkObserver
 _BATCH = 32
 _TIMEOUT_S = 30.0
 _MAX_ORIGINALS = 32
+_MAX_PUBLISHED = 100 * _BATCH
 # Messages of the protocol by topic.
 _PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
 # Topics with other messages.
@@ -85,7 +87,8 @@ class _Mutator:
         self.originals: collections.deque[bytes] = collections.deque(maxlen=_MAX_ORIGINALS)
         self._kind = kind
         self._publisher = node.create_publisher(kind, name, profile)
-        self._published: collections.deque[bytes] = collections.deque(maxlen=4 * _BATCH)
+        # The observer receives its own messages late on a busy machine.
+        self._published: NewestDict[bytes, None] = NewestDict(_MAX_PUBLISHED)
         subscribe(node, kind, name, self._receive, profile, raw=True)
 
     def publish(self, rng: np.random.Generator) -> bytes:
@@ -94,7 +97,7 @@ class _Mutator:
         # and falsify the counters, which are read from the diagnostics.
         originals = () if self.name == topics.DIAGNOSTICS else self.originals
         content = mutate(self._kind, originals, rng)
-        self._published.append(content)
+        self._published.put(content, None)
         self._publisher.publish(content)
         return content
 
