@@ -26,7 +26,8 @@ PIP_ONLY = {
 }
 # Modules of the repository.
 OWN = {
-    'rhs_isac_ros', 'parts', 'peers', 'diagram', 'sequence', 'run_notebook', 'pictures', 'conftest',
+    'rhs_isac_ros', 'parts', 'peers', 'diagram', 'sequence', 'run_notebook', 'pictures',
+    'conftest',
     'headless_browser', 'in_memory_network', 'node_processes', 'system', 'test_installation'}
 
 
