@@ -1,24 +1,14 @@
 """The ament_python package rhs_isac_ros; without ROS, pip installs the library alone."""
 
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = 'rhs_isac_ros'
-NODES = (
-    'bs',
-    'channel',
-    'demo',
-    'network',
-    'optimizer',
-    'positioner',
-    'rhs_controller',
-    'transmission',
-    'user',
-    'visualizer',
-)
-# The terminal tools that have no counterpart in `ros2`.
-TOOLS = ('calibrate', 'record', 'replay', 'snapshot', 'view', 'watch')
+NODES = sorted(path.stem for path in Path(__file__).parent.glob(f'{NAME}/nodes/[a-z]*.py'))
+# The demonstration, and the terminal tools that have no counterpart in `ros2`.
+TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
 
 setup(
     name=NAME,

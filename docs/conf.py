@@ -43,6 +43,6 @@ nitpick_ignore_regex = [
     ('py:.*', r'(?!rhs_isac_ros\.).*'),
     ('py:.*', r'rhs_isac_ros\.(.*\.)?_.*'),
     # Type variables.
-    ('py:.*', r'rhs_isac_ros\.(protocol\.codebook_cache\.Item|protocol\.newest\.(Key|Value)|'
-             r'protocol\.pending_settings\.SettingsT|protocol\.state_machine\.\w+T)'),
+    ('py:.*', r'rhs_isac_ros\.(protocol\.newest\.Item|protocol\.newest\.(Key|Value)|'
+             r'protocol\.role\.SettingsT|protocol\.state_machine\.\w+T)'),
 ]

@@ -19,7 +19,9 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from rhs_isac_ros.ros.parameters import NODES
 from rhs_isac_ros.ros.processes import MAX_USER_NODES
+from rhs_isac_ros.ros.roster import ROSTER
 
 PACKAGE = 'rhs_isac_ros'
 # A launch that receives SIGTERM does not end its processes, so the kernel does.
@@ -68,35 +70,35 @@ def start_nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         file does not exist.
     """
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
-    users, seed = _integer('users', given, 1), {'seed': _integer('seed', given, 0)}
+    users = _integer('users', given, 1)
+    values = {'seed': _integer('seed', given, 0), 'codebook_file': given['codebook'],
+              'estimator': given['estimator']}
     file = given['params_file']
     if file and not Path(file).is_file():
         raise ValueError(f'params_file: {file!r}, expected an existing file')
-    codebook, estimator = {'codebook_file': given['codebook']}, {'estimator': given['estimator']}
     if given['composed'] == 'true':
         # Without a name, the parameters apply to every node of the process.
-        nodes = [_node(given, 'network', None, users=users, **seed, **codebook, **estimator)]
+        nodes = [_node(given, 'network', None, users=users, **values)]
     else:
-        nodes = [
-            _node(given, 'rhs_controller', 'rhs_controller'),
-            _node(given, 'positioner', 'positioner', **estimator),
-            _node(given, 'transmission', 'transmission'),
-            _node(given, 'optimizer', 'optimizer', **codebook),
-            _node(given, 'channel', 'channel', **seed),
-            *_users(given, users, **seed),
-            _node(given, 'bs', 'bs', **seed),
-        ]
+        nodes = [node for role in ROSTER for node in _nodes(given, role, users, values)]
     if 'true' in (given['visualizer'], given['rviz']):
         nodes.append(_node(given, 'visualizer', 'visualizer'))
     # The recorder misses messages that precede its start and are not latched.
     return [*_recorder(given), *nodes, *_rviz(given)]
 
 
-def _users(given: dict[str, str], users: int, **values: int) -> list[Node]:
+def _nodes(
+        given: dict[str, str], role: str, users: int, values: dict[str, int | str]
+) -> list[LaunchDescriptionEntity]:
+    """Return the nodes of a role, with those of the values that are parameters of it."""
+    known = {parameter.name for parameter in NODES[role]}
+    values = {name: value for name, value in values.items() if name in known}
+    if ROSTER[role].is_unique:
+        return [_node(given, role, role, **values)]
     if users > MAX_USER_NODES:
         return [LogInfo(msg=f'the {users} users share the node users'),
-                _node(given, 'user', 'users', user_id=1, user_count=users, **values)]
-    return [_node(given, 'user', f'user_{number}', user_id=number, **values)
+                _node(given, role, 'users', user_id=1, user_count=users, **values)]
+    return [_node(given, role, f'user_{number}', user_id=number, **values)
             for number in range(1, users + 1)]
 
 
@@ -122,20 +124,24 @@ def _node(given: dict[str, str], executable: str, name: str | None, **values: in
 def _recorder(given: dict[str, str]) -> list[Node]:
     if not given['record']:
         return []
-    # Not restarted, because a second process would replace the recording.
-    return [_process(given, 'record', False, [], executable='record', name='recorder',
-                     arguments=[given['record'], '--config', given['config']])]
+    # Not restarted, because a second process would replace the recording. If the disk is full, the
+    # network does not end with the recorder.
+    return [_process(given, 'record', False, [], is_optional=True, executable='record',
+                     name='recorder', arguments=[given['record'], '--config', given['config']])]
 
 
 def _process(
         given: dict[str, str], exec_name: str, respawn: bool, ros_arguments: list[str],
-        **options: Any) -> Node:
-    """Return an action for a process of the package, named `exec_name` in the output."""
+        is_optional: bool = False, **options: Any) -> Node:
+    """Return an action for a process of the package, named `exec_name` in the output.
+
+    If it fails and is neither restarted nor optional, the launch ends.
+    """
     return Node(
         package=PACKAGE, exec_name=exec_name, output='screen', prefix=END_WITH_LAUNCH,
         namespace=given['namespace'], respawn=respawn, respawn_delay=RESPAWN_DELAY_S,
         ros_arguments=['--log-level', given['log_level'], *ros_arguments],
-        on_exit=functools.partial(_end_if_failed, respawn), **options)
+        on_exit=functools.partial(_end_if_failed, respawn or is_optional), **options)
 
 
 def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
@@ -152,14 +158,14 @@ def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
         namespace=given['namespace'], prefix=END_WITH_LAUNCH, arguments=['-d', file])]
 
 
-def _end_if_failed(respawn: bool, event: ProcessExited, context: LaunchContext) -> None:
-    """End the launch, with exit code 1, if a process failed and is not restarted.
+def _end_if_failed(may_fail: bool, event: ProcessExited, context: LaunchContext) -> None:
+    """End the launch, with exit code 1, if a process failed that may not, or is invalid.
 
     Raises
     ------
     RuntimeError
         ``launch`` logs it and ends; its action ``Shutdown`` would result in exit code 0.
     """
-    restarted = respawn and event.returncode != INVALID
-    if event.returncode and not restarted and not context.is_shutdown:
+    is_tolerated = may_fail and event.returncode != INVALID
+    if event.returncode and not is_tolerated and not context.is_shutdown:
         raise RuntimeError(f'{event.process_name} ended with exit code {event.returncode}')

@@ -11,31 +11,19 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 # Time of `time.monotonic` at which the program began, before anything slow was imported [s].
 STARTED_S = time.monotonic()
 # Environment variable with the process id of a parent that its children must not outlive.
 PARENT_ID = 'RHS_ISAC_ROS_PARENT_ID'
 _PR_SET_PDEATHSIG = 1
+# Executables in `tools`; the others are the modules of `nodes`.
+_TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
 # Subpackage of each executable.
 EXECUTABLES = {
-    'bs': 'nodes',
-    'calibrate': 'tools',
-    'channel': 'nodes',
-    'demo': 'tools',
-    'network': 'nodes',
-    'optimizer': 'nodes',
-    'positioner': 'nodes',
-    'record': 'tools',
-    'replay': 'tools',
-    'rhs_controller': 'nodes',
-    'snapshot': 'tools',
-    'transmission': 'nodes',
-    'user': 'nodes',
-    'view': 'tools',
-    'visualizer': 'nodes',
-    'watch': 'tools',
-}
+    **{path.stem: 'nodes' for path in (Path(__file__).parent / 'nodes').glob('[a-z]*.py')},
+    **dict.fromkeys(_TOOLS, 'tools')}
 
 
 def __getattr__(name: str) -> Callable[[], int]:
@@ -59,6 +47,7 @@ def __getattr__(name: str) -> Callable[[], int]:
             signal.signal(number, lambda *_: os._exit(0))
         _end_with_parent()
         try:
+            _join_network(name)
             module = importlib.import_module(f'rhs_isac_ros.{EXECUTABLES[name]}.{name}')
         except ModuleNotFoundError as error:
             missing = str(error.name).partition('.')[0]
@@ -83,6 +72,20 @@ def _what_provides(missing: str) -> str:
                 '`ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`, then repeat colcon build '
                 'and source install/setup.bash')
     return f'{missing}, which is not installed'
+
+
+def _join_network(name: str) -> None:
+    """Have a node discover the other processes while its modules are imported."""
+    arguments = sys.argv[1:]
+    if EXECUTABLES[name] != 'nodes' or arguments[:1] not in ([], ['--ros-args']):
+        return
+    # Before NumPy, which ROS imports, so that the limits of its threads apply.
+    importlib.import_module('rhs_isac_ros.nodes')
+    try:
+        importlib.import_module('rhs_isac_ros.ros.early').join([name, *arguments])
+    except RuntimeError:
+        # Invalid ROS arguments, which the executable reports.
+        return
 
 
 def _end_with_parent() -> None:
@@ -119,7 +122,7 @@ def _program() -> str:
     spec = getattr(sys.modules['__main__'], '__spec__', None)
     if spec is None:
         return os.path.basename(sys.argv[0])
-    return f'python -m {spec.name.removesuffix(".__main__")}'
+    return f'python3 -m {spec.name.removesuffix(".__main__")}'
 
 
 def exit_code_of(

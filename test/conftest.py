@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import subprocess
 import sys
+import sysconfig
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, plugins
 
 # Fixtures that several folders share. Those of processes need ROS, which the pure layers do not.
 pytest_plugins = ['in_memory_network']
@@ -261,6 +262,22 @@ def table1_estimator(shipped):
     """The default estimator for Table I and the shipped codebook."""
     from rhs_isac_ros.positioning import make_estimator
     return make_estimator('bayes', Scenario(), shipped)
+
+
+@pytest.fixture(autouse=True, scope='session')
+def without_installed_plugins():
+    """Hide plug-ins that are installed in the environment: they are not part of the tests."""
+    find, home = plugins.metadata.entry_points, Path(sysconfig.get_path('purelib'))
+
+    def entry_points(**chosen):
+        found = find(**chosen)
+        if not chosen.get('group', '').startswith('rhs_isac_ros.'):
+            return found
+        return type(found)(
+            point for point in found if Path(point.dist.locate_file('')) != home)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(plugins.metadata, 'entry_points', entry_points)
+        yield
 
 
 @pytest.fixture

@@ -22,7 +22,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.delivery import deliveries_to, is_due
 from rhs_isac_ros.protocol.events import (
     BuildEstimator,
     CodebookOffered,
@@ -40,15 +39,12 @@ from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PositionerSettings
 from rhs_isac_ros.protocol.transmission import Transmission
+from rhs_isac_ros.ros.roster import ROSTER
 
-ROLES = {'bs': BaseStation, 'user': user_role.User, 'rhs_controller': RhsController,
-         'channel': Channel, 'positioner': Positioner, 'transmission': Transmission}
+ROLES = {name: member.role for name, member in ROSTER.items() if member.role}
 SUBSCRIPTIONS = {name: role.RECEIVES for name, role in ROLES.items()}
-PEERS = {
-    'bs': ('rhs_controller', 'channel', 'positioner', 'transmission'),
-    'user': ('channel', 'bs'),
-}
-USE_CODEBOOKS = ('bs', 'rhs_controller', 'positioner', 'transmission')
+PEERS = {name: ROSTER[name].requires for name in ('bs', 'user')}
+USE_CODEBOOKS = tuple(name for name, member in ROSTER.items() if member.has_codebook)
 LATENCY_S = 1e-3
 DATA_DURATION_S = 1e-3
 # A model file that does not match any codebook.
@@ -238,7 +234,7 @@ class Network:
     def dispatch(self, name: str, event) -> None:
         for action in self._roles[name].handle(event, self.now_s):
             if isinstance(action, Send):
-                self.publish(action.message, name, action.to)
+                self.publish(action.message, name)
             elif isinstance(action, BuildEstimator):
                 self._make_estimator(name, action)
             elif isinstance(action, RevertSettings):
@@ -266,8 +262,8 @@ class Network:
         heapq.heappush(self._queue, (self.now_s + self._make_s, next(self._serial), name,
                                      self._roles[name], event))
 
-    def publish(self, message: m.Message, sender: str = 'external', to=()) -> None:
-        """Deliver a message to its recipients; those of a message from outside are all."""
+    def publish(self, message: m.Message, sender: str = 'external') -> None:
+        """Deliver a message to all roles that receive it."""
         m.check(message, self.scenario.sizes)
         if sender in self.instances:
             message = dataclasses.replace(message, sender=self.instances[sender])
@@ -279,11 +275,6 @@ class Network:
         for name, role in self._roles.items():
             kind = self._kind(name)
             if type(message) not in SUBSCRIPTIONS[kind]:
-                continue
-            wanted = [one for one in deliveries_to(kind) if one.kind is type(message)]
-            if wanted and sender != 'external' and not any(
-                    one.sender == self._kind(sender) and is_due(one, self.instances[name], to)
-                    for one in wanted):
                 continue
             for delay_s, arriving in self.transport(message, name):
                 key = (sender, name, type(message))

@@ -49,7 +49,7 @@ def installation(tmp_path_factory):
     made = subprocess.run([sys.executable, '-m', 'venv', folder / 'venv'], capture_output=True,
                           text=True, timeout=SECONDS, check=False)
     if made.returncode:
-        pytest.skip(f'python -m venv fails: {made.stdout.strip()[:200]}')
+        pytest.skip(f'python3 -m venv fails: {made.stdout.strip()[:200]}')
     fresh = Installation(folder)
     # The build needs setuptools. Its download also shows whether there is an index.
     probe = fresh.run('pip', 'download', '--quiet', '--no-deps', '--dest', 'index', 'setuptools')

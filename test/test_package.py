@@ -26,8 +26,9 @@ PIP_ONLY = {
 }
 # Modules of the repository.
 OWN = {
-    'rhs_isac_ros', 'parts', 'peers', 'sequence', 'run_notebook', 'pictures', 'conftest',
-    'headless_browser', 'in_memory_network', 'node_processes', 'system', 'test_installation'}
+    'rhs_isac_ros', 'parts', 'peers', 'diagram', 'sequence', 'run_notebook', 'pictures',
+    'conftest',
+    'headless_browser', 'impairment_checks', 'in_memory_network', 'node_processes', 'system', 'test_installation'}
 
 
 @functools.cache

@@ -11,19 +11,17 @@ import pkgutil
 import re
 from pathlib import Path
 
+import diagram
 import sequence
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
-from visualization_msgs.msg import MarkerArray
 
 from rhs_isac_ros.experiments.measures import MEASURES
 from rhs_isac_ros.model.scenario import Extensions, Table1
-from rhs_isac_ros.protocol import diagram
-from rhs_isac_ros.protocol.delivery import DELIVERIES, USER
 from rhs_isac_ros.protocol.outcomes import Kind, Outcome
-from rhs_isac_ros.ros import parameters, qos, recording, topics
+from rhs_isac_ros.ros import parameters
 
 ROOT = Path(__file__).parents[2]
 MESSAGES = ROOT / 'msg_defs' / 'msg'
@@ -77,33 +75,6 @@ def measure_table():
     """Return a table of the measures of sweeps."""
     rows = [(code(name), measure.unit, measure.label) for name, measure in MEASURES.items()]
     return table(('measure', 'unit', 'meaning'), rows, '30 15 55')
-
-
-def topic_table():
-    """Return all topics with type and quality of service."""
-    # Markers are published but not recorded.
-    publishers = {topics.MARKERS: (MarkerArray, qos.EXCHANGE), **recording.recorded_topics()}
-    rows = []
-    for name, (kind, profile) in sorted(publishers.items()):
-        kept = 'latched' if profile in (qos.LATCHED, qos.PRESENCES) else f'last {profile.depth}'
-        text = recording.type_name(kind).replace('/msg/', '/')
-        shown = f':ref:`{text} <message-{kind.__name__.lower()}>`' if text.startswith(
-            'rhs_isac_msgs') else code(text)
-        rows.append((code(name), shown, f'reliable, {kept}'))
-    return table(('topic', 'type', 'quality of service'), rows, '25 45 30')
-
-
-def delivery_table():
-    """Return the topics of single recipients."""
-    rows = []
-    for name in dict.fromkeys(topics.delivery(one.kind, one.recipient) for one in DELIVERIES):
-        ones = [one for one in DELIVERIES if topics.delivery(one.kind, one.recipient) == name]
-        names = [name]
-        if ones[0].recipient == USER:
-            names.append(topics.delivery(ones[0].kind, f'{USER}_<n>'))
-        rows.append((', '.join(map(code, names)), code(ones[0].kind.__name__),
-                     ', '.join(one.sender for one in ones), ones[0].recipient))
-    return table(('topic', 'type', 'publishers', 'subscriber'), rows, '46 22 18 14')
 
 
 def message_list():
@@ -189,7 +160,7 @@ def module_list(package):
 
 
 FUNCTIONS = {function.__name__: function for function in (
-    parameter_table, scenario_table, measure_table, topic_table, delivery_table, message_list,
+    parameter_table, scenario_table, measure_table, message_list,
     state_picture, state_table, cycle_sequence, outcome_table, module_list, dependency_table)}
 
 

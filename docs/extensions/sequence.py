@@ -25,13 +25,12 @@ from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.protocol.user import User
+from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.ros.topics import NAMES
 
 # Roles, in the order of the columns.
-RECEIVES = {'user': User.RECEIVES, 'channel': Channel.RECEIVES, 'bs': BaseStation.RECEIVES,
-            'rhs_controller': RhsController.RECEIVES, 'positioner': Positioner.RECEIVES,
-            'transmission': Transmission.RECEIVES}
+RECEIVES = {name: ROSTER[name].role.RECEIVES for name in (
+    'user', 'channel', 'bs', 'rhs_controller', 'positioner', 'transmission')}
 _COLUMN, _ROW, _TOP, _LEFT = 165, 24, 50, 70
 # The page includes the picture, so that its style must not match other pictures. The background is
 # that of the theme, light or dark.

@@ -12,7 +12,7 @@ from rhs_isac_ros.model.arguments import ArgumentParser
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, also after Ctrl-C, or 2 if an argument or a file is invalid."""
     parser = ArgumentParser(
-        prog='python -m rhs_isac_ros.codebook', description=__doc__,
+        prog='python3 -m rhs_isac_ros.codebook', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add_options(parser)
     options = parser.parse_args(arguments)

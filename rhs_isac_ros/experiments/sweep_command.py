@@ -42,7 +42,7 @@ from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.pictures import write_picture
 from rhs_isac_ros.positioning import REGION_ESTIMATORS
 
-PROGRAM = 'python -m rhs_isac_ros.experiments'
+PROGRAM = 'python3 -m rhs_isac_ros.experiments'
 # The bootstrap holds 2000 weights of each position.
 _MAX_POSITIONS = 10**5
 _MAX_SETTINGS = 10**4

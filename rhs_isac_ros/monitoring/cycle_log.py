@@ -29,6 +29,8 @@ class CycleTimes:
         Arrival of the first message of each later phase [s].
     ended_s
         Arrival of the outcome [s]; NaN before.
+    state
+        The latest state; None before the first. It contains the times of the base station.
     """
 
     cycle_id: int
@@ -36,12 +38,24 @@ class CycleTimes:
     began_s: float = math.nan
     phase_s: dict[m.Phase, float] = dataclasses.field(default_factory=dict)
     ended_s: float = math.nan
+    state: m.ProtocolState | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the last beacon to the outcome at the base station [s]; NaN before."""
+        return self.state.elapsed_s if self.state and self.state.outcome else math.nan
 
     def durations_s(self) -> dict[m.Phase, float]:
-        """Return the duration of each phase [s]; phases that were not observed are left out."""
-        marks = [(m.Phase.BEACONING, self.began_s), *sorted(self.phase_s.items())]
-        ends = [start for _, start in marks[1:]] + [self.ended_s]
-        return {phase: end - start for (phase, start), end in zip(marks, ends, strict=True)}
+        """Return the duration of each phase that has begun at the base station [s].
+
+        Their sum is `duration_s`: the times do not depend on when messages arrive.
+        """
+        starts = [] if self.state is None else [
+            (phase, float(start_s)) for phase, start_s in zip(
+                m.Phase, self.state.began_s, strict=True) if math.isfinite(start_s)]
+        ends = [start_s for _, start_s in starts[1:]] + [self.duration_s]
+        return {phase: end_s - start_s
+                for (phase, start_s), end_s in zip(starts, ends, strict=False)}
 
 
 @dataclasses.dataclass
@@ -94,8 +108,8 @@ class CycleRecord(CycleTimes):
                 or self.estimate is None or self.capacity is None):
             return None
         return CompleteCycle(
-            self.cycle_id, self.user, self.began_s, self.phase_s, self.ended_s, truth=truth,
-            signals=self.signals, estimate=self.estimate, capacity=self.capacity)
+            self.cycle_id, self.user, self.began_s, self.phase_s, self.ended_s, self.state,
+            truth=truth, signals=self.signals, estimate=self.estimate, capacity=self.capacity)
 
 
 class CycleLog:
@@ -149,7 +163,7 @@ class CycleLog:
             case m.ProtocolState() if message.outcome:
                 self._end(record, message, now_s)
             case m.ProtocolState():
-                record.user = message.user
+                record.user, record.state = message.user, message
                 record.phase_s[message.phase] = now_s
         self._close(record)
 
@@ -171,6 +185,7 @@ class CycleLog:
         if not record.outcome:
             self.ended.append(record)
         record.user, record.outcome, record.ended_s = state.user, state.outcome, now_s
+        record.state = state
 
     def _close(self, record: CycleRecord) -> None:
         """Stop collecting messages for a record that is complete or was given up."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.monitoring import cycle_log, mode_chart
+from rhs_isac_ros.monitoring import charts, cycle_log
 from rhs_isac_ros.monitoring import scene_entities as scene
 from rhs_isac_ros.monitoring.charts import Charts
 from rhs_isac_ros.monitoring.cycle_log import CycleLog
@@ -77,7 +77,7 @@ class NetworkView:
 
     def begin(self) -> list[Entry]:
         """Return the entries that are shown at all times."""
-        grid, labels = mode_chart.axes()
+        grid, labels = charts.axes()
         return [Entry(0, f'{WORLD}/region', scene.region(self._scenario)),
                 Entry(0, f'{MODES}/grid', grid), Entry(0, f'{MODES}/labels', labels)]
 
@@ -109,7 +109,7 @@ class NetworkView:
         points, ellipsoids = scene.modes(received.user, found)
         origin = self._origins.get(received.cycle_id, found.probabilities @ found.positions)
         return [Entry(cycle, path, points), Entry(cycle, f'{path}/ellipsoids', ellipsoids),
-                Entry(cycle, f'{MODES}/found', mode_chart.bars(received.user, found, origin))]
+                Entry(cycle, f'{MODES}/found', charts.bars(received.user, found, origin))]
 
     def add_track(self, cycle_id: int, point: TrackPoint) -> list[Entry]:
         """Add a position of a track; the id of its cycle is 0 if it is unknown."""
@@ -154,7 +154,7 @@ class NetworkView:
                 point, ellipsoid = scene.estimate(message)
                 yield path, point
                 yield f'{path}/ellipsoid', ellipsoid
-                yield f'{MODES}/estimate', mode_chart.estimate(
+                yield f'{MODES}/estimate', charts.estimate(
                     message.position, self._origins.get(message.cycle_id, message.position))
             case m.NoFix():
                 path = self._path(message.user)

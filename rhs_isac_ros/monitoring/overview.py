@@ -10,7 +10,7 @@ from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
 # Messages that the overview needs.

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_states import State
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, PeersChanged, Send
+from rhs_isac_ros.protocol.base_station_steps import State
+from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send
 from rhs_isac_ros.protocol.outcomes import Outcome, kind_of
 
 # Percentiles are computed over this number of latest durations.
@@ -45,23 +45,24 @@ class Report:
 
 
 class RoleStatistics:
-    """Collects the statistics of a role from its events and the resulting actions."""
+    """Collects the statistics of a role from its events and the resulting actions.
+
+    Attributes
+    ----------
+    missing
+        Descriptions of the roles that are missing.
+    """
 
     def __init__(self) -> None:
         self._received: collections.Counter[str] = collections.Counter()
         self._sent: collections.Counter[str] = collections.Counter()
         self._served = 0
         self._codebook_id = ''
-        self._missing_roles: tuple[str, ...] = ()
-        self._unavailable: set[str] = set()
+        self.missing: tuple[str, ...] = ()
         self._cycle_began_s: float | None = None
         self._durations_s: dict[str, collections.deque[float]] = collections.defaultdict(
             lambda: collections.deque(maxlen=_MAX_DURATIONS))
         self._faults: collections.Counter[str] = collections.Counter()
-
-    def set_available(self, node: str, available: bool) -> None:
-        """Record whether a node is available that the role can do without for a while."""
-        (self._unavailable.discard if available else self._unavailable.add)(node)
 
     def count_received(self, kind: type[m.Message]) -> None:
         """Count a received message, even if it is dropped later."""
@@ -81,11 +82,8 @@ class RoleStatistics:
         handling_s
             Time that the role took [s].
         """
-        match event:
-            case CodebookOffered(codebook):
-                self._codebook_id = codebook.id
-            case PeersChanged(missing):
-                self._missing_roles = missing
+        if isinstance(event, CodebookOffered):
+            self._codebook_id = event.codebook.id
         self._add_duration('handling_ms', handling_s)
         for action in actions:
             if isinstance(action, Send):
@@ -135,10 +133,8 @@ class RoleStatistics:
         faults = collections.Counter(
             {reason: count for reason, count in counters.items() if reason not in _NO_FAULTS})
         new_faults, self._faults = faults - self._faults, faults
-        if self._missing_roles:
-            return Report(True, f'waiting for {", ".join(self._missing_roles)}', values)
-        if self._unavailable:
-            return Report(True, f'{", ".join(sorted(self._unavailable))} not available', values)
+        if self.missing:
+            return Report(True, f'waiting for {", ".join(self.missing)}', values)
         if blocked:
             return Report(True, f'blocked: {phase}', values)
         warnings = [text for name, text in status.items() if name.startswith('warning.')]

@@ -8,8 +8,16 @@ import numpy as np
 from rhs_isac_ros.link import Beam, beam_pattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions
-from rhs_isac_ros.monitoring.entities import Boxes, Ellipsoids, Lines, Picture, Points
-from rhs_isac_ros.monitoring.scene_shapes import ellipsoid_95, lobe_m, user_colour
+from rhs_isac_ros.monitoring.entities import (
+    Boxes,
+    Ellipsoids,
+    Lines,
+    Picture,
+    Points,
+    ellipsoid_95,
+    lobe_m,
+    user_colour,
+)
 from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 

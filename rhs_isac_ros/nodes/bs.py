@@ -15,9 +15,7 @@ from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.events import (
     Action,
-    CodebookOffered,
     PauseRequested,
-    PeersChanged,
     Reply,
     Resumed,
     ResumeRequested,
@@ -27,7 +25,6 @@ from rhs_isac_ros.protocol.events import (
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.parameters import settings_of
-from rhs_isac_ros.ros.peer_monitor import REQUIRED_BY_BASE_STATION, PeerMonitor
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -39,9 +36,6 @@ class BsNode(RoleNode[BaseStation]):
         super().__init__('bs', **node_options)
         values = self.values
         rng = streams.generator(values.seed, streams.BASE_STATION)
-        self._peers = PeerMonitor(
-            self, REQUIRED_BY_BASE_STATION,
-            lambda missing: self.dispatch(PeersChanged(missing)))
         self.start(BaseStation(
             self.scenario, self.make_settings(values), rng, self._receive,
             values.first_cycle or _cycle_from_clock()))
@@ -49,17 +43,14 @@ class BsNode(RoleNode[BaseStation]):
         for name, event in ((topics.PAUSE, PauseRequested()), (topics.RESUME, ResumeRequested()),
                             (topics.STEP, StepRequested())):
             self.create_service(Trigger, name, functools.partial(self._on_request, event))
-        self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
     def stand_by(self) -> None:
         """Abandon the cycle, and wait."""
-        self._peers.stop()
         self.dispatch(StoodBy())
 
     def resume(self) -> None:
-        """Begin cycles once the other nodes have discovered the publishers again."""
+        """Begin cycles once the other nodes are known to be present."""
         self.dispatch(Resumed(_cycle_from_clock()))
-        self._peers.restart()
 
     def make_settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
         """Return the settings for parameter values.

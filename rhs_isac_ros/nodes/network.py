@@ -1,23 +1,23 @@
 """The executable ``network``: all nodes composed in one process."""
 
+import importlib
 import sys
 
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rhs_isac_ros.nodes.bs import BsNode
-from rhs_isac_ros.nodes.channel import ChannelNode
-from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.nodes.positioner import PositionerNode
-from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
-from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.processes import MAX_USER_NODES
+from rhs_isac_ros.ros.roster import UNIQUE
 from rhs_isac_ros.ros.run import entry
 
-# All node classes except the users and ``network``, which only declares the parameter ``users``.
-KINDS = (OptimizerNode, RhsControllerNode, ChannelNode, PositionerNode, TransmissionNode, BsNode)
+
+def _make(role: str) -> Node:
+    """Create the node of a role, whose class has its name."""
+    module = importlib.import_module(f'rhs_isac_ros.nodes.{role}')
+    node: Node = getattr(module, f'{role.title().replace("_", "")}Node')()
+    return node
 
 
 def make_network() -> list[Node]:
@@ -32,7 +32,7 @@ def make_network() -> list[Node]:
     """
     head = Node('network')
     users = parameters.declare(head, 'network').users
-    nodes = [head, *(kind() for kind in KINDS)]
+    nodes = [head, *map(_make, UNIQUE)]
     if users > MAX_USER_NODES:
         return [*nodes, _user_node('users', 1, users)]
     return [*nodes, *(_user_node(f'user_{n}', n, 1) for n in range(1, users + 1))]

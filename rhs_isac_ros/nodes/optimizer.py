@@ -2,14 +2,20 @@
 
 import argparse
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.srv import SetParameters
+from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.parameter_service import ParameterService
 from rclpy.publisher import Publisher
 from rclpy.utilities import remove_ros_args, try_shutdown
 
@@ -23,12 +29,94 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
 from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.parameter_service import GroupParameterService
+from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
-from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
-from rhs_isac_ros.ros.push import PushError, push
+from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.run import run
+
+
+class GroupParameterService(ParameterService):
+    """The parameter services of a node of which some parameters belong together.
+
+    The service ``set_parameters`` of rclpy sets the parameters of a request one by one. ``ros2
+    param load`` uses this service. Here, the parameters of the group in one request are set
+    together, or not at all.
+
+    Parameters
+    ----------
+    node
+        A node that was created with ``start_parameter_services=False``.
+    prefix
+        Prefix of the names of the group.
+    """
+
+    def __init__(self, node: Node, prefix: str) -> None:
+        super().__init__(node)  # type: ignore[no-untyped-call]
+        self._prefix = prefix
+
+    # Overrides the callback of rclpy, which creates the services in its constructor.
+    def _set_parameters_callback(
+            self, request: SetParameters.Request,
+            response: SetParameters.Response) -> SetParameters.Response:
+        parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
+        group = [p for p in parameters if p.name.startswith(self._prefix)]
+        group_result = self._set(group) if group else None
+        response.results = [group_result if p in group else self._set([p]) for p in parameters]
+        return response
+
+    def _set(self, parameters: list[Parameter]) -> Any:
+        try:
+            node = self._get_node()  # type: ignore[no-untyped-call]
+            return node.set_parameters_atomically(parameters)
+        except ParameterNotDeclaredException as error:
+            return SetParametersResult(successful=False, reason=str(error))
+
+
+TIMEOUT_S = 10.0
+
+
+class PushError(RuntimeError):
+    """The optimizer did not accept a codebook."""
+
+
+def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
+    """Set a codebook as the parameters of the optimizer in the namespace of the node.
+
+    This function blocks and spins the node, so it must not be called from a callback.
+
+    Parameters
+    ----------
+    timeout_s
+        Maximum time to wait for the optimizer and for its response [s].
+
+    Raises
+    ------
+    PushError
+        If there is no optimizer, if it does not respond, or if it rejects the codebook.
+    """
+    optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
+    client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
+    parameters = [Parameter(name, value=value)
+                  for name, value in codebook.to_parameters().items()]
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    end_s, future = time.monotonic() + timeout_s, None
+    try:
+        while future is None or not future.done():
+            if time.monotonic() > end_s:
+                reason = 'no response' if future else 'not found'
+                raise PushError(f'{optimizer}: {reason} within {timeout_s:g} s')
+            if future is None and client.services_are_ready():
+                future = client.set_parameters_atomically(parameters)
+            executor.spin_once(timeout_sec=0.1)
+    finally:
+        executor.remove_node(node)
+        executor.shutdown()
+    result = future.result().result
+    if not result.successful:
+        raise PushError(f'{optimizer}: codebook rejected: {result.reason}')
+
 
 PUSHER_NODE = 'codebook_pusher'
 
@@ -57,8 +145,9 @@ class OptimizerNode(ParameterizedNode):
             [Parameter(name, value=value)
              for name, value in self._first_codebook(file).to_parameters().items()])
         self._announce(False)
-        self._presence = PresenceClient(
-            self, topics.OPTIMIZER_NODE, self._instance, self._scenario, self._announce)
+        self._peers = Peers(
+            self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
+            self._announce)
         self._diagnostics = Diagnostics(self, self._report)
         self.add_pre_set_parameters_callback(self._normalize)
         self.add_on_set_parameters_callback(self._check_codebook)
@@ -120,7 +209,7 @@ class OptimizerNode(ParameterizedNode):
             self._publish(self._codebook_of(given))
 
     def _report(self) -> Report:
-        conflicts = self._presence.conflicts()
+        conflicts = self._peers.conflicts()
         values = {'codebook_id': self._codebook_id, 'dropped.wrong_codebook': str(self._refused),
                   **conflicts}
         return Report(bool(conflicts), '; '.join(conflicts.values()) or 'no fault', values)
@@ -131,8 +220,8 @@ class OptimizerNode(ParameterizedNode):
             self.destroy_publisher(self._publisher)
             self._publisher = None
         if not stands_by:
-            self._publisher = self._publisher or self.create_publisher(
-                ros.Codebook, topics.CODEBOOK, qos.LATCHED_WITH_LEASE)
+            self._publisher = self._publisher or create_publisher(
+                self, ros.Codebook, topics.CODEBOOK, qos.LATCHED)
             self._publish(self._codebook_of(self._codebook_values()))
 
     def _publish(self, codebook: Codebook) -> None:

@@ -8,12 +8,13 @@ import types
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import plugins
+from rhs_isac_ros.model import plugins, simulate_received
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     REGION_ESTIMATORS,
@@ -26,11 +27,9 @@ from rhs_isac_ros.positioning import (
 )
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import (
     Action,
     BuildEstimator,
-    CodebookOffered,
     EstimatorFailed,
     EstimatorReady,
     PublishTrack,
@@ -39,11 +38,10 @@ from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.parameters import calibrated_surface, settings_of
+from rhs_isac_ros.ros.endpoints import UserTopics, create_publisher
+from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.user_topics import UserTopics
 
 
 class PositionerNode(RoleNode[Positioner]):
@@ -53,12 +51,11 @@ class PositionerNode(RoleNode[Positioner]):
         super().__init__('positioner', **node_options)
         settings = self.make_settings(self.values)
         self._worker = BackgroundWorker(self)
-        self._pose = self.create_publisher(
-            PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
+        self._pose = create_publisher(
+            self, PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
         self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped})
         self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry})
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
-        self.follow_codebook(lambda codebook: self.dispatch(CodebookOffered(codebook)))
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
         """Return the settings for parameter values.
@@ -110,7 +107,12 @@ class PositionerNode(RoleNode[Positioner]):
             options['reject_outside'] = settings.reject_outside
         if settings.calibration_file:
             options['surface'] = load_surface(settings.calibration_file, self.scenario)
-        return make_estimator(settings.estimator, self.scenario, codebook, **options)
+        estimator = make_estimator(settings.estimator, self.scenario, codebook, **options)
+        # The first estimate takes longer than all others. A user does not wait for it.
+        center = np.array([self.scenario.roi_center_m])
+        estimator.estimate(simulate_received(
+            self.scenario, codebook, center, np.random.default_rng(0))[0])
+        return estimator
 
     def execute(self, action: Action) -> None:
         """Build an estimator in the background, or publish the odometry of a track.
@@ -145,9 +147,9 @@ class PositionerNode(RoleNode[Positioner]):
         if isinstance(event, EstimatorReady):
             self.subscribe()
 
-    def publish(self, message: m.Message, to: tuple[Recipient, ...] = ()) -> bool:
+    def publish(self, message: m.Message) -> bool:
         """Publish a message, and poses for an estimate; return False if it is invalid."""
-        is_published = super().publish(message, to)
+        is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
             pose = convert.pose(message, self.get_clock().now().to_msg())
             for publisher in (self._pose, *self._user_poses.publishers(message.user)):

@@ -3,24 +3,17 @@
 import sys
 from typing import Any
 
-from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
 
 class RhsControllerNode(RoleNode[RhsController]):
-    """The controller of the surface; it subscribes to commands once it has a codebook."""
+    """The controller of the surface; it serves once it has a codebook."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('rhs_controller', **node_options)
-        self.start(RhsController(), subscribe=False)
-        self.follow_codebook(self._on_codebook)
-
-    def _on_codebook(self, codebook: Codebook) -> None:
-        self.dispatch(CodebookOffered(codebook))
-        self.subscribe()
+        self.start(RhsController(), needs_codebook=True)
 
 
 main = entry('rhs_controller', lambda: [RhsControllerNode()])

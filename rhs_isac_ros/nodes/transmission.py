@@ -4,14 +4,11 @@ import sys
 import types
 from typing import Any
 
-from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.link import prepare_steering
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.parameters import calibrated_surface, settings_of
+from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -25,8 +22,7 @@ class TransmissionNode(RoleNode[Transmission]):
         self._surfaces: dict[str, SurfaceEstimate | None] = {}
         settings = self.make_settings(self.values)
         self.start(Transmission(self.scenario, settings, self._surfaces.__getitem__),
-                   advertise=False, subscribe=False)
-        self.follow_codebook(self._on_codebook)
+                   needs_codebook=True)
 
     def make_settings(self, values: types.SimpleNamespace) -> TransmissionSettings:
         """Return the settings for parameter values.
@@ -44,11 +40,6 @@ class TransmissionNode(RoleNode[Transmission]):
         self._surfaces[values.calibration_file] = surface
         prepare_steering(self.scenario, surface)
         return settings_of(TransmissionSettings, values)
-
-    def _on_codebook(self, codebook: Codebook) -> None:
-        self.dispatch(CodebookOffered(codebook))
-        self.advertise()
-        self.subscribe()
 
 
 main = entry('transmission', lambda: [TransmissionNode()])

@@ -6,20 +6,15 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model import mobility, plugins, streams
-from rhs_isac_ros.protocol.delivery import OBSERVERS
-from rhs_isac_ros.protocol.events import PeersChanged
 from rhs_isac_ros.protocol.user import User, timeouts
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.peer_monitor import REQUIRED_BY_USER, PeerMonitor
+from rhs_isac_ros.ros.endpoints import steady_timer
+from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.timers import steady_timer
 
 
 class UserNode(RoleNode[User]):
     """One or many users of the network."""
-
-    is_unique = False
 
     def __init__(self, name: str = '', **node_options: Any) -> None:
         super().__init__('user', name, **node_options)
@@ -27,8 +22,6 @@ class UserNode(RoleNode[User]):
         self.start(User(
             self._mobilities(), timeouts(values.step_timeout_s, values.beacon_timeout_s),
             self.instance))
-        self._peers = PeerMonitor(
-            self, REQUIRED_BY_USER, lambda missing: self.dispatch(PeersChanged(missing)))
         steady_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
 
     def _mobilities(self) -> dict[int, mobility.Mobility]:
@@ -91,7 +84,7 @@ class UserNode(RoleNode[User]):
     def _publish_ground_truth(self) -> None:
         role, now_s = self.role, self.now_s()
         self.publish(role.ground_truths(now_s) if len(role.users) > 1
-                     else role.ground_truth(role.users[0], now_s), to=(OBSERVERS,))
+                     else role.ground_truth(role.users[0], now_s))
 
 
 main = entry('user', lambda: [UserNode()])

@@ -14,11 +14,14 @@ from rhs_isac_ros.link import Beam, beam_pattern
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import markers, parameters, qos, topics, transforms
+from rhs_isac_ros.ros.endpoints import (
+    UserTopics,
+    create_publisher,
+    steady_timer,
+    subscribe_messages,
+)
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.subscriptions import subscribe_messages
-from rhs_isac_ros.ros.timers import steady_timer
 from rhs_isac_ros.ros.transforms import TransformPublisher
-from rhs_isac_ros.ros.user_topics import UserTopics
 
 
 class VisualizerNode(Node):
@@ -33,7 +36,7 @@ class VisualizerNode(Node):
         # The latest beam and its marker, cached because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
-        self._publisher = self.create_publisher(MarkerArray, topics.MARKERS, qos.EXCHANGE)
+        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, qos.EXCHANGE)
         self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path})
         self._transforms = TransformPublisher(self)
         subscribe_messages(self, RECEIVES, self._scenario.sizes, self._on_message,

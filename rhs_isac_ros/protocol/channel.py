@@ -9,15 +9,60 @@ from rhs_isac_ros.link import Beam, capacity
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.impairments import DeclaredElements, draw_factors, draw_surface
 from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered
-from rhs_isac_ros.protocol.fading import Fading
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import PlainRole
+
+# Number of users whose multipath is kept. With more, the time between two cycles of a user is far
+# longer than the coherence time.
+_MAX_USERS = 32
+
+
+class Fading:
+    """Source of multipath gains that depend on the seed and on the times of a user's cycles.
+
+    The gains of a cycle are rho h + sqrt(1 - rho^2) w, where h are the gains of the user's
+    previous cycle, rho is Eq. (4) for the time between them, and w is a new draw that depends on
+    the seed, the user, the cycle and the band alone. Every cycle has the distribution of Eq. (2)
+    to (4), and consecutive cycles have the correlation of Eq. (4); it is negative for some times.
+    Over several cycles the correlation is the product of these, not Eq. (4): the exact
+    conditional distribution would need all earlier cycles.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self._scenario, self._seed = scenario, seed
+        # The first draw factorises covariances. Draw once now, so that it does not delay the first
+        # cycle.
+        draw_multipath(scenario, 0, 1, np.random.default_rng(0))
+        # Time [s] and gains of the latest cycle of each user.
+        self._latest: NewestDict[int, tuple[float, list[np.ndarray]]] = NewestDict(_MAX_USERS)
+
+    def gains(self, user: int, cycle_id: int, now_s: float, *, memory: bool) -> list[np.ndarray]:
+        """Return the gains of a cycle for each band, complex128 [N_SB, F, N_E].
+
+        Without memory, they are independent of the previous cycle.
+        """
+        scenario = self._scenario
+        gains = [
+            draw_multipath(
+                scenario, band, 1,
+                streams.generator(self._seed, streams.CHANNEL, user, cycle_id, band)
+            ).reshape(scenario.n_subbands, scenario.n_frames, scenario.n_elements)
+            for band in range(scenario.n_bands)]
+        if memory and user in self._latest:
+            before_s, previous = self._latest[user]
+            lag = np.array((now_s - before_s) / scenario.frame_duration_s)
+            for band, earlier in enumerate(previous):
+                rho = float(time_correlation(scenario, band, lag, np.array(0.0)))
+                gains[band] = rho * earlier + np.sqrt(1 - rho**2) * gains[band]
+        self._latest.put(user, (now_s, gains))
+        return gains
+
 
 # Maximum number of messages of each kind kept until related messages arrive. The cycle of an older
 # message can no longer be completed.
@@ -178,7 +223,7 @@ class Channel(PlainRole):
                 continue
             answer = self._answer(event, cycle)
             if answer is not None:
-                actions.append(Send(answer, _recipients(answer, cycle.truth)))
+                actions.append(Send(answer))
                 del self._pending[serial]
         return actions
 
@@ -227,13 +272,6 @@ class Channel(PlainRole):
         rate_bps = float(capacity(self._scenario, used, truth.position[None])[0])
         bits = min(data.bits, rate_bps * data.duration_s // 1)
         return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)
-
-
-def _recipients(answer: m.Message, truth: m.GroundTruth) -> tuple[Recipient, ...]:
-    """Return the recipient of an answer in the cycle of a true position."""
-    if isinstance(answer, m.Data) and answer.direction is m.Direction.UPLINK:
-        return ('bs',)
-    return (truth.sender,)
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:

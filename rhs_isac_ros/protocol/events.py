@@ -1,13 +1,15 @@
 """Events of the roles other than messages, and the actions that the roles return."""
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import Estimator, TrackEstimate
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.messages import Message
-from rhs_isac_ros.protocol.settings import PositionerSettings
+
+if TYPE_CHECKING:
+    # The settings import the roles of the users, which use the events.
+    from rhs_isac_ros.protocol.settings import PositionerSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,16 +88,9 @@ Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | 
 
 @dataclasses.dataclass(frozen=True)
 class Send:
-    """Publish a message.
-
-    Attributes
-    ----------
-    to
-        Recipients among those of `DELIVERIES`; empty: all.
-    """
+    """Publish a message."""
 
     message: Message
-    to: tuple[Recipient, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +114,7 @@ class BuildEstimator:
     """Build an estimator in the background; reply with `EstimatorReady` or `EstimatorFailed`."""
 
     codebook: Codebook
-    settings: PositionerSettings
+    settings: 'PositionerSettings'
 
 
 @dataclasses.dataclass(frozen=True)

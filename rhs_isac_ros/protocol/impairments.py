@@ -1,7 +1,6 @@
 """A channel that loses, duplicates, delays and reorders messages."""
 
 import dataclasses
-import enum
 import heapq
 import itertools
 from collections.abc import Mapping
@@ -12,8 +11,7 @@ import numpy as np
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered, Timeout
-from rhs_isac_ros.protocol.pending_settings import PendingSettings
-from rhs_isac_ros.protocol.role import Role
+from rhs_isac_ros.protocol.role import PendingSettings, PlainRole, Role
 from rhs_isac_ros.protocol.settings import setting
 
 
@@ -61,7 +59,7 @@ class Impairments:
             name: value for name, value in values.items() if name in known and value >= 0})
 
 
-class ImpairedChannel:
+class ImpairedChannel(PlainRole):
     """A channel role whose outgoing messages are subject to impairments.
 
     The role receives new impairments as `SettingsOffered`, for the deviations of its signals.
@@ -71,7 +69,7 @@ class ImpairedChannel:
     Parameters
     ----------
     role
-        A role without deadlines.
+        A role without states and deadlines.
     impairments
         Initial impairments.
     rng
@@ -84,7 +82,8 @@ class ImpairedChannel:
     """
 
     def __init__(self, role: Role, impairments: Impairments, rng: np.random.Generator) -> None:
-        self.counters = role.counters
+        super().__init__()
+        self.counters, self.SENDS, self.RECEIVES = role.counters, role.SENDS, role.RECEIVES
         self._role, self._settings, self._rng = role, PendingSettings(impairments), rng
         self._cycle_id = 0
         self._serial = itertools.count()
@@ -115,26 +114,6 @@ class ImpairedChannel:
     def status(self) -> Mapping[str, str]:
         """Return the impairments in use and pending, by name."""
         return self._settings.describe()
-
-    @property
-    def SENDS(self) -> tuple[type[m.Message], ...]:
-        """Messages that the role sends."""
-        return self._role.SENDS
-
-    @property
-    def RECEIVES(self) -> tuple[type[m.Message], ...]:
-        """Messages that the role handles."""
-        return self._role.RECEIVES
-
-    @property
-    def state(self) -> enum.Enum | None:
-        """State of the role."""
-        return self._role.state
-
-    @property
-    def BLOCKED_STATES(self) -> frozenset[enum.Enum]:
-        """States in which something that the role needs is missing."""
-        return self._role.BLOCKED_STATES
 
     def next_deadline(self) -> float | None:
         """Return when the next message arrives [s], or None if no message is in flight."""

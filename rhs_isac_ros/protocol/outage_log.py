@@ -3,24 +3,45 @@
 from collections.abc import Iterable, Sequence
 
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
-from rhs_isac_ros.protocol.user_lists import join_users
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 
-# The reason that concerns one user; all others concern the whole network.
-_USER_REASON = Outcome.USER_GONE.value
+# Maximum number of users that one text names.
+MAX_NAMED = 8
+
+
+def join_users(users: Iterable[int]) -> str:
+    """Return the numbers of users as a list, which ends with a count of those beyond `MAX_NAMED`.
+
+    Examples
+    --------
+    >>> join_users(range(1, 12))
+    '1, 2, 3, 4, 5, 6, 7, 8 and 3 others'
+    """
+    names = [str(user) for user in users]
+    n_others = len(names) - MAX_NAMED
+    others = f' and {n_others} other{"s" * (n_others > 1)}' if n_others > 0 else ''
+    return f'{", ".join(names[:MAX_NAMED])}{others}'
+
+
+# The reasons that concern one user; all others concern the whole network.
+_USER_REASONS = {Outcome.USER_GONE.value, Outcome.NO_FIX.value}
+# Maximum number of outages of users that are remembered, which bounds the memory.
+_MAX_OPEN = MAX_USERS
 
 
 class OutageLog:
     """Suppresses repeated log messages about the same outage.
 
     Missing roles are logged again once a cycle has begun. The reason for a lost cycle is logged
-    again once service has resumed: to the same user for ``user_gone``, to any user for other
-    reasons.
+    again once service has resumed: to the same user for ``user_gone`` and ``no_fix``, to any user
+    for other reasons.
     """
 
     def __init__(self) -> None:
         # Reason and user of each outage; user 0 for the whole network.
-        self._open: set[tuple[str, int]] = set()
+        self._open: NewestDict[tuple[str, int], None] = NewestDict(_MAX_OPEN)
         self._waiting_for: tuple[str, ...] = ()
         # Whether a cycle was served since something was missing.
         self._serving = False
@@ -48,10 +69,10 @@ class OutageLog:
 
     def log_lost_cycle(self, cycle_id: int, user: int, reason: str) -> list[LogMessage]:
         """Return a warning about a cycle without service, unless its reason was logged before."""
-        key = reason, user if reason == _USER_REASON else 0
+        key = reason, user if reason in _USER_REASONS else 0
         if key in self._open:
             return []
-        self._open.add(key)
+        self._open.put(key, None)
         return [LogMessage(f'cycle {cycle_id} of user {user} given up: {reason}', warning=True)]
 
     @staticmethod
@@ -69,7 +90,8 @@ class OutageLog:
             messages.append(LogMessage(
                 f'serving: codebook {codebook_id}, {n_users} user{"s" * (n_users != 1)}'))
         if ended := {key for key in self._open if key[1] in (0, user)}:
-            self._open -= ended
+            for key in ended:
+                del self._open[key]
             reasons = ', '.join(sorted(reason for reason, _ in ended))
             messages.append(LogMessage(
                 f'cycle {cycle_id}: user {user} served again after: {reasons}'))

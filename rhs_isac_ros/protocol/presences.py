@@ -1,16 +1,14 @@
 """Which instance of a role serves, and which stand by."""
 
+import collections
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 from rhs_isac_ros.protocol.events import LogMessage
-from rhs_isac_ros.protocol.instance import started
+from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.newest import NewestDict
 
-# While two nodes are in conflict, both announce themselves with this period, and a node that has
-# been silent for the longer time is gone [s].
-PERIOD_S, SILENCE_S = 0.3, 1.5
 # Maximum number of nodes in conflict with this one, which bounds the memory.
 _MAX_OTHERS = 64
 # Maximum number of scenarios that are logged, which bounds the log.
@@ -53,9 +51,6 @@ class Presences:
     fencing tokens of leases: a restarted node serves at once, and the older node resumes when the
     newer one has gone. Nodes of another scenario are reported and otherwise ignored.
 
-    Nodes announce themselves once. Only nodes in conflict do so repeatedly, so that the absence of
-    a node is noticed without load in a correct network.
-
     Parameters
     ----------
     own
@@ -64,49 +59,57 @@ class Presences:
 
     def __init__(self, own: Presence) -> None:
         self.own = own
-        # By instance: nodes in conflict with this one, and the time of their last announcement.
-        self._others: NewestDict[int, tuple[Presence, float]] = NewestDict(_MAX_OTHERS)
+        # Nodes in conflict with this one, by instance.
+        self._others: NewestDict[int, Presence] = NewestDict(_MAX_OTHERS)
         self._superseded_by: Presence | None = None
         self._serves_instead_of: Presence | None = None
-        # The older node that was named last: one that is slow may seem to return.
+        # The older node that was named last: one that was suspended may return.
         self._named = 0
         # By id: the differences of other scenarios.
-        self._scenarios: dict[str, str] = {}
+        self._scenarios: NewestDict[str, str] = NewestDict(_MAX_OTHERS)
         self._n_logged = 0
 
-    def add(self, other: Presence, now_ns: int, now_s: float) -> list[LogMessage]:
-        """Process an announcement.
-
-        Parameters
-        ----------
-        now_ns
-            Time since 1970 [ns].
-        now_s
-            Time on any monotonic clock [s].
-        """
+    def add(self, other: Presence, now_ns: int) -> list[LogMessage]:
+        """Process an announcement that arrives at a time since 1970 [ns]."""
         own = self.own
         is_stranger = bool(other.scenario_id) and other.scenario_id != own.scenario_id
         if other.sender in (0, own.sender) or other.sender > now_ns + _MAX_AHEAD_NS or not (
                 is_stranger or other.role == own.role):
             return []
         is_new = other.sender not in self._others
-        self._others.put(other.sender, (other, now_s))
+        self._others.put(other.sender, other)
         if is_stranger:
             return self._report_scenario(other)
         return self._update() if is_new else []
 
-    def expire(self, now_s: float) -> list[LogMessage]:
-        """Forget nodes that have been silent."""
-        silent = [sender for sender, (_, last_s) in self._others.items()
-                  if now_s - last_s > SILENCE_S]
-        for sender in silent:
+    def gone(self, announcing: Mapping[str, int]) -> set[str]:
+        """Return the names of nodes in conflict that have gone.
+
+        If several nodes have the name, it is unknown which of them has gone. All are to be
+        forgotten; those that are present announce themselves again.
+
+        Parameters
+        ----------
+        announcing
+            Number of nodes that announce themselves, by fully qualified name; by an empty name
+            those whose name is unknown.
+        """
+        known = collections.Counter(other.node for other in self._others.values())
+        return {name for name, count in known.items()
+                if announcing.get(name, 0) + announcing.get('', 0)
+                < count + (name == self.own.node)}
+
+    def keep(self, announcing: Mapping[str, int]) -> list[LogMessage]:
+        """Forget the nodes that have gone, see `gone`, and choose the node that serves."""
+        gone = self.gone(announcing)
+        for sender in [sender for sender, other in self._others.items() if other.node in gone]:
             del self._others[sender]
-        present = {other.scenario_id for other, _ in self._others.values()}
-        ended = self._scenarios.keys() - present
+        present = {other.scenario_id for other in self._others.values()}
+        ended = sorted(self._scenarios.keys() - present)
         for scenario_id in ended:
             del self._scenarios[scenario_id]
         return [*(LogMessage(f'no node with scenario {scenario_id} is left')
-                  for scenario_id in sorted(ended)), *self._update()]
+                  for scenario_id in ended), *self._update()]
 
     @property
     def stands_by(self) -> bool:
@@ -114,15 +117,15 @@ class Presences:
         return self._superseded_by is not None
 
     @property
+    def others(self) -> frozenset[int]:
+        """Instances of the nodes in conflict with this one."""
+        return frozenset(self._others)
+
+    @property
     def rival(self) -> int:
         """The newest other instance of the same role; 0 if there is none."""
         rivals = self._rivals()
         return rivals[0].sender if rivals else 0
-
-    @property
-    def in_conflict(self) -> bool:
-        """Whether any node is in conflict with this one."""
-        return bool(self._others)
 
     def conflicts(self) -> dict[str, str]:
         """Return a description of each conflict, by key of the diagnostics."""
@@ -136,27 +139,26 @@ class Presences:
 
     def _rivals(self) -> list[Presence]:
         """Return the other nodes of the same role and scenario, the newest first."""
-        return sorted((other for other, _ in self._others.values()
-                       if other.role == self.own.role
+        return sorted((other for other in self._others.values() if other.role == self.own.role
                        and other.scenario_id in ('', self.own.scenario_id)),
                       key=lambda other: -other.sender)
 
     def _update(self) -> list[LogMessage]:
         """Choose the node that serves, and log a change."""
-        rivals, role = self._rivals(), self.own.role
-        newest = rivals[0] if rivals and rivals[0].sender > self.own.sender else None
+        own, rivals = self.own, self._rivals()
+        newest = rivals[0] if rivals and rivals[0].sender > own.sender else None
         previous, self._superseded_by = self._superseded_by, newest
         older = rivals[0] if rivals and not newest else None
         self._serves_instead_of = older
         if newest and newest != previous:
-            return [LogMessage(f'two nodes act as {role}: this one stands by for {newest}',
+            return [LogMessage(f'two nodes act as {own.role}: this one stands by for {newest}',
                                warning=True)]
         if older and older.sender != self._named:
             self._named = older.sender
-            return [LogMessage(f'two nodes act as {role}: this one serves instead of {older}',
+            return [LogMessage(f'two nodes act as {own.role}: this one serves instead of {older}',
                                warning=True)]
         if previous and not newest:
-            return [LogMessage(f'{previous.node} has gone; this node acts as {role} again')]
+            return [LogMessage(f'{previous.node} has gone; this node acts as {own.role} again')]
         return []
 
     def _report_scenario(self, other: Presence) -> list[LogMessage]:
@@ -168,6 +170,6 @@ class Presences:
         text = (f'{other.node} uses another scenario, {other.scenario_id}, with '
                 f'{"; ".join(differences)[:_MAX_LENGTH] or "unknown differences"}; '
                 'its messages are dropped')
-        self._scenarios[other.scenario_id] = text
+        self._scenarios.put(other.scenario_id, text)
         self._n_logged += 1
         return [LogMessage(text, warning=True)] if self._n_logged <= _MAX_LOGGED else []

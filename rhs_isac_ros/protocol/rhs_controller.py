@@ -6,9 +6,8 @@ from collections.abc import Mapping
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, LogMessage, Send
-from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.newest import CodebookCache, NewestDict
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
 
@@ -101,7 +100,7 @@ class RhsControllerSteps(StateMachine[State]):
         analog = self._codebooks.take(event.codebook_id).analog[event.band]
         return [Send(m.RhsConfiguration(
             cycle_id=event.cycle_id, mode=m.Mode.POSITIONING, band=event.band,
-            codebook_id=event.codebook_id, analog=analog), to=('bs', 'channel'))]
+            codebook_id=event.codebook_id, analog=analog))]
 
     def apply_beam(self, event: m.Beam, now_s: float) -> list[Action]:
         """Report the configuration of a beam."""

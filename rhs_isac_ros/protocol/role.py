@@ -3,11 +3,12 @@
 import collections
 import enum
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
-from rhs_isac_ros.protocol.events import Action, Event
+from rhs_isac_ros.protocol.events import Action, Event, LogMessage
 from rhs_isac_ros.protocol.messages import Message
 from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.settings import changes, describe_settings, shown
 
 
 class Role(Protocol):
@@ -89,3 +90,33 @@ class PlainRole(CountingRole):
     def next_deadline(self) -> float | None:
         """Return None, because the role needs no `Timeout`."""
         return None
+
+
+SettingsT = TypeVar('SettingsT')
+
+
+class PendingSettings(Generic[SettingsT]):
+    """Holds new settings back until the role may apply them.
+
+    Attributes
+    ----------
+    in_use
+        The settings in use.
+    latest
+        The settings received last.
+    """
+
+    def __init__(self, settings: SettingsT) -> None:
+        self.in_use = settings
+        self.latest = settings
+
+    def apply(self) -> list[LogMessage]:
+        """Put the latest settings into use; return a message that lists changes, if any."""
+        changed = changes(self.in_use, self.latest)
+        self.in_use = self.latest
+        described = ', '.join(f'{name} {shown(value)!r}' for name, value in changed.items())
+        return [LogMessage(f'settings applied: {described}')] if described else []
+
+    def describe(self) -> dict[str, str]:
+        """Return the values in use and the pending ones, as `settings.describe_settings` does."""
+        return describe_settings(self.in_use, self.latest)

@@ -9,8 +9,7 @@ from typing import Any
 
 from rhs_isac_ros.model import plugins
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
-from rhs_isac_ros.protocol.ack_filter import parse_users
-from rhs_isac_ros.protocol.user_scheduler import POLICIES
+from rhs_isac_ros.protocol.user_scheduler import POLICIES, parse_users
 
 # Priors of the position.
 REGION, TRACK = PRIORS = ('region', 'track')

@@ -20,7 +20,6 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import outcomes
-from rhs_isac_ros.protocol.codebook_cache import CodebookCache
 from rhs_isac_ros.protocol.events import (
     Action,
     CodebookOffered,
@@ -30,9 +29,8 @@ from rhs_isac_ros.protocol.events import (
     SettingsOffered,
     Timeout,
 )
-from rhs_isac_ros.protocol.newest import NewestDict
-from rhs_isac_ros.protocol.pending_settings import PendingSettings
-from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.newest import CodebookCache, NewestDict
+from rhs_isac_ros.protocol.role import PendingSettings, PlainRole
 from rhs_isac_ros.protocol.settings import TransmissionSettings
 
 # Fields of a report for which statistics are computed, named as in `CapacityStatistics`.

@@ -1,9 +1,16 @@
 """The users that a base station waits for, and the order in which it serves them."""
 
 import bisect
-from collections.abc import Callable, Set
+import collections
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterable, Set
 
 import numpy as np
+
+from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.messages import started
 
 POLICIES = ('round_robin', 'first', 'random')
 # Maximum number of registered users, which bounds the memory whatever ids the acks contain.
@@ -185,3 +192,142 @@ class UserScheduler:
         self._turn += 1
         self._served[chosen] = self._turn, 1
         return chosen
+
+
+_RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
+_LAST_USER = 2**32 - 1
+
+
+class AckFilter:
+    """Restricts the users whose acks are accepted, and the acks of each user per second.
+
+    Parameters
+    ----------
+    allowed
+        Ids of the users, as returned by `parse_users`; empty: all.
+    rate_hz
+        Maximum number of acks of each user in a second.
+    """
+
+    def __init__(self, allowed: tuple[range, ...] = (), rate_hz: float = math.inf) -> None:
+        self._allowed, self._rate_hz = allowed, rate_hz
+        # Acks by user in the current second; they are discarded every second, which bounds the
+        # memory.
+        self._acks: collections.Counter[int] = collections.Counter()
+        self._second: int | None = None
+
+    def allows(self, user: int) -> bool:
+        """Return whether acks of a user may be accepted at all."""
+        return not self._allowed or any(user in numbers for numbers in self._allowed)
+
+    def within_rate(self, user: int, now_s: float) -> bool:
+        """Return whether another ack of a user is within the rate.
+
+        Parameters
+        ----------
+        now_s
+            Time on any monotonic clock [s].
+        """
+        counted = self._acks[user] if math.floor(now_s) == self._second else 0
+        return counted + 1 <= self._rate_hz
+
+    def count(self, user: int, now_s: float) -> None:
+        """Count an ack of a user, at a time on the clock of `within_rate` [s]."""
+        second = math.floor(now_s)
+        if second != self._second:
+            self._second = second
+            self._acks.clear()
+        self._acks[user] += 1
+
+
+def parse_users(text: str) -> tuple[range, ...]:
+    """Parse a list of users, such as ``1, 4, 10-20``.
+
+    Parameters
+    ----------
+    text
+        User numbers from 1 and ranges, separated by commas; may be empty.
+
+    Raises
+    ------
+    ValueError
+        If a part is neither a number nor an ascending range.
+    """
+    return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
+
+
+def _parse_range(part: str) -> range:
+    match = _RANGE.fullmatch(part)
+    first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, 0)
+    if not 1 <= first <= last <= _LAST_USER:
+        raise ValueError(f'{part.strip()!r}, expected numbers from 1 to {_LAST_USER} and ranges '
+                         'such as 10-20')
+    return range(first, last + 1)
+
+
+# Acks of older instances in a row after which the newest one no longer owns the number.
+_MAX_MISSED = 3
+# Time without a rejected ack after which a conflict has ended [s].
+_CONFLICT_S = 5.0
+
+
+@dataclasses.dataclass
+class _Owner:
+    """The instance that owns a number.
+
+    Attributes
+    ----------
+    rejected
+        Acks of other instances since the last one of this instance.
+    """
+
+    instance: int
+    rejected: int = 0
+
+
+class UserInstances:
+    """Assigns each user number to one node, the newest of those that acknowledge with it.
+
+    A restarted user owns its number at once. If the newest node falls silent, the number passes to
+    an older one after a few beacons.
+    """
+
+    def __init__(self) -> None:
+        self._owners: dict[int, _Owner] = {}
+        # By user: time of the last rejected ack, and a description.
+        self._conflicts: dict[int, tuple[float, str]] = {}
+
+    def owner(self, user: int) -> int:
+        """Return the instance that owns a number; 0 if none does or if it is unknown."""
+        owner = self._owners.get(user)
+        return owner.instance if owner else 0
+
+    def is_superseded(self, user: int, instance: int) -> bool:
+        """Return whether a newer instance owns a number."""
+        owner = self._owners.get(user)
+        return owner is not None and instance < owner.instance and owner.rejected < _MAX_MISSED
+
+    def accept(self, user: int, instance: int) -> None:
+        """Record an ack of the instance that owns a number from now on."""
+        self._owners[user] = _Owner(instance)
+
+    def reject(self, user: int, now_s: float) -> list[LogMessage]:
+        """Record an ack of a superseded instance; return a warning about the first."""
+        owner = self._owners[user]
+        owner.rejected += 1
+        text = (f'user {user}: two nodes have this number; the newer one, '
+                f'{started(owner.instance)}, is served')
+        known = user in self._conflicts
+        self._conflicts[user] = now_s, text
+        return [] if known else [LogMessage(text, warning=True)]
+
+    def forget(self, users: Iterable[int], now_s: float) -> None:
+        """Release the numbers of users that no longer answer, and end old conflicts."""
+        for user in users:
+            self._owners.pop(user, None)
+        self._conflicts = {user: entry for user, entry in self._conflicts.items()
+                           if now_s - entry[0] < _CONFLICT_S}
+
+    def conflicts(self) -> dict[str, str]:
+        """Return a description of each conflict, by key of the diagnostics."""
+        return {f'conflict.user_{user}': text for user, (_, text) in self._conflicts.items()}

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from rclpy.node import Node
 
-from rhs_isac_ros.ros.timers import steady_timer
+from rhs_isac_ros.ros.endpoints import steady_timer
 
 _Result = TypeVar('_Result')
 _IMMEDIATE_S = 1e-6

@@ -9,7 +9,6 @@ from typing import Any
 
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.serialization import deserialize_message
@@ -18,9 +17,9 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.log_once import LogOnce
+from rhs_isac_ros.ros.diagnostics import LogOnce
+from rhs_isac_ros.ros.endpoints import steady_timer, subscribe
 from rhs_isac_ros.ros.parameters import CODEBOOK
-from rhs_isac_ros.ros.timers import steady_timer
 
 _NAMES = list(CODEBOOK)
 _RETRY_S = 0.1
@@ -41,17 +40,17 @@ class CodebookClient:
         Scenario that the codebook must fit.
     on_codebook
         Called with each new codebook.
-    on_presence
-        Called with True or False whenever the optimizer appears or disappears; it is assumed to be
-        present at first.
+
+    Attributes
+    ----------
+    codebook_id
+        Id of the latest codebook; empty before the first.
     """
 
     def __init__(
-            self, node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None],
-            on_presence: Callable[[bool], None] = lambda present: None) -> None:
-        self._node, self._scenario = node, scenario
-        self._on_codebook, self._on_presence = on_codebook, on_presence
-        self._is_present = True
+            self, node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]
+    ) -> None:
+        self._node, self._scenario, self._on_codebook = node, scenario, on_codebook
         # Only one of the parameter services, so that a security policy need not allow the others.
         self._client = node.create_client(
             GetParameters, f'{topics.OPTIMIZER_NODE}/get_parameters')
@@ -61,11 +60,9 @@ class CodebookClient:
         self._announced_s = math.inf
         self._announcement: Codebook | None = None
         self._log_once = LogOnce(node)
-        self._codebook_id = ''
-        node.create_subscription(
-            ros.Codebook, topics.CODEBOOK, self._on_announcement, qos.LATCHED_WITH_LEASE, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(
-                liveliness=self._on_liveliness, use_default_callbacks=False))
+        self.codebook_id = ''
+        subscribe(
+            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, qos.LATCHED, raw=True)
         self._timer = steady_timer(node, _RETRY_S, self._request)
 
     def _on_announcement(self, content: bytes) -> None:
@@ -84,6 +81,7 @@ class CodebookClient:
         self._announced += 1
         self._announced_s = time.monotonic()
         self._timer.reset()
+        self._request()
 
     def _fits(self, message: ros.Codebook, codebook: Codebook) -> bool:
         """Return whether a codebook fits the scenario, or log that it does not."""
@@ -94,42 +92,11 @@ class CodebookClient:
                     f'scenario {message.scenario_id}, expected {self._scenario.id}')
         except CodebookError as error:
             self._log_once.error(
-                'codebook', f'codebook of {self._optimizer} rejected: {error}',
+                'codebook', f'codebook of the optimizer rejected: {error}',
                 repeat_if_changed=True)
             return False
         self._log_once.clear('codebook')
         return True
-
-    def _on_liveliness(self, event: Any) -> None:
-        present = event.alive_count > 0 or self._is_in_this_process()
-        if present == self._is_present:
-            return
-        self._is_present = present
-        self._on_presence(present)
-        if present:
-            self._node.get_logger().info(f'{self._optimizer} is present again')
-        else:
-            self._node.get_logger().warning(
-                f'{self._optimizer} is no longer present; '
-                f'the codebook in use is {self._codebook_id or "none"}')
-
-    def _is_in_this_process(self) -> bool:
-        """Return whether the optimizer is in this process; Fast DDS then reports it as lost.
-
-        The first twelve bytes of the GID of an endpoint identify its participant, and each process
-        has one participant.
-        """
-        topic = self._node.resolve_topic_name(topics.CODEBOOK)
-        name = self._node.get_name(), self._node.get_namespace()
-        participants = {bytes(info.endpoint_gid[:12])
-                        for info in self._node.get_subscriptions_info_by_topic(topic)
-                        if (info.node_name, info.node_namespace) == name}
-        return any(bytes(info.endpoint_gid[:12]) in participants
-                   for info in self._node.get_publishers_info_by_topic(topic))
-
-    @property
-    def _optimizer(self) -> str:
-        return f'{self._node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
 
     def _request(self) -> None:
         if self._fetched == self._announced:
@@ -157,6 +124,6 @@ class CodebookClient:
             fetched = Codebook.from_parameters(
                 dict(zip(_NAMES, map(parameter_value_to_python, values), strict=True)))
             codebook = fetched if fetched.id == codebook.id else codebook
-        if codebook.id != self._codebook_id:
-            self._codebook_id = codebook.id
+        if codebook.id != self.codebook_id:
+            self.codebook_id = codebook.id
             self._on_codebook(codebook)

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Sequence
 from rclpy.utilities import remove_ros_args
 
 from rhs_isac_ros.model.arguments import ArgumentParser
-from rhs_isac_ros.ros.parameter import Parameter
-from rhs_isac_ros.ros.parameters import CODEBOOK, NODES
+from rhs_isac_ros.ros.parameters import CODEBOOK, NODES, Parameter
 
 # The highest domain whose ports exist.
 _MAX_DOMAIN = 232

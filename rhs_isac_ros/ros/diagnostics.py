@@ -1,4 +1,4 @@
-"""The diagnostics of the nodes, published as `diagnostic_msgs/DiagnosticArray`."""
+"""The diagnostics of the nodes, published as `diagnostic_msgs/DiagnosticArray`, and errors."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import qos, topics
-from rhs_isac_ros.ros.timers import steady_timer
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 
 _PERIOD_S = 1.0
 
@@ -46,11 +46,37 @@ class Diagnostics:
 
     def __init__(self, node: Node, report: Callable[[], Report]) -> None:
         self._node, self._report = node, report
-        self._publisher = node.create_publisher(
-            DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE)
+        self._publisher = create_publisher(
+            node, DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE)
         steady_timer(node, _PERIOD_S, self._publish)
 
     def _publish(self) -> None:
         stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(
             to_ros(self._report(), self._node.get_fully_qualified_name(), stamp))
+
+
+class LogOnce:
+    """Logs the first error of each subject, so that a faulty sender cannot fill the disk."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._logged: dict[str, str] = {}
+
+    def error(self, subject: str, text: str, *, repeat_if_changed: bool = False) -> None:
+        """Log an error unless one was logged for the subject already.
+
+        Parameters
+        ----------
+        repeat_if_changed
+            Whether to log an error again if its text differs from the last one logged for the
+            subject.
+        """
+        last = self._logged.get(subject)
+        if last is None or repeat_if_changed and text != last:
+            self._logged[subject] = text
+            self._node.get_logger().error(text)
+
+    def clear(self, subject: str) -> None:
+        """Allow the next error of a subject to be logged again."""
+        self._logged.pop(subject, None)

@@ -12,7 +12,7 @@ from visualization_msgs.msg import Marker
 from rhs_isac_ros.link import BeamPattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions
-from rhs_isac_ros.monitoring.scene_shapes import ellipsoid_95, lobe_m, user_colour
+from rhs_isac_ros.monitoring.entities import ellipsoid_95, lobe_m, user_colour
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.topics import MAP_FRAME
 

@@ -9,8 +9,8 @@ from rclpy.node import Node
 from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.recording import Recorder
-from rhs_isac_ros.ros.subscriptions import subscribe_messages
 
 
 class CycleObserver(Node):

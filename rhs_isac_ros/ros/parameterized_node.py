@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rhs_isac_ros.ros import parameters
-from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.parameters import ParameterError
 
 _FLOATING = (Parameter.Type.DOUBLE, Parameter.Type.DOUBLE_ARRAY)
 

@@ -1,29 +1,126 @@
 """The declarations of all ROS parameters: the source of descriptors, checks and documentation.
 
-``python -m rhs_isac_ros.ros.parameters`` prints the table of the README. Parameters that belong to
-the settings of a role are declared there.
+``python3 -m rhs_isac_ros.ros.parameters`` prints the table of the README. Parameters that belong
+to the settings of a role are declared there.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.model import Scenario, mobility, plugins
 from rhs_isac_ros.model.arguments import ArgumentParser
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.protocol.impairments import Impairments
-from rhs_isac_ros.protocol.settings import (
-    BaseStationSettings,
-    PositionerSettings,
-    TransmissionSettings,
-)
+from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
-from rhs_isac_ros.ros.parameter import Parameter, ParameterError
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.roster import ROSTER
+
+
+class ParameterError(ValueError):
+    """A parameter has a value that its node cannot use."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """Declaration of a parameter.
+
+    Attributes
+    ----------
+    default
+        Value when none is given; its type is the type of the parameter.
+    text
+        Description, one sentence.
+    low, high
+        Range of a number, inclusive.
+    choices
+        Valid strings; empty: any.
+    plugins
+        Entry point group whose names are valid too; empty: none.
+    dynamic
+        Whether the parameter may change while the node runs; all others are read at the start.
+    """
+
+    name: str
+    default: bool | int | float | str | list[float]
+    text: str
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    plugins: str = ''
+    dynamic: bool = False
+
+    @property
+    def kind(self) -> str:
+        """ROS type of the parameter."""
+        return {bool: 'bool', int: 'integer', float: 'double', str: 'string',
+                list: 'double_array'}[type(self.default)]
+
+    @property
+    def range(self) -> str:
+        """Valid values as text; empty if every value of the type is valid."""
+        if self.choices:
+            return ', '.join(self.choices) + (' or a plug-in' if self.plugins else '')
+        if self.low is None:
+            return ''
+        low, high = (format(limit, 'd' if type(self.default) is int else 'g')
+                     for limit in (self.low, self.high))
+        return f'{low} to {high} {self.unit}'.rstrip()
+
+    @property
+    def expected(self) -> str:
+        """Valid values as text, including the type."""
+        if self.choices:
+            return f'one of {self.range}' + (f' of {self.plugins}' if self.plugins else '')
+        words = {'bool': 'true or false', 'integer': 'an integer', 'string': 'a string',
+                 'double': 'a number with a decimal point',
+                 'double_array': 'a list of numbers, each with a decimal point'}[self.kind]
+        return f'{words}, {self.range}' if self.range else words
+
+    def check(self, value: Any) -> None:
+        """Check a value against the declaration.
+
+        Raises
+        ------
+        ParameterError
+            If the value has the wrong type, is out of range or is not one of the choices.
+        """
+        if not self._has_type(value) or not self._is_in_range(value):
+            raise ParameterError(f'{self.name}: {value!r}, expected {self.expected}')
+        if self.choices and value not in self.choices:
+            if not self.plugins:
+                raise ParameterError(f'{self.name}: {value!r}, expected {self.expected}')
+            self._check_plugin(value)
+
+    def _has_type(self, value: Any) -> bool:
+        if not isinstance(self.default, list):
+            return type(value) is type(self.default)
+        return (isinstance(value, Sequence) and not isinstance(value, str)
+                and all(isinstance(number, float) for number in value))
+
+    def _is_in_range(self, value: Any) -> bool:
+        # ROS does not check lists and tolerates small deviations at the ends of a range.
+        numbers = value if isinstance(self.default, list) else [value]
+        if self.low is None or self.high is None:
+            return True
+        return all(math.isfinite(number) and self.low <= number <= self.high
+                   for number in numbers)
+
+    def _check_plugin(self, value: str) -> None:
+        # Listing the installed plug-ins takes time; the built-in choices do not need it.
+        installed = plugins.names(self.plugins)
+        if value not in installed:
+            raise ParameterError(
+                f'{self.name}: {value!r}, expected {self.expected}; '
+                f'installed: {", ".join(installed) or "none"}')
+
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -38,28 +135,27 @@ class _Dataclass(Protocol):
 _Settings = TypeVar('_Settings', bound=_Dataclass)
 
 
-def _declared_by(settings: type[_Dataclass]) -> dict[str, Parameter]:
+def _declared_by(settings: type[_Dataclass] | None) -> dict[str, Parameter]:
     """Return the parameters, by name, that the fields of a settings class declare."""
-    return {field.name: Parameter(field.name, getattr(settings, field.name), **field.metadata)
-            for field in dataclasses.fields(settings)}
+    return {} if settings is None else {
+        field.name: Parameter(field.name, getattr(settings, field.name), **field.metadata)
+        for field in dataclasses.fields(settings)}
 
 
 _SCENARIO = Parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
 _SEED = Parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
-_BASE_STATION = _declared_by(BaseStationSettings)
-_POSITIONER = _declared_by(PositionerSettings)
 
-NODES: Mapping[str, tuple[Parameter, ...]] = {
+# Parameters of roles that are not settings.
+_OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
-        _SCENARIO, _SEED,
-        *_BASE_STATION.values(),
+        _SEED,
         Parameter('first_cycle', 0,
                   'Id of the first cycle; 0: derived from the clock, so that no id is reused '
                   'after a restart.', low=0, high=2**53),
     ),
     'user': (
-        _SCENARIO, _SEED,
+        _SEED,
         Parameter('user_id', 1, 'Id of the user, or the first of several.', low=1,
                   high=2**31 - 1),
         Parameter('user_count', 1, 'Number of users of the node, with consecutive ids.', low=1,
@@ -75,28 +171,23 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
                   'm/s', 0.0, 1e4),
         Parameter('ground_truth_period_s', 0.5,
                   'Period at which the true position is published.', 's', 0.01, 60.0),
-        _BASE_STATION['step_timeout_s'],
+        _declared_by(BaseStationSettings)['step_timeout_s'],
         Parameter('beacon_timeout_s', 1.5,
                   'Time without a beacon after which a warning is logged.', 's', 0.1, 7200.0),
     ),
-    'rhs_controller': (_SCENARIO,),
-    'channel': (_SCENARIO, _SEED, *_declared_by(Impairments).values()),
+    'channel': (_SEED,),
     'positioner': (
-        _SCENARIO,
-        _POSITIONER['estimator'],
         Parameter('table_folder', '',
                   'Directory in which tables are cached; empty: the cache directory of the user.'),
-        _POSITIONER['model_file'],
-        _POSITIONER['reject_outside'],
-        _POSITIONER['calibration_file'],
-        _POSITIONER['prior'],
-        _POSITIONER['track_speed_mps'],
     ),
-    'transmission': (_SCENARIO, *_declared_by(TransmissionSettings).values()),
-    'optimizer': (
-        _SCENARIO,
+    topics.OPTIMIZER_NODE: (
         Parameter('codebook_file', '', 'Codebook file; empty: the default codebook.'),
     ),
+}
+
+NODES: Mapping[str, tuple[Parameter, ...]] = {
+    **{name: (_SCENARIO, *_declared_by(member.settings).values(), *_OTHERS.get(name, ()))
+       for name, member in sorted(ROSTER.items())},
     'visualizer': (
         _SCENARIO,
         Parameter('period_s', 0.2, 'Period at which the scene is published.', 's', 0.01, 60.0),
@@ -246,6 +337,6 @@ def table() -> str:
 
 
 if __name__ == '__main__':
-    ArgumentParser(prog='python -m rhs_isac_ros.ros.parameters',
+    ArgumentParser(prog='python3 -m rhs_isac_ros.ros.parameters',
                    description='Print the table of all ROS parameters.').parse_args()
     print(table())

@@ -1,10 +1,8 @@
 """The quality of service of all topics."""
 
-from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
-    LivelinessPolicy,
     QoSProfile,
     ReliabilityPolicy,
 )
@@ -38,13 +36,6 @@ LATCHED = QoSProfile(
 PRESENCES = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-# For a current value whose publisher must remain alive. Subscribers are notified within a second
-# when the publisher terminates, long before discovery times out.
-LATCHED_WITH_LEASE = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL, liveliness=LivelinessPolicy.AUTOMATIC,
-    liveliness_lease_duration=Duration(seconds=1))
 
 _LATCHED_MESSAGES = {m.CapacityStatistics}
 

@@ -22,7 +22,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.subscriptions import subscribe
+from rhs_isac_ros.ros.endpoints import subscribe
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
 _SEPARATOR = '=' * 80
@@ -101,6 +101,8 @@ class Recorder:
     ----------
     count
         Number of messages written.
+    failure
+        Why the rest is not recorded, as when the disk is full; empty if nothing failed.
 
     Raises
     ------
@@ -123,7 +125,7 @@ class Recorder:
         self._writer = Writer(self._stream)
         self._writer.start(profile='ros2', library='rhs_isac_ros')
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
-        self.count = 0
+        self.count, self.failure = 0, ''
 
     def record_topics(
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
@@ -148,19 +150,32 @@ class Recorder:
     ) -> Callable[[bytes], None]:
         def write(message: bytes) -> None:
             now_ns = time.time_ns()
-            self._writer.add_message(
-                channel_id=channel, log_time=now_ns, publish_time=now_ns, data=message)
-            self.count += 1
+            if self._attempt(lambda: self._writer.add_message(
+                    channel_id=channel, log_time=now_ns, publish_time=now_ns, data=message)):
+                self.count += 1
             if on_message:
                 on_message(name, message)
         return write
 
+    def _attempt(self, write: Callable[[], object]) -> bool:
+        """Write unless an earlier attempt has failed; return whether it succeeds."""
+        try:
+            if not self.failure:
+                write()
+        except OSError as error:
+            self.failure = (f'{self._partial}: cannot be written: {error.strerror}; the recording '
+                            f'ends after {self.count} messages')
+        return not self.failure
+
     def close(self) -> None:
-        """Complete the file and rename it."""
-        if not self._stream.closed:
-            self._writer.finish()
-            self._stream.close()
+        """Complete the file and rename it; after a failure, the incomplete file remains."""
+        if self._stream.closed:
+            return
+        if self._attempt(self._writer.finish) and self._attempt(self._stream.flush):
             self._partial.replace(self._path)
+        # The buffer may still hold what cannot be written.
+        with contextlib.suppress(OSError):
+            self._stream.close()
 
 
 def read(

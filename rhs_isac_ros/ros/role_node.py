@@ -1,36 +1,37 @@
 """The adapter between a role of the protocol and ROS 2."""
 
 import dataclasses
+import functools
 import time
-from collections.abc import Callable
 from typing import Any, Generic, TypeVar
+
+from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import Recipient
 from rhs_isac_ros.protocol.events import (
     Action,
+    CodebookOffered,
     Event,
     LogMessage,
+    PeersChanged,
     RevertSettings,
     Send,
     SettingsOffered,
     Timeout,
 )
-from rhs_isac_ros.protocol.instance import started
+from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
-from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.log_once import LogOnce
+from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
-from rhs_isac_ros.ros.presence_client import PresenceClient, new_instance
-from rhs_isac_ros.ros.role_publishers import RolePublishers
-from rhs_isac_ros.ros.role_subscriptions import RoleSubscriptions
-from rhs_isac_ros.ros.timers import steady_timer
+from rhs_isac_ros.ros.peers import Peers, new_instance
+from rhs_isac_ros.ros.roster import ROSTER
 
 # Maximum number of senders whose wrong scenario is logged, which bounds the log.
 _MAX_LOGGED = 16
@@ -68,8 +69,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """
 
     role: _RoleT
-    # Whether only one node may serve in the role, so that others stand by.
-    is_unique = True
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(executable, name, **node_options)
@@ -79,11 +78,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self.instance = new_instance()
         self._identity = self.instance, self.scenario.id
         self._foreign: set[int] = set()
-        self._presence: PresenceClient | None = None
         self._is_advertised = self._stands_by = False
-        self._role_publishers = RolePublishers(self, executable)
-        self._role_subscriptions = RoleSubscriptions(
-            self, executable, self.instance, self._receive_bytes)
+        self._has_optimizer = True
+        self._sending: dict[type[m.Message], Publisher] = {}
+        self._receiving: set[type[m.Message]] = set()
         self._log_once = LogOnce(self)
         self._statistics = RoleStatistics()
         # One timer serves all deadlines. It is set again only if it would expire too late, or
@@ -92,23 +90,28 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._timer.cancel()
         self._timer_due_s: float | None = None
 
-    def start(self, role: _RoleT, *, advertise: bool = True, subscribe: bool = True) -> None:
+    def start(
+            self, role: _RoleT, *, subscribe: bool = True, needs_codebook: bool = False) -> None:
         """Connect the role to its topics and publish its diagnostics.
 
         Parameters
         ----------
-        advertise, subscribe
-            Whether to call these methods now; a role that is not ready yet calls them later.
+        subscribe
+            Whether to subscribe now; a role that is not ready yet calls `subscribe` later.
+        needs_codebook
+            Whether to advertise and to subscribe when the first codebook arrives.
         """
-        self.role = role
-        if advertise:
+        self.role, self._needs_codebook = role, needs_codebook
+        if not needs_codebook:
             self.advertise()
-        self._diagnostics = Diagnostics(self, self._report_regularly)
-        if self.is_unique:
-            self._presence = PresenceClient(
-                self, self._executable, self.instance, self.scenario, self._on_presence)
-        if subscribe:
+        self._diagnostics = Diagnostics(self, self.report)
+        self._peers = Peers(
+            self, self._executable, self.instance, self.scenario, self._on_missing,
+            self._on_rival)
+        if subscribe and not needs_codebook:
             self.subscribe()
+        if ROSTER[self._executable].has_codebook:
+            self._codebook_client = CodebookClient(self, self.scenario, self._on_codebook)
 
     def advertise(self) -> None:
         """Create the publishers of the role; the graph then shows that the role is present.
@@ -116,12 +119,19 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         A node that stands by creates them when it resumes.
         """
         self._is_advertised = True
-        if not self._stands_by:
-            self._role_publishers.advertise(self.role.SENDS)
+        for kind in () if self._stands_by else self.role.SENDS:
+            if kind not in self._sending:
+                self._sending[kind] = create_publisher(
+                    self, convert.ros_type(kind), topics.NAMES[kind], qos.profile_for(kind))
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
-        self._role_subscriptions.subscribe(self.role.RECEIVES)
+        for kind in self.role.RECEIVES:
+            if kind not in self._receiving:
+                self._receiving.add(kind)
+                subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
+                          functools.partial(self._receive_bytes, kind), qos.profile_for(kind),
+                          raw=True)
 
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
@@ -129,17 +139,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         report = self._statistics.report(
             '' if state is None else state.value, self.role.counters,
             state in self.role.BLOCKED_STATES, self.role.status())
-        own = self._presence.conflicts() if self._presence else {}
-        values = {**report.values, **own}
+        values = {**report.values, **self._peers.conflicts()}
         conflicts = [text for key, text in values.items() if key.startswith('conflict.')]
         if not conflicts:
             return report
         return dataclasses.replace(
             report, fault=True, summary='; '.join(conflicts), values=values)
-
-    def _report_regularly(self) -> Report:
-        self._role_subscriptions.examine_senders()
-        return self.report()
 
     @property
     def is_standing_by(self) -> bool:
@@ -152,28 +157,51 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def resume(self) -> None:
         """Handle that the node serves again."""
 
-    def _on_presence(self, stands_by: bool) -> None:
+    def _on_missing(self, missing: dict[str, str]) -> None:
+        if self._stands_by:
+            return
+        self._statistics.missing = tuple(missing.values())
+        if ROSTER[self._executable].requires:
+            self.dispatch(PeersChanged(tuple(
+                text for role, text in missing.items() if role != topics.OPTIMIZER_NODE)))
+        has_optimizer = topics.OPTIMIZER_NODE not in missing
+        if has_optimizer == self._has_optimizer:
+            return
+        self._has_optimizer = has_optimizer
+        if has_optimizer:
+            self.get_logger().info('optimizer is present again')  # type: ignore[no-untyped-call]
+        else:
+            self.get_logger().warning(  # type: ignore[no-untyped-call]
+                'optimizer is not present; the codebook in use is '
+                f'{self._codebook_client.codebook_id or "none"}')
+
+    def _on_rival(self, stands_by: bool) -> None:
         if stands_by == self._stands_by:
             return
         self._stands_by = stands_by
         if stands_by:
             self.stand_by()
             # Subscriptions remain: the executor may hold messages for them. They are ignored.
-            self._role_publishers.withdraw()
+            for publisher in self._sending.values():
+                self.destroy_publisher(publisher)
+            self._sending.clear()
         else:
             if self._is_advertised:
                 self.advertise()
             self.resume()
+            # The other nodes have to discover the publishers again.
+            self._peers.restart()
 
     def on_settings_changed(self, settings: Any) -> None:
         """Pass new settings to the role."""
         self.dispatch(SettingsOffered(settings))
 
-    def follow_codebook(self, on_codebook: Callable[[Codebook], None]) -> None:
-        """Call a function with the current codebook of the optimizer and with each later one."""
-        self._codebook_client = CodebookClient(
-            self, self.scenario, on_codebook,
-            lambda present: self._statistics.set_available(topics.OPTIMIZER_NODE, present))
+    def _on_codebook(self, codebook: Codebook) -> None:
+        """Pass a codebook to the role, which may begin to serve with the first."""
+        self.dispatch(CodebookOffered(codebook))
+        if self._needs_codebook:
+            self.advertise()
+            self.subscribe()
 
     @staticmethod
     def now_s() -> float:
@@ -190,15 +218,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self._timer_due_s is None or deadline_s < self._timer_due_s):
             self._set_timer(deadline_s - now_s, deadline_s)
 
-    def publish(self, message: m.Message, to: tuple[Recipient, ...] = ()) -> bool:
+    def publish(self, message: m.Message) -> bool:
         """Publish a valid message and return True, or log its error and return False.
 
         A node that stands by publishes nothing.
-
-        Parameters
-        ----------
-        to
-            Recipients, as in `Send`.
         """
         if self._stands_by:
             return False
@@ -209,7 +232,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         except m.MessageError as error:
             self._log_error('not sent', error)
             return False
-        self._role_publishers.publish(type(message), content, to)
+        self._sending[type(message)].publish(content)
         return True
 
     def execute(self, action: Action) -> None:
@@ -255,8 +278,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _perform(self, action: Action) -> None:
         match action:
-            case Send(message, to):
-                self.publish(message, to)
+            case Send(message):
+                self.publish(message)
             case LogMessage(text, True):
                 self.get_logger().warning(text)  # type: ignore[no-untyped-call]
             case LogMessage(text):

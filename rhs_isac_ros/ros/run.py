@@ -18,25 +18,11 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.ros import command_line, parameters
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.resources import discovery_profile_file
+from rhs_isac_ros.ros.early import leave, use_discovery_profile
+from rhs_isac_ros.ros.parameters import ParameterError
 
 # Maximum time between two checks for a signal.
 _POLL_S = 0.1
-# Environment variable with the profile file of Fast DDS.
-_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-
-
-def use_discovery_profile() -> None:
-    """Shorten the discovery times of Fast DDS in this process.
-
-    Fast DDS reads the profile when the first node is created. A file that the environment already
-    names takes precedence; an empty name selects the defaults of Fast DDS.
-    """
-    file = os.environ.setdefault(_PROFILES, str(discovery_profile_file()))
-    if not file:
-        # Fast DDS reports an error for an empty name.
-        del os.environ[_PROFILES]
 
 
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
@@ -68,8 +54,9 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         signal.signal(number, lambda number, _: signals.append(number))
     use_discovery_profile()
     try:
-        rclpy.init(args=None if args is None else list(args),
-                   signal_handler_options=SignalHandlerOptions.NO)
+        if not ok():
+            rclpy.init(args=None if args is None else list(args),
+                       signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         print_error(error, program)
         return 2
@@ -77,6 +64,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     executor = None
     try:
         nodes = make()
+        leave()
         for node in nodes:
             parameters.check_overrides(node)
         executor = EventsExecutor()
@@ -94,6 +82,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         print_error(error, program)
         return 2
     finally:
+        leave()
         for node in nodes:
             node.destroy_node()
         if executor is not None:

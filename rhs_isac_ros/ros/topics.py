@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import USER, Recipient
 
 NAMES: Mapping[type[m.Message], str] = {
     m.Beacon: 'beacon',
@@ -25,17 +24,6 @@ NAMES: Mapping[type[m.Message], str] = {
     m.GroundTruths: 'ground_truths',
     m.ProtocolState: 'protocol_state',
 }
-
-# Prefix of the topics to which only the recipients of `DELIVERIES` subscribe. The underscore hides
-# them from lists of topics, because the same messages are published on the topics above.
-_DELIVERY = '_to'
-
-
-def delivery(kind: type[m.Message], recipient: Recipient) -> str:
-    """Return the topic on which a role, or one node of users by its instance, gets messages."""
-    name = recipient if isinstance(recipient, str) else f'{USER}_{recipient}'
-    return f'{_DELIVERY}/{name}/{NAMES[kind]}'
-
 
 # Topics without a message of the protocol.
 POSITION = 'position'

@@ -7,6 +7,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from rhs_isac_ros.ros import qos
+from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.topics import MAP_FRAME, RHS_FRAME, TF, TF_STATIC, USER_FRAME
 
 
@@ -47,8 +48,8 @@ class TransformPublisher:
             return
         self.available = True
         self._message = TFMessage
-        self._dynamic = node.create_publisher(TFMessage, TF, qos.EXCHANGE)
-        self._static = node.create_publisher(TFMessage, TF_STATIC, qos.LATCHED)
+        self._dynamic = create_publisher(node, TFMessage, TF, qos.EXCHANGE)
+        self._static = create_publisher(node, TFMessage, TF_STATIC, qos.LATCHED)
         self._static.publish(TFMessage(transforms=[surface(node.get_clock().now().to_msg())]))
 
     def publish(self, transform: TransformStamped) -> None:

@@ -28,6 +28,7 @@ from rhs_isac_ros.monitoring.cycle_log import CycleLog
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros.command_line import check_domain
+from rhs_isac_ros.ros.early import use_discovery_profile
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import (
     MAX_USER_NODES,
@@ -35,7 +36,6 @@ from rhs_isac_ros.ros.processes import (
     private_domain,
 )
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
-from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.demo_picture import draw, prepare_drawing
 from rhs_isac_ros.tools.demo_report import summary, table
 from rhs_isac_ros.tools.demo_times import Parts, process_age_s
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scenario, codebook_file = load_files(options.config, options.codebook)
         recorder = Recorder(options.record, scenario) if options.record else None
     except CodebookError as error:
-        print_error(f'{error}; to create a codebook for a scenario: python -m '
+        print_error(f'{error}; to create a codebook for a scenario: python3 -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
         return 2
     except (ScenarioError, RecordingError) as error:

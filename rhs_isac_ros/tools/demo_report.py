@@ -37,7 +37,7 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
     """Return statistics of at least one complete cycle, and a line for each that was given up."""
     errors = np.array([cycle.error_m for cycle in cycles])
     bounds = np.sqrt([cycle.estimate.crlb_m2 for cycle in cycles])
-    lengths = np.array([cycle.ended_s - cycle.began_s for cycle in cycles])
+    lengths = np.array([cycle.duration_s for cycle in cycles])
     losses = np.array([cycle.capacity.loss_percent for cycle in cycles])
     users = len({cycle.user for cycle in cycles})
     lines = [

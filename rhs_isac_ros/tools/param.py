@@ -1,6 +1,6 @@
 """``scripts/param``: ``ros2 param``, which the wheels lack, with the same output.
 
-``python -m rhs_isac_ros.tools.param --help`` lists the commands.
+``python3 -m rhs_isac_ros.tools.param --help`` lists the commands.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Permissions of the nodes for topics and services, as a policy for SROS2.
 
-``python -m rhs_isac_ros.tools.permissions`` prints the policy; ``config/sros2/policy.xml`` is the
+``python3 -m rhs_isac_ros.tools.permissions`` prints the policy; ``config/sros2/policy.xml`` is the
 policy for two users.
 """
 
@@ -17,15 +17,8 @@ from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model.arguments import ArgumentParser, integer
 from rhs_isac_ros.monitoring.scene_state import RECEIVES as SCENE_RECEIVES
 from rhs_isac_ros.nodes.optimizer import PUSHER_NODE
-from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.delivery import USER, Delivery, deliveries_from, deliveries_to
-from rhs_isac_ros.protocol.positioner import Positioner
-from rhs_isac_ros.protocol.rhs_controller import RhsController
-from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.roster import ROSTER
 
 # Topics that every rclpy node publishes, and services that it offers.
 _RCLPY_TOPICS = ('/parameter_events', '/rosout')
@@ -72,63 +65,26 @@ def permissions(users: int) -> dict[str, Permissions]:
         Permissions by node. ``operator`` stands for the command-line tools, which may read all
         topics, set parameters and pause cycles.
     """
-    diagnostics = (topics.DIAGNOSTICS,)
     nodes = {
-        'bs': _with_codebook(_unique('bs', BaseStation.SENDS, BaseStation.RECEIVES, diagnostics)
-                             )._replace(reply=(*_OFFERED_SERVICES, *_CYCLE_SERVICES)),
-        'channel': _unique('channel', Channel.SENDS, Channel.RECEIVES, diagnostics),
-        'optimizer': _unique('optimizer', (), (), (*diagnostics, topics.CODEBOOK)),
-        'positioner': _with_codebook(_unique(
-            'positioner', Positioner.SENDS, Positioner.RECEIVES, (
-                *diagnostics, topics.POSITION, *_of_users(users, topics.POSE)))),
-        'rhs_controller': _with_codebook(_unique(
-            'rhs_controller', RhsController.SENDS, RhsController.RECEIVES, diagnostics)),
-        'transmission': _with_codebook(_unique(
-            'transmission', Transmission.SENDS, Transmission.RECEIVES, diagnostics)),
-        'visualizer': _of_messages('visualizer', (), SCENE_RECEIVES, (
-            topics.MARKERS, topics.TF, topics.TF_STATIC,
-            *_of_users(users, topics.PATH, topics.TRUE_PATH))),
-        **{f'user_{number}': _of_messages(USER, User.SENDS, User.RECEIVES, diagnostics)
-           for number in range(1, users + 1)},
-    }
+        name if member.is_unique else f'{name}_{number}': _of_member(name, users)
+        for name, member in sorted(ROSTER.items())
+        for number in range(1, 2 if member.is_unique else users + 1)}
+    nodes['visualizer'] = Permissions(
+        publish=(*sorted((topics.MARKERS, topics.TF, topics.TF_STATIC,
+                          *_of_users(users, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
+        subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
     return {**nodes, 'operator': _operator(nodes, users)}
 
 
-def _of_messages(
-        role: str, sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
-        publishes: Iterable[str]) -> Permissions:
-    """Return permissions for messages of a role, and for publishing other topics by name."""
-    # A node also subscribes to the topics for all nodes if a publisher uses no others.
+def _of_member(name: str, users: int) -> Permissions:
+    """Return the permissions of the nodes of a role."""
+    member = ROSTER[name]
+    sent = {full for topic in member.sent for full in _of_users(
+        users if '{user}' in topic else 1, topic)}
     return Permissions(
-        publish=(*sorted([*(topics.NAMES[kind] for kind in sends),
-                          *_delivery_topics(deliveries_from(role)), *publishes]),
-                 *_RCLPY_TOPICS),
-        subscribe=tuple(sorted([
-            *(topics.NAMES[kind] for kind in receives),
-            *_delivery_topics(deliveries_to(role))])))
-
-
-def _delivery_topics(deliveries: Iterable[Delivery]) -> set[str]:
-    """Return the topics of deliveries; the instances of nodes of users are not known before."""
-    return {
-        topics.delivery(one.kind, recipient) for one in deliveries
-        for recipient in ((USER, f'{USER}_*') if one.recipient == USER else (one.recipient,))}
-
-
-def _unique(
-        role: str, sends: Iterable[type[m.Message]], receives: Iterable[type[m.Message]],
-        publishes: Iterable[str]) -> Permissions:
-    """Return the permissions of `_of_messages`, and those to announce and detect a second node."""
-    permissions = _of_messages(role, sends, receives, (*publishes, topics.PRESENCE))
-    return permissions._replace(
-        subscribe=tuple(sorted([*permissions.subscribe, topics.PRESENCE])))
-
-
-def _with_codebook(permissions: Permissions) -> Permissions:
-    """Add the permissions to fetch the codebook from the optimizer."""
-    return permissions._replace(
-        subscribe=tuple(sorted([*permissions.subscribe, topics.CODEBOOK])),
-        request=(_GET_CODEBOOK,))
+        publish=(*sorted(sent), *_RCLPY_TOPICS), subscribe=tuple(sorted(member.received)),
+        reply=(*_OFFERED_SERVICES, *(_CYCLE_SERVICES if name == 'bs' else ())),
+        request=(_GET_CODEBOOK,) if member.has_codebook else ())
 
 
 def _of_users(users: int, *names: str) -> tuple[str, ...]:
@@ -143,7 +99,7 @@ def _operator(nodes: Iterable[str], users: int) -> Permissions:
     """
     readable = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
                 topics.POSITION, topics.PRESENCE, topics.TF, topics.TF_STATIC,
-                *_of_users(users, topics.POSE, topics.PATH, topics.TRUE_PATH)}
+                *_of_users(users, topics.POSE, topics.ODOMETRY, topics.PATH, topics.TRUE_PATH)}
     return Permissions(
         publish=_RCLPY_TOPICS, subscribe=(*sorted(readable), *_RCLPY_TOPICS),
         reply=(*(service.replace('~', PUSHER_NODE) for service in _OFFERED_SERVICES),
@@ -183,8 +139,9 @@ def policy(namespace: str = '/', users: int = 2) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the policy, and return the exit code 0."""
     parser = ArgumentParser(
-        prog='python -m rhs_isac_ros.tools.permissions', description='Print the SROS2 policy of a '
-        'network.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        prog='python3 -m rhs_isac_ros.tools.permissions',
+        description='Print the SROS2 policy of a network.',
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')

@@ -14,15 +14,15 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arguments import input_file, seed
 from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import REGION
+from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, max_processes
+from rhs_isac_ros.ros.roster import ROSTER, UNIQUE
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0
 # Time between two looks at the nodes that have been discovered [s].
 _DISCOVERY_PERIOD_S = 0.02
-# Processes that are not users.
-_N_OTHERS = 6
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +52,7 @@ def check_users(parser: argparse.ArgumentParser, users: int) -> None:
 
 def max_user_processes() -> int:
     """Return the number of users that this machine can run as processes of their own."""
-    return max_processes() - _N_OTHERS
+    return max_processes() - len(UNIQUE)
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
@@ -97,7 +97,7 @@ def start_network(
     seed
         Seed of all random numbers.
     scenario_file
-        File of `scenario`; None for the paper's Table I.
+        File of ``scenario``; None for the paper's Table I.
     rest_s
         Pause between cycles [s].
     first_cycle
@@ -110,21 +110,24 @@ def start_network(
     positioner
         Further parameters of the positioner.
     """
-    common: dict[str, Any] = {}
+    given: dict[str, Any] = {
+        'seed': seed, 'codebook_file': codebook_file, 'rest_s': rest_s,
+        'first_cycle': first_cycle, **dataclasses.asdict(impairments or Impairments())}
     if scenario_file:
-        common['scenario_file'] = Path(scenario_file).resolve()
-    for executable in ('rhs_controller', 'transmission'):
-        processes.start(executable, **common)
-    processes.start('positioner', **(positioner or {}), **common)
-    processes.start('optimizer', codebook_file=codebook_file, **common)
-    impaired = dataclasses.asdict(impairments or Impairments())
-    processes.start('channel', seed=seed, **impaired, **common)
-    nodes = [('users', 1, users)] if together else [
-        (f'user_{user}', user, 1) for user in range(1, users + 1)]
-    for name, first, count in nodes:
-        processes.start('user', name, user_id=first, user_count=count, seed=seed,
-                        mobility='random_walk', speed_mps=scenario.max_user_speed_mps, **common)
-    processes.start('bs', seed=seed, rest_s=rest_s, first_cycle=first_cycle, **common)
+        given['scenario_file'] = Path(scenario_file).resolve()
+    for role in ROSTER:
+        known = {parameter.name for parameter in parameters.NODES[role]}
+        values = {name: value for name, value in given.items() if name in known}
+        if role == 'positioner':
+            values |= positioner or {}
+        if ROSTER[role].is_unique:
+            processes.start(role, **values)
+            continue
+        for name, first, count in [('users', 1, users)] if together else [
+                (f'user_{user}', user, 1) for user in range(1, users + 1)]:
+            processes.start(
+                role, name, **values, user_id=first, user_count=count, mobility='random_walk',
+                speed_mps=scenario.max_user_speed_mps)
 
 
 def watch(

@@ -48,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 after a signal; 2 if an argument or a file is invalid.
+        Exit code: 0 after a signal; 1 if the file cannot be written to its end; 2 if an argument
+        or a file is invalid.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = _parser()
@@ -61,9 +62,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(error, parser.prog)
         return 2
     try:
-        code = run(lambda: [RecorderNode(recorder)], ['record', *arguments])
+        code = run(lambda: [RecorderNode(recorder)], ['record', *arguments],
+                   done=lambda: bool(recorder.failure))
     finally:
         recorder.close()
+    if recorder.failure:
+        print_error(recorder.failure, parser.prog)
+        return 1
     print(f'{recorder.count} messages in {options.file}')
     return code
 

@@ -19,9 +19,9 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.timers import steady_timer
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
@@ -78,7 +78,7 @@ class RepublisherNode(Node):
         self._unchanged_since_s = time.monotonic()
         kinds = recorded_topics()
         self._message_publishers = {
-            name: self.create_publisher(kinds[name][0], name, kinds[name][1]) for name in names}
+            name: create_publisher(self, kinds[name][0], name, kinds[name][1]) for name in names}
         self._timer = steady_timer(self, _POLL_PERIOD_S, self._poll_subscribers)
 
     def _poll_subscribers(self) -> None:

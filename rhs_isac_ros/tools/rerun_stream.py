@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
-from rhs_isac_ros.monitoring import charts, mode_chart, network_view
+from rhs_isac_ros.monitoring import charts, network_view
 from rhs_isac_ros.monitoring.entities import (
     Boxes,
     Ellipsoids,
@@ -120,7 +120,7 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
 
     scene = rrb.Spatial3DView(
         origin=network_view.WORLD, name='Scene (surface enlarged)', background=_BACKGROUND)
-    reach, height = mode_chart.REACH_M, mode_chart.HEIGHT_M
+    reach, height = charts.REACH_M, charts.HEIGHT_M
     modes = rrb.Spatial2DView(
         origin=network_view.MODES, background=_BACKGROUND,
         name='Modes: probability over range error [m]',

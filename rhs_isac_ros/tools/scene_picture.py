@@ -10,7 +10,7 @@ from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions, feed_positions
 from rhs_isac_ros.model.pictures import PAGE_IN, look, new_figure, paper_style, write_picture
-from rhs_isac_ros.monitoring.scene_shapes import MIN_LEVEL_DB, lobe_m
+from rhs_isac_ros.monitoring.entities import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
 from rhs_isac_ros.protocol.messages import Beam as BeamMessage
 from rhs_isac_ros.protocol.messages import Mode

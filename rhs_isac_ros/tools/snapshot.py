@@ -19,10 +19,10 @@ from rhs_isac_ros.model.arguments import (
 )
 from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.user_lists import join_users
+from rhs_isac_ros.protocol.outage_log import join_users
 from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.subscriptions import subscribe_messages
 from rhs_isac_ros.tools.scene_picture import draw
 
 _PROGRAM = 'snapshot'

@@ -1,6 +1,6 @@
 """``scripts/topic``: ``ros2 topic``, which the wheels lack, with the same output.
 
-``python -m rhs_isac_ros.tools.topic --help`` lists the commands.
+``python3 -m rhs_isac_ros.tools.topic --help`` lists the commands.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float, positive_int
-from rhs_isac_ros.ros.timers import steady_timer
+from rhs_isac_ros.ros.endpoints import steady_timer
 from rhs_isac_ros.tools.message_text import Layout, as_csv, as_yaml
 from rhs_isac_ros.tools.rate import Rate
 from rhs_isac_ros.tools.session import Session, ToolError, print_now, run_tool

@@ -20,9 +20,7 @@ from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
-from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
-from rhs_isac_ros.ros.timers import steady_timer
-from rhs_isac_ros.ros.user_topics import MAX_USERS
+from rhs_isac_ros.ros.endpoints import MAX_USERS, steady_timer, subscribe, subscribe_messages
 from rhs_isac_ros.tools.view_posteriors import Posteriors
 
 # If no cycle is observed for this time, the reason is logged.

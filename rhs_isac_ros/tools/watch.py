@@ -17,8 +17,8 @@ from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
 from rhs_isac_ros.ros import diagnostics, qos, topics
 from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.subscriptions import subscribe, subscribe_messages
 from rhs_isac_ros.tools.session import print_now
 from rhs_isac_ros.tools.watch_view import render
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from rhs_isac_ros.monitoring.overview import Fix, NodeStatus, Overview
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -5,7 +5,7 @@ chosen for the region, each with half as many frames? All plans are evaluated wi
 mean. The 95 % region of an estimate is the ellipsoid of its covariance that contains 95 % of a
 Gaussian. How close does the coordinate search come to the best of all plans of a small raster?
 
---plan adds a plan, for example one with two bands that python -m rhs_isac_ros.codebook --spectrum
+--plan adds a plan, for example one with two bands that python3 -m rhs_isac_ros.codebook --spectrum
 2.5e9:3.0e9 --bands 2 --plan two.yaml --output codebook_two.yaml has chosen.
 """
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from parts.chain import ChainObserver, Cycle
-from parts.hops import hops_of, ping_pong
+from parts.hops import CHAIN, ping_pong
 from rclpy.experimental import EventsExecutor
 
 from rhs_isac_ros.codebook import default_codebook_file
@@ -30,8 +30,8 @@ from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_i
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.command_line import check_domain
+from rhs_isac_ros.ros.early import use_discovery_profile
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.process_network import check_users, start_network
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
@@ -80,7 +80,7 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
     finally:
         rclpy.try_shutdown()
     hops_s = np.concatenate([before_s, after_s]) / 2
-    hop_s, n_hops = float(np.median(hops_s)), hops_of(scenario)
+    hop_s, n_hops = float(np.median(hops_s)), len(CHAIN)
     cycles_s = np.array([chain.duration_s for chain in chains])
     messages_s = np.array([sum(link.elapsed_s for link in chain.links()
                                if link.name not in COMPUTED) for chain in chains])

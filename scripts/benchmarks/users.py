@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from parts.hops import hops_of, ping_pong
+from parts.hops import CHAIN, ping_pong
 from system.observer import NetworkObserver
 
 from rhs_isac_ros.codebook import default_codebook_file
@@ -24,8 +24,8 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int
 from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.ros.command_line import check_domain
+from rhs_isac_ros.ros.early import use_discovery_profile
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.process_network import max_user_processes, start_network
 
 TIMEOUT_S = 600.0
@@ -70,7 +70,7 @@ def main() -> int:
         hop_s = np.median(ping_pong(scenario)) / 2
     finally:
         rclpy.try_shutdown()
-    hops = hops_of(scenario)
+    hops = len(CHAIN)
     rate_hz = np.mean([run['rate_hz'] for run in few])
     for run in many.values():
         run['rate_ratio'] = run['rate_hz'] / rate_hz

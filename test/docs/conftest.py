@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[2] / 'docs'
+# The extensions import each other as Sphinx does.
+sys.path.insert(0, str(DOCS / 'extensions'))
 
 
 @pytest.fixture(scope='session')

@@ -14,8 +14,9 @@ for library in ('sphinx', 'furo', 'myst_parser', 'matplotlib'):
     pytest.importorskip(library, reason=f'{library} is not installed')
 pytest.importorskip('rclpy', reason='the pages of the interfaces need ROS')
 
+import diagram  # noqa: E402
+
 from rhs_isac_ros.model import Scenario  # noqa: E402
-from rhs_isac_ros.protocol import diagram  # noqa: E402
 from rhs_isac_ros.ros import parameters, topics  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
@@ -175,7 +176,7 @@ def test_commands_on_the_pages_exist(path):
     text = path.read_text(encoding='utf-8')
     for command in re.findall(r'scripts/([a-z.]+[a-z])', text):
         assert (ROOT / 'scripts' / command).is_file(), command
-    for module in re.findall(r'python -m (rhs_isac_ros[\w.]*)', text):
+    for module in re.findall(r'python3? -m (rhs_isac_ros[\w.]*)', text):
         place = ROOT.joinpath(*module.split('.'))
         assert place.with_suffix('.py').is_file() or (place / '__main__.py').is_file(), module
     for executable in re.findall(r'(?:scripts/run|ros2 run rhs_isac_ros) (\w+)', text):

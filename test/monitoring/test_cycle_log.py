@@ -8,7 +8,7 @@ import pytest
 
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 
 
 def log_of(*networks, without=()):
@@ -47,7 +47,21 @@ def test_durations_match_the_messages_of_the_phases(network):
     assert durations[m.Phase.POSITIONING] == pytest.approx(positioning_s)
     estimating_s = times[m.Data] - times[m.ReceivedSignals]
     assert durations[m.Phase.ESTIMATING] == pytest.approx(estimating_s)
-    assert sum(durations.values()) == pytest.approx(record.ended_s - record.began_s)
+    assert sum(durations.values()) == pytest.approx(record.duration_s)
+    assert record.duration_s == pytest.approx(record.ended_s - record.began_s)
+
+
+def test_durations_do_not_depend_on_when_messages_arrive(network):
+    net = network(rest_s=0.5)
+    net.run_cycles(2)
+    prompt, late = log_of(net), CycleLog()
+    for sent in net.log:
+        if isinstance(sent.message, RECEIVES):
+            # The observer receives all messages of a busy machine together.
+            late.add(sent.message, 99.0)
+    for one, other in zip(prompt.complete, late.complete, strict=True):
+        assert one.durations_s() == other.durations_s()
+        assert one.duration_s == other.duration_s > 0
 
 
 def test_a_cycle_begins_with_the_last_beacon_before_its_grant(network, places):

@@ -5,7 +5,7 @@ import pytest
 
 from rhs_isac_ros.monitoring.role_statistics import RoleStatistics
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, PeersChanged, Send, Timeout
+from rhs_isac_ros.protocol.events import CodebookOffered, LogMessage, Send, Timeout
 
 
 def state(outcome, cycle_id=1):
@@ -83,11 +83,11 @@ def test_a_fault_is_reported_once_and_a_missing_role_until_it_is_present():
     first, second = (statistics.report('', counters) for _ in range(2))
     assert (first.fault, second.fault) == (True, False)
     assert first.summary == 'new faults: wrong_user 2'
-    statistics.record(PeersChanged(('channel', 'bs')), [], 0.0, 0.0)
+    statistics.missing = ('channel', 'bs')
     for _ in range(2):
         report = statistics.report('', counters)
         assert (report.fault, report.summary) == (True, 'waiting for channel, bs')
-    statistics.record(PeersChanged(()), [], 0.0, 0.0)
+    statistics.missing = ()
     assert not statistics.report('', counters | {'unanswered': 9}).fault
 
 

@@ -15,7 +15,7 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.receive import receive_feeds
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.fields import check
+from rhs_isac_ros.protocol.messages import check
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 
@@ -25,7 +25,7 @@ SIZES = SCENARIO.sizes
 COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
          m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'],
          m.RhsConfiguration: SIZES['N_B'] + 1,
-         m.PilotRequest: SIZES['N_B'], m.Pilot: SIZES['N_B'],
+         m.PilotRequest: 1, m.Pilot: SIZES['N_B'],
          m.FeedSignals: SIZES['N_B'], m.Data: 4, m.ProtocolState: 4}
 # Parameters of the nodes, in another order than in test_start_and_stop.
 BASE = {'channel': {}, 'transmission': {}, 'bs': {'rest_s': 0.02, 'ack_timeout_s': 0.3},

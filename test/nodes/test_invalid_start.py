@@ -45,7 +45,7 @@ CASES = {
                         ['argument -p: policy is a parameter of bs, expected one of user']),
     'of a viewer': ('network', {'forget_s': 2.0}, ['forget_s is a parameter of visualizer']),
     'of the optimizer': ('bs', ['--param', 'codebook.id:=x'], ['codebook.id']),
-    'of several nodes': ('optimizer', {'seed': 1}, ['seed is a parameter of bs, user, channel,']),
+    'of several nodes': ('optimizer', {'seed': 1}, ['seed is a parameter of bs, channel, user,']),
     'unknown in a file': ('bs', ['--params-file', 'unknown.yaml'], ['polcy', 'policy']),
     'no parameter file': ('bs', ['--params-file', '/no/parameters.yaml'],
                           ['/no/parameters.yaml']),

@@ -10,8 +10,8 @@ from rclpy.node import Node
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.nodes.optimizer import PushError, push
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.push import PushError, push
 
 
 @pytest.fixture(scope='module')

@@ -11,14 +11,14 @@ from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, st
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 
 PACKAGE = Path(rhs_isac_ros.__file__).parent
 # Messages of one cycle with two bands of two frames.
-OF_A_BAND = [m.PilotRequest, m.Pilot, m.FeedSignals]
 OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, m.RhsCommand, m.RhsCommand, m.RhsConfiguration,
-              m.RhsConfiguration, *OF_A_BAND, *OF_A_BAND, m.ReceivedSignals, m.PositionEstimate,
-              m.Beam, m.RhsConfiguration, m.Data, m.Data, m.Data, m.Data]
+              m.RhsConfiguration, m.PilotRequest, m.Pilot, m.Pilot, m.FeedSignals, m.FeedSignals,
+              m.ReceivedSignals, m.PositionEstimate, m.Beam, m.RhsConfiguration,
+              m.Data, m.Data, m.Data, m.Data]
 BESIDES = (m.ProtocolState, m.GroundTruth, m.Capacity, m.CapacityStatistics)
 
 
@@ -53,7 +53,7 @@ def test_bands_are_sounded_in_order(network, scenario, codebooks):
     net = network()
     net.run_cycles(1)
     assert [c.band for c in net.sent(m.RhsCommand)] == [0, 1]
-    assert [(r.band, r.n_frames) for r in net.sent(m.PilotRequest)] == [(0, 2), (1, 2)]
+    assert [(r.band, r.last_band, r.n_frames) for r in net.sent(m.PilotRequest)] == [(0, 1, 2)]
     assert [(p.band, len(p.symbols)) for p in net.sent(m.Pilot)] == [(0, 2), (1, 2)]
     reports = net.sent(m.RhsConfiguration, mode=m.Mode.POSITIONING)
     for band, report in enumerate(reports):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model.multipath import multipath_covariance, time_correlation
-from rhs_isac_ros.protocol.fading import Fading
+from rhs_isac_ros.protocol.channel import Fading
 
 
 def test_the_first_cycle_is_the_draw_of_its_seed_and_without_memory_each_is(scenario):

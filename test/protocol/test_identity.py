@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from system.invariants import RECEIVES, InvariantChecker
 
-from rhs_isac_ros.monitoring.invariants import RECEIVES, InvariantChecker
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import PauseRequested, PeersChanged, Resumed, StoodBy
 
 

@@ -13,6 +13,8 @@ from rhs_isac_ros.protocol.role import PlainRole
 class Repeats(PlainRole):
     """Publishes each message that it receives, with a log message."""
 
+    SENDS = RECEIVES = ()
+
     def handle(self, event, now_s):
         return [Send(event), LogMessage('received')]
 

@@ -1,6 +1,7 @@
 """One lost message costs one cycle at most, and none with retries."""
 
 import collections
+import dataclasses
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from in_memory_network import LosesFirst, matches
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
@@ -29,7 +30,6 @@ LOST = [
     (m.RhsConfiguration, {'mode': POSITIONING}, 'channel', 'user_gone', {}),
     (m.RhsConfiguration, {'mode': POSITIONING, 'band': 1}, 'bs', 'rhs_silent', {}),
     (m.PilotRequest, {}, 'user1', 'user_gone', {}),
-    (m.PilotRequest, {'band': 1}, 'user1', 'user_gone', {}),
     (m.Pilot, {}, 'channel', 'user_gone', {}),
     (m.Pilot, {'band': 1}, 'channel', 'user_gone', {}),
     (m.FeedSignals, {}, 'bs', 'user_gone', {}),
@@ -89,7 +89,7 @@ def test_one_lost_message_ends_no_cycle_with_retries(network, kind, fields, reci
     assert lost
     assert [outcome for _, _, outcome in net.outcomes()] == ['served'] * 4
     assert net.counters().get('bs', {}).keys() <= {
-        'unanswered', 'duplicate', 'wrong_band', *(f'retry_{step}' for step in (
+        'unanswered', 'duplicate', *(f'retry_{step}' for step in (
             'rhs', 'band', 'position', 'beam', 'data'))}
     net.verify()
 
@@ -99,7 +99,7 @@ def test_a_step_is_repeated_at_most_as_often_as_configured(network, retries, out
     requests = []
 
     def lose_first_two(message, recipient):
-        if isinstance(message, m.PilotRequest) and message.band == 1:
+        if isinstance(message, m.PilotRequest):
             requests.append(message)
             return [] if len(requests) < 3 else [(1e-3, message)]
         return [(1e-3, message)]
@@ -114,30 +114,52 @@ def test_a_step_is_repeated_at_most_as_often_as_configured(network, retries, out
     net.verify()
 
 
-def test_each_band_may_be_requested_as_often_as_configured(network):
-    requests = []
+def test_the_signals_of_a_band_begin_a_new_step(network):
+    remaining = [(m.PilotRequest, 0), (m.Pilot, 1)]
 
-    def loses_first_of_each_band(message, recipient):
-        if isinstance(message, m.PilotRequest) and recipient == 'user1':
-            requests.append(message.band)
-            return [(1e-3, message)] if requests.count(message.band) > 1 else []
+    def loses_each_once(message, recipient):
+        key = type(message), getattr(message, 'band', 0)
+        if key in remaining:
+            remaining.remove(key)
+            return []
         return [(1e-3, message)]
-    net = network(transport=loses_first_of_each_band, retries=1)
+    net = network(transport=loses_each_once, retries=1)
     net.run_cycles(1)
     assert net.outcomes() == [(1, 1, 'served')]
-    assert net.counters()['bs'] == {'retry_band': 2}
+    assert not remaining
+    # One repetition is due for each band.
+    assert [request.band for request in net.sent(m.PilotRequest)] == [0, 0, 1]
 
 
-def test_a_band_begins_once_its_configurations_are_reported(network):
+def test_pilots_are_requested_once_all_configurations_are_reported(network):
     net = network(transport=LosesFirst(
         m.RhsConfiguration, {'mode': POSITIONING, 'band': 1}, 'bs'), retries=1)
-    net.run_to(State.SOUNDING)
-    net.run_to(State.CONFIGURING)
-    assert [request.band for request in net.sent(m.PilotRequest)] == [0]
     net.run_cycles(1)
     assert net.outcomes() == [(1, 1, 'served')]
     assert [command.band for command in net.sent(m.RhsCommand)] == [0, 1, 1]
+    assert [(r.band, r.last_band) for r in net.sent(m.PilotRequest)] == [(0, 1)]
     assert net.counters() == {'bs': {'retry_rhs': 1}, 'rhs_controller': {'duplicate': 1}}
+
+
+@pytest.mark.parametrize('band', [0, 1])
+def test_only_the_signals_that_lack_are_requested_again(network, band):
+    net = network(transport=LosesFirst(m.FeedSignals, {'band': band}, 'bs'), retries=1)
+    net.run_cycles(1)
+    assert net.outcomes() == [(1, 1, 'served')]
+    assert [(r.band, r.last_band) for r in net.sent(m.PilotRequest)] == [(0, 1), (band, 1)]
+    assert [command.band for command in net.sent(m.RhsCommand)] == [0, 1, band]
+    assert net.counters()['bs'].pop('retry_band') == 1
+
+
+def test_a_user_that_sends_the_pilots_of_the_first_band_alone_is_served(network):
+    """A user of another project may ignore the last band of a request."""
+    def first_band_alone(message, recipient):
+        if isinstance(message, m.PilotRequest):
+            message = dataclasses.replace(message, last_band=message.band)
+        return [(1e-3, message)]
+    net = network(transport=first_band_alone, retries=3)
+    net.run_cycles(2)
+    assert [outcome for *_, outcome in net.outcomes()] == ['served'] * 2
 
 
 def test_every_subscription_is_among_the_lost_messages(subscriptions):

@@ -171,7 +171,7 @@ def test_an_index_out_of_range_is_named(example, scenario, kind, field, symbol, 
 def test_bands_are_indices():
     assert {(kind.__name__, field) for kind, field, _ in INDICES} == {
         (kind.__name__, field.name) for kind in KINDS for field in dataclasses.fields(kind)
-        if field.name == 'band'}
+        if field.name in ('band', 'last_band')}
 
 
 NUMBERS = [(kind, field) for kind in KINDS for field in dataclasses.fields(kind)

@@ -58,16 +58,24 @@ def test_a_reason_is_logged_once_until_a_cycle_is_served():
     assert len(outages.log_lost_cycle(8, 1, 'rhs_silent')) == 1
 
 
-def test_user_gone_is_logged_once_per_user_until_that_user_is_served():
+@pytest.mark.parametrize('reason', ['user_gone', 'no_fix'])
+def test_the_reasons_of_a_user_are_logged_once_until_that_user_is_served(reason):
     outages = OutageLog()
-    assert len(outages.log_lost_cycle(1, 1, 'user_gone')) == 1
-    assert len(outages.log_lost_cycle(2, 2, 'user_gone')) == 1
+    assert len(outages.log_lost_cycle(1, 1, reason)) == 1
+    assert len(outages.log_lost_cycle(2, 2, reason)) == 1
     assert served(outages, 3, 3) == []
-    assert outages.log_lost_cycle(4, 1, 'user_gone') == []
+    assert outages.log_lost_cycle(4, 1, reason) == []
     assert served(outages, 5, 1) == [
-        LogMessage('cycle 5: user 1 served again after: user_gone')]
-    assert len(outages.log_lost_cycle(6, 1, 'user_gone')) == 1
-    assert outages.log_lost_cycle(7, 2, 'user_gone') == []
+        LogMessage(f'cycle 5: user 1 served again after: {reason}')]
+    assert len(outages.log_lost_cycle(6, 1, reason)) == 1
+    assert outages.log_lost_cycle(7, 2, reason) == []
+
+
+def test_the_outages_of_many_users_do_not_fill_the_memory():
+    outages = OutageLog()
+    for user in range(1, 6000):
+        assert outages.log_lost_cycle(user, user, 'no_fix')
+    assert len(outages._open) == 4096
 
 
 @pytest.mark.parametrize(('users', 'text'), [

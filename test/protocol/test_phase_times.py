@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.phase_times import PhaseTimes
+from rhs_isac_ros.protocol.base_station_steps import PhaseTimes
 
 
 def test_times_count_from_the_latest_beacon():

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from rhs_isac_ros.protocol.presences import SILENCE_S, Presence, Presences
+from rhs_isac_ros.protocol.presences import Presence, Presences
 
 NOW_NS = 1_700_000_000 * 10**9
 OWN = Presence(NOW_NS - 5 * 10**9, 'sc1', 'bs', '/bs', {'n_frames': 4, 'n_feeds': 3})
@@ -24,52 +24,65 @@ def texts(messages):
 
 
 def test_a_node_serves_alone(presences):
-    assert presences.add(OWN, NOW_NS, 0.0) == []
-    assert presences.expire(10.0) == []
+    assert presences.add(OWN, NOW_NS) == []
+    assert presences.keep({'/bs': 1}) == []
     assert not presences.stands_by
-    assert not presences.in_conflict
+    assert not presences.others
     assert presences.conflicts() == {}
 
 
 def test_the_older_node_stands_by_until_the_newer_has_gone(presences):
     text = 'two nodes act as bs: this one stands by for /bs, started 2023-11-14 22:13:20 UTC'
-    assert texts(presences.add(other(), NOW_NS, 0.0)) == [text]
+    assert texts(presences.add(other(), NOW_NS)) == [text]
     assert presences.stands_by
     assert presences.conflicts() == {
         'conflict.role': 'stands by for /bs, started 2023-11-14 22:13:20 UTC'}
-    assert presences.add(other(), NOW_NS, 1.0) == []
-    assert presences.expire(1.0 + SILENCE_S) == []
+    assert presences.add(other(), NOW_NS) == []
+    # A name that is unknown yet may be that of the other one.
+    for announcing in ({'/bs': 2}, {'/bs': 1, '': 1}):
+        assert presences.gone(announcing) == set()
+        assert presences.keep(announcing) == []
     assert presences.stands_by
-    assert texts(presences.expire(1.1 + SILENCE_S)) == [
+    assert presences.gone({'/bs': 1}) == {'/bs'}
+    assert texts(presences.keep({'/bs': 1})) == [
         '/bs has gone; this node acts as bs again']
     assert not presences.stands_by
-    assert not presences.in_conflict
+    assert not presences.others
 
 
 def test_the_newer_node_serves(presences):
-    (message,) = presences.add(other(age_s=9), NOW_NS, 0.0)
+    (message,) = presences.add(other(age_s=9), NOW_NS)
     assert message.warning
     assert message.text == (
         'two nodes act as bs: this one serves instead of /bs, started 2023-11-14 22:13:11 UTC')
     assert not presences.stands_by
-    assert presences.in_conflict
+    assert presences.others
     assert 'serves instead of' in presences.conflicts()['conflict.role']
-    assert presences.expire(2.0) == []
+    assert presences.keep({'/bs': 1}) == []
     assert presences.conflicts() == {}
-    # It was only slow.
-    assert presences.add(other(age_s=9), NOW_NS, 3.0) == []
+    # It was only suspended.
+    assert presences.add(other(age_s=9), NOW_NS) == []
     assert 'serves instead of' in presences.conflicts()['conflict.role']
 
 
 def test_the_newest_of_three_serves(presences):
-    presences.add(other(age_s=1), NOW_NS, 0.0)
-    presences.add(other(age_s=9), NOW_NS, 0.0)
-    presences.add(other(age_s=0), NOW_NS, 0.0)
+    presences.add(other(age_s=1), NOW_NS)
+    presences.add(other(age_s=9), NOW_NS)
+    presences.add(other(age_s=0), NOW_NS)
     assert presences.conflicts()['conflict.role'].endswith('22:13:20 UTC')
-    presences.add(other(age_s=1), NOW_NS, 1.0)
-    assert texts(presences.expire(2.0)) == [
+    presences.add(other(age_s=1), NOW_NS)
+    # All have the same name, so that the one that has gone is unknown.
+    assert presences.keep({'/bs': 3})
+    assert not presences.stands_by
+    assert texts(presences.add(other(age_s=1), NOW_NS)) == [
         'two nodes act as bs: this one stands by for /bs, started 2023-11-14 22:13:19 UTC']
-    assert presences.stands_by
+
+
+def test_of_nodes_with_different_names_the_one_that_has_gone_is_forgotten(presences):
+    presences.add(other(age_s=1, node='/a'), NOW_NS)
+    presences.add(other(age_s=0, node='/b'), NOW_NS)
+    assert texts(presences.keep({'/bs': 1, '/a': 1})) == [
+        'two nodes act as bs: this one stands by for /a, started 2023-11-14 22:13:19 UTC']
 
 
 def test_exactly_one_of_several_nodes_serves():
@@ -78,7 +91,7 @@ def test_exactly_one_of_several_nodes_serves():
     for own in all_of_them:
         presences = Presences(own)
         for announced in all_of_them:
-            presences.add(announced, NOW_NS, 0.0)
+            presences.add(announced, NOW_NS)
         serving += [] if presences.stands_by else [own]
     assert serving == [all_of_them[0]]
 
@@ -87,22 +100,22 @@ def test_exactly_one_of_several_nodes_serves():
     {'role': 'channel'}, {'sender': 0}, {'sender': NOW_NS + 2 * 3600 * 10**9},
     {'sender': 2**64 - 1}])
 def test_other_roles_and_impossible_instances_are_ignored(presences, changes):
-    assert presences.add(dataclasses.replace(other(), **changes), NOW_NS, 0.0) == []
-    assert not presences.in_conflict
+    assert presences.add(dataclasses.replace(other(), **changes), NOW_NS) == []
+    assert not presences.others
 
 
 def test_another_scenario_is_named_once_and_never_supersedes(presences):
     stranger = other(scenario_id='sc2', node='/channel', role='channel',
                      scenario={'n_frames': 6, 'n_feeds': 3})
-    (message,) = presences.add(stranger, NOW_NS, 0.0)
+    (message,) = presences.add(stranger, NOW_NS)
     assert message.warning
     assert message.text == ('/channel uses another scenario, sc2, with n_frames 6 instead of 4; '
                             'its messages are dropped')
     assert presences.conflicts() == {'conflict.sc2': message.text}
     same_role = dataclasses.replace(stranger, sender=NOW_NS - 1, role='bs')
-    assert presences.add(same_role, NOW_NS, 0.0) == []
+    assert presences.add(same_role, NOW_NS) == []
     assert not presences.stands_by
-    assert texts(presences.expire(2.0)) == ['no node with scenario sc2 is left']
+    assert texts(presences.keep({'/bs': 1})) == ['no node with scenario sc2 is left']
     assert presences.conflicts() == {}
 
 
@@ -110,8 +123,7 @@ def test_forged_announcements_fill_neither_the_memory_nor_the_log(presences):
     logged = []
     for number in range(1000):
         logged += presences.add(
-            other(scenario_id=f'sc{number}x', age_s=number), NOW_NS, number * 1e-3)
+            other(scenario_id=f'sc{number}x', age_s=number), NOW_NS)
     assert len(logged) == 16
     assert len(presences._others) == 64
-    presences.expire(0.0)
     assert len(presences.conflicts()) == 64

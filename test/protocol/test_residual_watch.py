@@ -7,7 +7,7 @@ from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.positioning.innovation_test import MIN_FIXES, MIN_RETURN, WINDOW
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, SettingsOffered
-from rhs_isac_ros.protocol.residual_watch import ResidualWatch
+from rhs_isac_ros.protocol.positioner import ResidualWatch
 from rhs_isac_ros.protocol.settings import PositionerSettings
 
 EXPECTED = 62.5

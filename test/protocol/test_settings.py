@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage
-from rhs_isac_ros.protocol.pending_settings import PendingSettings
+from rhs_isac_ros.protocol.role import PendingSettings
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
     PositionerSettings,

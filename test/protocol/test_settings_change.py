@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.protocol.settings import PositionerSettings
 

@@ -12,7 +12,7 @@ from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.protocol import base_station as bs
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import rhs_controller, user
-from rhs_isac_ros.protocol.base_station_states import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     LogMessage,
@@ -250,8 +250,8 @@ def test_a_snapshot_shows_changes_at_every_depth(machine):
     for change in (lambda: subject._users._missed.update({3: 0}),
                    lambda: subject._users._rng.random(),
                    lambda: subject._times._began_s.__setitem__(0, 1.0),
-                   lambda: subject._outages._open.add(('user_gone', 1)),
-                   lambda: setattr(subject._cycle, 'band', 9)):
+                   lambda: subject._outages._open.put(('user_gone', 1), None),
+                   lambda: subject._cycle.configured.add(9)):
         before = snapshot(subject)
         assert snapshot(subject) == before
         change()

@@ -46,7 +46,8 @@ def test_a_late_beacon_or_grant_of_a_cycle_keeps_its_position(user):
     assert answers(user, m.Beacon(cycle_id=7, attempt=0), 11.5) == []
     assert user.counters == {'late_grant': 1, 'stale_beacon': 1}
     user.handle(m.Beacon(cycle_id=7, attempt=1), 12.0)
-    again, *_ = answers(user, m.PilotRequest(cycle_id=7, user=4, band=0, n_frames=2), 12.5)
+    again, *_ = answers(user, m.PilotRequest(
+        cycle_id=7, user=4, band=0, last_band=0, n_frames=2), 12.5)
     assert again is truth
 
 
@@ -76,7 +77,8 @@ def test_a_true_position_has_cycle_0_unless_given(user):
 
 def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
     grant(user)
-    pilots, = answers(user, m.PilotRequest(cycle_id=7, user=4, band=1, n_frames=3), 12.5)
+    pilots, = answers(user, m.PilotRequest(
+        cycle_id=7, user=4, band=1, last_band=1, n_frames=3), 12.5)
     assert (pilots.cycle_id, pilots.user, pilots.band) == (7, 4, 1)
     assert pilots.symbols.tolist() == [1 + 0j] * 3
     assert user.next_deadline() == 15.5
@@ -127,7 +129,8 @@ def test_a_grant_to_another_user_ends_the_wait(user):
 
 
 @pytest.mark.parametrize('other', [
-    m.Grant(cycle_id=6, user=5), m.PilotRequest(cycle_id=7, user=5, band=0, n_frames=2), m.Data(
+    m.Grant(cycle_id=6, user=5), m.PilotRequest(
+        cycle_id=7, user=5, band=0, last_band=0, n_frames=2), m.Data(
         cycle_id=6, user=5, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0)],
     ids=['grant of another cycle', 'request', 'data'])
 def test_other_messages_to_another_user_are_ignored(user, other):
@@ -141,7 +144,8 @@ def test_other_messages_to_another_user_are_ignored(user, other):
 
 def test_a_pilot_request_that_overtakes_the_grant_implies_it(user):
     user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
-    truth, pilots = answers(user, m.PilotRequest(cycle_id=7, user=4, band=0, n_frames=2), 10.5)
+    truth, pilots = answers(user, m.PilotRequest(
+        cycle_id=7, user=4, band=0, last_band=0, n_frames=2), 10.5)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
     assert (type(pilots), len(pilots.symbols)) == (m.Pilot, 2)
     assert user.state is State.GRANTED
@@ -230,11 +234,13 @@ def test_a_cycle_serves_the_user_of_the_node_that_is_granted_it(users, user):
     users.handle(invite(1, 9), 1.0)
     (truth,) = answers(users, m.Grant(cycle_id=7, user=user), 1.1)
     assert (truth.user, *truth.position) == (user, user, 0, 0)
-    pilots = answers(users, m.PilotRequest(cycle_id=7, user=user, band=0, n_frames=2), 1.2)
+    pilots = answers(users, m.PilotRequest(
+        cycle_id=7, user=user, band=0, last_band=0, n_frames=2), 1.2)
     assert {pilot.user for pilot in pilots} == {user}
     for other in ({4, 5, 6} - {user}):
         assert answers(
-            users, m.PilotRequest(cycle_id=7, user=other, band=1, n_frames=2), 1.2) == []
+            users, m.PilotRequest(
+        cycle_id=7, user=other, band=1, last_band=1, n_frames=2), 1.2) == []
         assert answers(users, m.Data(
             cycle_id=7, user=other, direction=DOWN, stage=DELIVERED, duration_s=0.25, bits=1.0),
             1.2) == []

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rhs_isac_ros.protocol.user_instances import UserInstances
+from rhs_isac_ros.protocol.user_scheduler import UserInstances
 
 NEWER, OLDER = 1_700_000_000 * 10**9, 1_600_000_000 * 10**9
 

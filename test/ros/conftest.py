@@ -49,6 +49,10 @@ class Bench:
         self._executor.remove_node(node)
         node.destroy_node()
 
+    def spin_once(self):
+        """Spin once, as a node does: an exception is raised."""
+        self._executor.spin_once(timeout_sec=0.01)
+
     def until(self, condition, what='the condition'):
         """Spin until a condition holds and return its value."""
         end_s = time.monotonic() + TIMEOUT_S

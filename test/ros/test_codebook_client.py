@@ -1,7 +1,6 @@
 """The client of the codebook that the optimizer holds."""
 
 import dataclasses
-import types
 
 import numpy as np
 import pytest
@@ -190,14 +189,3 @@ def test_a_restarted_optimizer_is_followed(bench, follow, optimizer_of, stored, 
     optimizer_of('second')
     bench.until(lambda: len(got) == 2, 'the codebook of the new optimizer')
     assert ids(got) == [stored['first'].id, stored['second'].id]
-
-
-def test_an_optimizer_in_the_same_process_counts_as_present(bench, shipped):
-    """Fast DDS reports it dead when its lease expires."""
-    bench.add(OptimizerNode)
-    got, presence = [], []
-    node = bench.add(Node, 'client')
-    client = CodebookClient(node, Scenario(), got.append, presence.append)
-    bench.until(lambda: got, 'the codebook')
-    client._on_liveliness(types.SimpleNamespace(alive_count=0))
-    assert presence == []

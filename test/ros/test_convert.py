@@ -16,7 +16,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.fields import MessageError, check
+from rhs_isac_ros.protocol.messages import MessageError, check
 from rhs_isac_ros.ros import cdr, convert, topics
 
 SIZES = Scenario().sizes

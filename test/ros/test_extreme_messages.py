@@ -20,7 +20,7 @@ from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.fields import check
+from rhs_isac_ros.protocol.messages import check
 from rhs_isac_ros.ros import convert, topics
 
 # Outside tests, warnings are only printed.

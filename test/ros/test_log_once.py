@@ -4,7 +4,7 @@ import types
 
 import pytest
 
-from rhs_isac_ros.ros.log_once import LogOnce
+from rhs_isac_ros.ros.diagnostics import LogOnce
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.ros import convert, qos
-from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.parameters import ParameterError
 
 TYPES = {
     'codebook.id': Parameter.Type.STRING,

@@ -22,8 +22,7 @@ from rhs_isac_ros.protocol.settings import (
     TransmissionSettings,
 )
 from rhs_isac_ros.ros import parameters
-from rhs_isac_ros.ros.parameter import ParameterError
-from rhs_isac_ros.ros.parameters import NODES, declare, settings_of
+from rhs_isac_ros.ros.parameters import NODES, ParameterError, declare, settings_of
 
 PAIRS = [(executable, p) for executable, group in NODES.items() for p in group]
 NAMES = [f'{executable}-{p.name}' for executable, p in PAIRS]

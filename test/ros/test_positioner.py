@@ -18,7 +18,7 @@ from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros import convert, qos
-from rhs_isac_ros.ros.parameter import ParameterError
+from rhs_isac_ros.ros.parameters import ParameterError
 
 PLACE = np.array([10.0, 0.5, 0.2])
 

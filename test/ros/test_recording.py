@@ -2,20 +2,33 @@
 
 import array
 import importlib
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 import yaml
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
 
 import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import qos
+from rhs_isac_ros.nodes.transmission import TransmissionNode
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import (
     Recorder,
     RecordingError,
+    _offered_qos,
     read,
     read_scenario,
     recorded_topics,
@@ -258,3 +271,63 @@ def test_the_file_declares_its_profile_and_encodings(recording):
     assert {found.encoding for found in summary.schemas.values()} == {'ros2msg'}
     assert {channel.message_encoding for channel in summary.channels.values()} == {'cdr'}
     assert len(summary.channels) == len(recorded_topics())
+
+
+def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path):
+    (tmp_path / 'run.mcap.part').symlink_to('/dev/full')
+    recorder, seen = Recorder(tmp_path / 'run.mcap', Scenario()), []
+    recorder.record_topics(probe, lambda name, message: seen.append(name))
+    publisher = probe.create_publisher(ros.Ack, 'ack', qos.ACKS)
+    bench.until(publisher.get_subscription_count, 'the recorder')
+
+    def failed():
+        for _ in range(100):
+            publisher.publish(ros.Ack(cycle_id=1, user=1, scenario_id=1000 * 'x'))
+        return recorder.failure
+    assert 'run.mcap.part: cannot be written: No space left on device; the recording ends after ' \
+        in bench.until(failed, 'the failure')
+    # Observers of the recorded messages receive the others nevertheless.
+    n_seen, count, failure = len(seen), recorder.count, recorder.failure
+    publisher.publish(ros.Ack(cycle_id=1, user=1))
+    bench.until(lambda: len(seen) > n_seen, 'another message')
+    for _ in range(2):
+        recorder.close()
+    assert (recorder.count, recorder.failure) == (count, failure)
+    assert not (tmp_path / 'run.mcap').exists()
+
+
+def test_the_tool_ends_with_one_line_if_the_disk_is_full(bench, probe, tmp_path):
+    (tmp_path / 'run.mcap.part').symlink_to('/dev/full')
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'rhs_isac_ros.tools.record', str(tmp_path / 'run.mcap')],
+        stderr=subprocess.PIPE, text=True)
+    publisher = probe.create_publisher(ros.Ack, 'ack', qos.ACKS)
+    bench.until(publisher.get_subscription_count, 'the recorder')
+
+    def ended():
+        for _ in range(100):
+            publisher.publish(ros.Ack(cycle_id=1, user=1, scenario_id=1000 * 'x'))
+        return process.poll() is not None
+    bench.until(ended, 'the end of the recorder')
+    assert process.returncode == 1
+    error = process.communicate()[1]
+    assert 'Traceback' not in error
+    assert error.count('error: ') == error.count('No space left on device') == 1
+
+
+def test_nodes_receive_a_recording_that_is_played_with_its_recorded_qos(bench, tmp_path):
+    """As ``ros2 bag play`` does, which reads the quality of service from the file."""
+    codebook = Codebook.load(default_codebook_file())
+    message = convert.codebook_to_ros(codebook, Time(), 1, Scenario().id)
+    player = bench.add(Node, 'player')
+    (recorded,) = yaml.safe_load(_offered_qos(recorded_topics()[topics.CODEBOOK][1]))
+    assert recorded['liveliness_lease_duration'] == recorded['deadline']
+    publisher = player.create_publisher(ros.Codebook, topics.CODEBOOK, QoSProfile(
+        history=HistoryPolicy.get_from_short_key(recorded['history']), depth=recorded['depth'],
+        reliability=ReliabilityPolicy.get_from_short_key(recorded['reliability']),
+        durability=DurabilityPolicy.get_from_short_key(recorded['durability']),
+        liveliness=LivelinessPolicy.get_from_short_key(recorded['liveliness'])))
+    publisher.publish(message)
+    node = bench.add(TransmissionNode)
+    bench.until(lambda: node._codebook_client.codebook_id == codebook.id, 'the codebook')
+    assert not node._peers.conflicts()

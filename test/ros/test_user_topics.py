@@ -3,17 +3,17 @@
 import pytest
 from geometry_msgs.msg import Point, Vector3
 
-from rhs_isac_ros.ros import user_topics
-from rhs_isac_ros.ros.user_topics import UserTopics
+from rhs_isac_ros.ros import endpoints
+from rhs_isac_ros.ros.endpoints import UserTopics
 
 
 @pytest.fixture
 def topics(probe, monkeypatch):
     """Topics of at most two users, on a clock that the test sets."""
-    monkeypatch.setattr(user_topics, 'MAX_USERS', 2)
+    monkeypatch.setattr(endpoints, 'MAX_USERS', 2)
     topics = UserTopics(probe, {'users/user_{user}/a': Point, 'users/user_{user}/b': Vector3})
     topics.now_s = 0.0
-    monkeypatch.setattr(user_topics.time, 'monotonic', lambda: topics.now_s)
+    monkeypatch.setattr(endpoints.time, 'monotonic', lambda: topics.now_s)
     return topics
 
 

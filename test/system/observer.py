@@ -13,12 +13,13 @@ from rclpy.serialization import deserialize_message
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.monitoring import cycle_log, invariants
+from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, qos, topics
+from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.subscriptions import subscribe
+from system import invariants
 
 
 class NetworkObserver(CycleObserver):

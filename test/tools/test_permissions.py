@@ -7,16 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.delivery import deliveries_to
-from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.tools import permissions
 
-# An instance of a node of users in the name of a topic.
-INSTANCE = re.compile(r'(?<=_to/)user_\d+')
 ROOT = Path(__file__).parents[2]
 RIGHTS = ('publish', 'subscribe', 'reply', 'request')
 
@@ -47,18 +40,11 @@ def test_the_file_matches_the_output_of_the_command(capsys):
 def test_a_user_may_not_publish_messages_of_another_role():
     allowed = rules(permissions.policy(users=3))
     own = {f'/{name}' for name in (
-        'ack', 'data', 'ground_truth', 'ground_truths', 'pilot', topics.DIAGNOSTICS,
-        '_to/channel/data', '_to/channel/ground_truth', '_to/transmission/ground_truth')}
+        'ack', 'data', 'ground_truth', 'ground_truths', 'pilot', topics.DIAGNOSTICS)}
     common = {'/parameter_events', '/rosout'}
     for number in (1, 2, 3):
         assert allowed[f'/user_{number}']['publish'] == own | common
         assert not allowed[f'/user_{number}']['request']
-
-
-def test_nodes_may_receive_messages_of_publishers_that_do_not_deliver():
-    for path, role in (('/user_1', User), ('/channel', Channel), ('/bs', BaseStation)):
-        assert rules(permissions.policy())[path]['subscribe'] >= {
-            f'/{topics.NAMES[kind]}' for kind in role.RECEIVES}
 
 
 def test_only_the_operator_may_set_parameters_of_other_nodes():
@@ -102,12 +88,9 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
         'visualizer', namespace=space, scenario_file=small_files / 'scenario.yaml')
     allowed = rules(permissions.policy(space, users=2))
     del allowed[f'{space}/operator']
-    # Beacons to single nodes require more users.
-    allowed[f'{space}/bs']['publish'].remove(f'{space}/{topics.delivery(m.Beacon, "user_*")}')
-    # These subscriptions require a publisher that does not deliver.
-    for path, rights in allowed.items():
-        role = re.sub(r'_\d+$', '', path.rpartition('/')[2])
-        rights['subscribe'] -= {f'{space}/{topics.NAMES[one.kind]}' for one in deliveries_to(role)}
+    # Only tracks have a velocity.
+    for rights in allowed.values():
+        rights['publish'] = {name for name in rights['publish'] if not name.endswith('/odometry')}
     if not importlib.util.find_spec('tf2_msgs'):
         allowed[f'{space}/visualizer']['publish'] -= {topics.TF, topics.TF_STATIC}
 
@@ -120,7 +103,7 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
             'subscribe': node.get_subscriber_names_and_types_by_node(name, space),
             'reply': node.get_service_names_and_types_by_node(name, space),
             'request': node.get_client_names_and_types_by_node(name, space)}
-        return {right: {INSTANCE.sub('user_*', name) for name, _ in pairs}
+        return {right: {name for name, _ in pairs}
                 for right, pairs in found.items()}
 
     # After two cycles, all nodes have created all their publishers and subscriptions.

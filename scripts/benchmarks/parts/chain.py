@@ -133,8 +133,6 @@ def _step(message: m.Message) -> str | None:
         case m.RhsCommand() | m.RhsConfiguration() if message.band > 0:
             # Sent in parallel with those of the first band.
             return None
-        case m.PilotRequest() | m.Pilot() | m.FeedSignals():
-            return f'{name} {message.band}'
         case m.Data():
             return f'{name} {message.direction.name.lower()} {message.stage.name.lower()}'
     return name

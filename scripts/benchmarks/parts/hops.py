@@ -15,17 +15,11 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.run import run
 
-# Messages of a cycle in order. The commands of all bands are sent in parallel and count once.
-BEFORE = ('beacon', 'ack', 'rhs/command', 'rhs/configuration')
-PER_BAND = ('pilot_request', 'pilot', 'feed_signals')
-AFTER = ('received_signals', 'position_estimate', 'beam', 'rhs/configuration',
+# Messages of a cycle in order. Those of all bands are sent in parallel and count once.
+CHAIN = ('beacon', 'ack', 'rhs/command', 'rhs/configuration', 'pilot_request', 'pilot',
+         'feed_signals', 'received_signals', 'position_estimate', 'beam', 'rhs/configuration',
          'data', 'data', 'data', 'data')
 ROUND_TRIPS = 2000
-
-
-def hops_of(scenario: Scenario) -> int:
-    """Return the number of consecutive messages of a cycle."""
-    return len(BEFORE) + scenario.n_bands * len(PER_BAND) + len(AFTER)
 
 
 def ping_pong(scenario: Scenario, composed: bool = False) -> np.ndarray:

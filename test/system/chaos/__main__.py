@@ -1,4 +1,4 @@
-"""Entry point of ``python -m system.chaos``."""
+"""Entry point of ``python3 -m system.chaos``."""
 
 import sys
 

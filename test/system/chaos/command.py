@@ -24,14 +24,14 @@ from rhs_isac_ros.model.arguments import (
     positive_int,
 )
 from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.monitoring.invariants import CHECK_DELAY_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.command_line import check_domain
+from rhs_isac_ros.ros.early import use_discovery_profile
 from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.ros.run import use_discovery_profile
 from rhs_isac_ros.tools.process_network import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.chaos.trial import ChaosError, Trial
+from system.invariants import CHECK_DELAY_S
 from system.observer import NetworkObserver
 
 # Pause between cycles [s]; a longer one during fuzzing leaves room for messages in the queues.
@@ -140,7 +140,7 @@ def _crash(
     phases = [m.Phase[name.upper()] for name in options.phases or _PHASES]
     return crashes.crash_all(
         observer, processes, options.nodes or crashes.NODES, phases,
-        lambda trial: print(report.crash_line(trial), flush=True))
+        lambda trial: print(report.crash_line(trial), flush=True), options.repeat)
 
 
 def _intrude(
@@ -178,6 +178,8 @@ def _parser() -> argparse.ArgumentParser:
                         help=f'only kill these nodes; one or more of {", ".join(crashes.NODES)}')
     parser.add_argument('--phases', nargs='+', choices=_PHASES, metavar='PHASE',
                         help=f'only kill nodes in these phases; of {", ".join(_PHASES)}')
+    parser.add_argument('--repeat', type=positive_int, default=1, metavar='N',
+                        help='number of times that each node is killed in each phase')
     parser.add_argument('--intruders', nargs='+', choices=intruders.INTRUDERS, metavar='NODE',
                         help='only start these second nodes, which may be repeated; of '
                              f'{", ".join(intruders.INTRUDERS)}')

@@ -1,17 +1,13 @@
 """Crash trials: kill each node in each phase, restart it, and measure the time to recover."""
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.positioner import Positioner
-from rhs_isac_ros.protocol.rhs_controller import RhsController
-from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.roster import ROSTER
 from system.chaos.trial import (
     TIMEOUT_S,
     ChaosError,
@@ -23,15 +19,8 @@ from system.chaos.trial import (
 from system.observer import NetworkObserver
 
 # Messages that each node publishes.
-PUBLISHES = {
-    'bs': BaseStation.SENDS,
-    'rhs_controller': RhsController.SENDS,
-    'channel': Channel.SENDS,
-    'positioner': Positioner.SENDS,
-    'transmission': Transmission.SENDS,
-    'optimizer': (),
-    'user_1': User.SENDS,
-}
+PUBLISHES = {name if member.is_unique else f'{name}_1': member.role.SENDS if member.role else ()
+             for name, member in ROSTER.items()}
 NODES = tuple(PUBLISHES)
 PHASES = tuple(m.Phase)
 # A killed node is restarted after this time [s]. Until then, the other nodes must report that it
@@ -58,7 +47,8 @@ class CrashTrial(Trial):
 
 def crash_all(
         observer: NetworkObserver, processes: Processes, nodes: Sequence[str],
-        phases: Iterable[m.Phase], on_trial: Callable[[CrashTrial], None]) -> list[CrashTrial]:
+        phases: Iterable[m.Phase], on_trial: Callable[[CrashTrial], None],
+        repetitions: int = 1) -> list[CrashTrial]:
     """Kill every node in every phase.
 
     Parameters
@@ -69,6 +59,8 @@ def crash_all(
         Names of the nodes to kill.
     on_trial
         Called after each trial.
+    repetitions
+        Number of trials of each node and phase.
 
     Raises
     ------
@@ -77,7 +69,7 @@ def crash_all(
     """
     trials = []
     for node in nodes:
-        for phase in phases:
+        for phase in itertools.chain.from_iterable(itertools.repeat(tuple(phases), repetitions)):
             trials.append(crash(observer, processes, node, phase))
             on_trial(trials[-1])
     return trials

@@ -15,10 +15,10 @@ from visualization_msgs.msg import MarkerArray
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.delivery import DELIVERIES
+from rhs_isac_ros.protocol.newest import NewestDict
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.ros.subscriptions import subscribe
 from system.chaos.mutations import mutate
 from system.chaos.trial import ChaosError, both_served
 from system.observer import NetworkObserver
@@ -27,13 +27,12 @@ from system.observer import NetworkObserver
 _BATCH = 32
 _TIMEOUT_S = 30.0
 _MAX_ORIGINALS = 32
-# Messages of the protocol by topic. Those for single roles come first, so that no node mistakes
-# this one for a publisher without them and subscribes to further topics.
-_PROTOCOL = {topics.delivery(one.kind, one.recipient): one.kind for one in DELIVERIES} | {
-    name: kind for kind, name in topics.NAMES.items()}
+_MAX_PUBLISHED = 100 * _BATCH
+# Messages of the protocol by topic.
+_PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
 # Topics with other messages.
 _OTHERS = {
-    topics.CODEBOOK: (ros.Codebook, qos.LATCHED_WITH_LEASE),
+    topics.CODEBOOK: (ros.Codebook, qos.LATCHED),
     topics.PRESENCE: (ros.Presence, qos.PRESENCES),
     topics.POSITION: (PoseWithCovarianceStamped, qos.EXCHANGE),
     topics.DIAGNOSTICS: (DiagnosticArray, qos.EXCHANGE),
@@ -41,8 +40,7 @@ _OTHERS = {
 }
 # Topics without messages in a correct network with one codebook, a node for each user and no
 # visualizer.
-_UNUSED = {topics.NAMES[m.NoFix], topics.NAMES[m.GroundTruths], topics.MARKERS,
-           *(name for name in _PROTOCOL if name not in topics.NAMES.values())}
+_UNUSED = {topics.NAMES[m.NoFix], topics.NAMES[m.GroundTruths], topics.MARKERS}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +87,8 @@ class _Mutator:
         self.originals: collections.deque[bytes] = collections.deque(maxlen=_MAX_ORIGINALS)
         self._kind = kind
         self._publisher = node.create_publisher(kind, name, profile)
-        self._published: collections.deque[bytes] = collections.deque(maxlen=4 * _BATCH)
+        # The observer receives its own messages late on a busy machine.
+        self._published: NewestDict[bytes, None] = NewestDict(_MAX_PUBLISHED)
         subscribe(node, kind, name, self._receive, profile, raw=True)
 
     def publish(self, rng: np.random.Generator) -> bytes:
@@ -98,7 +97,7 @@ class _Mutator:
         # and falsify the counters, which are read from the diagnostics.
         originals = () if self.name == topics.DIAGNOSTICS else self.originals
         content = mutate(self._kind, originals, rng)
-        self._published.append(content)
+        self._published.put(content, None)
         self._publisher.publish(content)
         return content
 

@@ -1,16 +1,21 @@
 """Intrusion trials: start a second node of a role, and stop it again."""
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
+from rclpy.node import Node
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.roster import UNIQUE
 from system.chaos.crashes import PUBLISHES
 from system.chaos.trial import (
     TIMEOUT_S,
@@ -21,15 +26,17 @@ from system.chaos.trial import (
 )
 from system.observer import NetworkObserver
 
-# A channel of another scenario, a node with the number of user 1, and a second node of each role.
-SCENARIO, USER = 'scenario', 'user'
-INTRUDERS = (
-    'bs', 'rhs_controller', 'channel', 'positioner', 'transmission', 'optimizer', USER, SCENARIO)
+# A channel of another scenario, a node with the number of user 1, and a second base station beside
+# an observer that requests an incompatible quality of service.
+SCENARIO, USER, OBSERVER = 'scenario', 'user', 'observer'
+# The second nodes, also one of each role.
+INTRUDERS = (*UNIQUE, USER, SCENARIO, OBSERVER)
 SECONDS = 4.0
 _PROCESS = 'intruder'
 _USER_NODE = 'user_1'
 # Texts that name a conflict.
-_NAMES_OF_CONFLICTS = ('two nodes', 'another scenario', 'serves instead of', 'stands by for')
+_NAMES_OF_CONFLICTS = (
+    'two nodes', 'another scenario', 'serves instead of', 'stands by for', 'no messages between')
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,9 +86,22 @@ def intrude_all(
     commands = _commands(folder, parameters, scenario, codebook)
     trials = []
     for intruder in intruders:
-        trials.append(_intrude(observer, processes, intruder, commands[intruder], seconds))
+        with _incompatible_observer() if intruder == OBSERVER else contextlib.nullcontext():
+            trials.append(_intrude(observer, processes, intruder, commands[intruder], seconds))
         on_trial(trials[-1])
     return trials
+
+
+@contextlib.contextmanager
+def _incompatible_observer() -> Iterator[None]:
+    """Run a node that requests the latest message of every topic, which most do not offer."""
+    node = Node('incompatible')
+    for kind, name in topics.NAMES.items():
+        subscribe(node, convert.ros_type(kind), name, lambda content: None, qos.LATCHED, raw=True)
+    try:
+        yield
+    finally:
+        node.destroy_node()
 
 
 def _commands(
@@ -100,6 +120,7 @@ def _commands(
     commands[USER] = (
         'user', _USER_NODE, {**parameters, 'user_id': 1, 'seed': 99, 'mobility': 'random_walk',
                              'speed_mps': scenario.max_user_speed_mps})
+    commands[OBSERVER] = commands['bs']
     commands[SCENARIO] = (
         'channel', '', {**parameters, 'scenario_file': folder / 'scenario.yaml'})
     return commands

@@ -5,12 +5,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rhs_isac_ros.monitoring.invariants import InvariantChecker
 from system.chaos.crashes import CrashTrial
 from system.chaos.fuzzing import FuzzResult
 from system.chaos.intruders import IntrusionTrial
 from system.chaos.soaking import SoakResult
 from system.chaos.trial import Trial
+from system.invariants import InvariantChecker
 from system.recovery import finite
 
 CRASH_HEAD = (

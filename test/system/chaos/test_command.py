@@ -57,7 +57,7 @@ def test_mutations_crash_no_node_and_are_counted(small_files, tmp_path):
     figures, output = chaos(small_files, tmp_path, '--fuzz', '1500')
     assert figures['passed'], output
     assert figures['mutations'] == sum(figures['sent'].values()) == 1500
-    assert len(figures['sent']) == 32
+    assert len(figures['sent']) == 23
     # Which mutations are malformed depends on the messages of the running network: about a third,
     # 498 to 535 in several runs. Every node receives some of them.
     assert sum(figures['counted'].values()) > 300

@@ -32,7 +32,7 @@ def test_random_messages_can_be_serialized_and_some_are_malformed(kind):
 
 def test_some_mutations_are_well_formed():
     original = serialize_message(ros.PilotRequest(
-        cycle_id=7, user=1, band=1, n_frames=Scenario().n_frames))
+        cycle_id=7, user=1, band=1, last_band=1, n_frames=Scenario().n_frames))
     rng = np.random.default_rng(1)
     mutations = [mutate(ros.PilotRequest, [original], rng) for _ in range(400)]
     valid = [content for content in mutations if well_formed(m.PilotRequest, content)]

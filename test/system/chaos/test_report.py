@@ -5,12 +5,12 @@ import math
 import pytest
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.monitoring.invariants import InvariantChecker
 from system.chaos import report
 from system.chaos.crashes import CrashTrial
 from system.chaos.fuzzing import FuzzResult
 from system.chaos.intruders import IntrusionTrial
 from system.chaos.soaking import SoakResult
+from system.invariants import InvariantChecker
 
 
 def crash_trial(**fields):

@@ -1,4 +1,4 @@
-"""Entry point of ``python -m system.hosts``."""
+"""Entry point of ``python3 -m system.hosts``."""
 
 import sys
 

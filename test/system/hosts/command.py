@@ -22,8 +22,8 @@ from rhs_isac_ros.model.arguments import (
     positive_float,
 )
 from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.ros.early import discovery_profile_file
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.ros.resources import discovery_profile_file
 from rhs_isac_ros.tools.process_network import (
     add_network_options,
     check_users,

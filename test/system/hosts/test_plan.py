@@ -4,7 +4,7 @@ import ipaddress
 
 import pytest
 
-from rhs_isac_ros.ros.resources import discovery_profile_file
+from rhs_isac_ros.ros.early import discovery_profile_file
 from system.hosts import plan
 
 
@@ -48,7 +48,7 @@ def test_namespaces_of_terminated_processes_are_stale():
 
 
 def test_the_lease_is_read_from_the_profile(tmp_path):
-    assert plan.lease_s(discovery_profile_file()) == 10.0
+    assert plan.lease_s(discovery_profile_file()) == 1.6
     assert plan.lease_s(None) == 20.0
     other = tmp_path / 'other.xml'
     other.write_text('<dds><leaseAnnouncement><sec>1</sec></leaseAnnouncement></dds>')

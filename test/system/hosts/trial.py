@@ -2,8 +2,8 @@
 
 import time
 
-from rhs_isac_ros.monitoring import invariants
 from rhs_isac_ros.ros.processes import Processes
+from system import invariants
 from system.hosts import plan
 from system.hosts.namespaces import Hosts
 from system.hosts.verdict import Outage, evaluate

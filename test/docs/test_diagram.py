@@ -4,9 +4,9 @@ import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 
+import diagram
 import pytest
 
-from rhs_isac_ros.protocol import diagram
 from rhs_isac_ros.protocol.state_machine import ANY, SAME, always
 
 SVG = '{http://www.w3.org/2000/svg}'

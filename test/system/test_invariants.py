@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring.invariants import RECEIVES, InvariantChecker
 from rhs_isac_ros.protocol import messages as m
+from system.invariants import RECEIVES, InvariantChecker
 
 # Belongs to no cycle; its late arrival makes all earlier results due.
 END = m.Grant(cycle_id=0, user=1)

@@ -5,8 +5,8 @@ import pytest
 
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.monitoring.pilot_log import PilotLog
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.tools.calibrate import PilotLog
 
 SCENARIO = Scenario(elements_per_side=3, n_feeds=2, n_subbands=2, n_frames=2)
 

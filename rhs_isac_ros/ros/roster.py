@@ -1,0 +1,101 @@
+"""The roles of a network, each declared once.
+
+Executables, parameters, launch files, permissions, readiness, the fault trials and the topics in
+the documentation derive from `ROSTER`.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from rhs_isac_ros.protocol.base_station import BaseStation
+from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.protocol.positioner import Positioner
+from rhs_isac_ros.protocol.rhs_controller import RhsController
+from rhs_isac_ros.protocol.settings import (
+    BaseStationSettings,
+    PositionerSettings,
+    TransmissionSettings,
+)
+from rhs_isac_ros.protocol.transmission import Transmission
+from rhs_isac_ros.protocol.user import User
+from rhs_isac_ros.ros import topics
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Member:
+    """Declaration of a role.
+
+    Attributes
+    ----------
+    role
+        Class of the role, which lists its messages; None: it has no messages of the protocol.
+    settings
+        Dataclass of the settings that are parameters; None: there are none.
+    requires
+        Roles without which it does not start to serve.
+    is_unique
+        Whether only one node may serve in the role, so that others stand by.
+    has_codebook
+        Whether it follows the codebook of the optimizer.
+    publishes
+        Further topics; ``{user}`` stands for the number of a user.
+    """
+
+    role: Any = None
+    settings: type | None = None
+    requires: tuple[str, ...] = ()
+    is_unique: bool = True
+    has_codebook: bool = False
+    publishes: tuple[str, ...] = ()
+
+    @property
+    def sent(self) -> tuple[str, ...]:
+        """Topics that the nodes of the role publish, those of the protocol first."""
+        return (*(topics.NAMES[kind] for kind in (self.role.SENDS if self.role else ())),
+                *self.publishes, topics.DIAGNOSTICS,
+                *((topics.PRESENCE,) if self.is_unique else ()))
+
+    @property
+    def received(self) -> tuple[str, ...]:
+        """Topics to which the nodes of the role subscribe, those of the protocol first."""
+        return (*(topics.NAMES[kind] for kind in (self.role.RECEIVES if self.role else ())),
+                *((topics.CODEBOOK,) if self.has_codebook else ()),
+                *((topics.PRESENCE,) if self.is_unique else ()))
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Roles whose absence the nodes of the role report."""
+        return (*self.requires, *((topics.OPTIMIZER_NODE,) if self.has_codebook else ()))
+
+
+# In the order in which the nodes of a network start.
+ROSTER: Mapping[str, Member] = {
+    'rhs_controller': Member(role=RhsController, has_codebook=True),
+    'positioner': Member(
+        role=Positioner, settings=PositionerSettings, has_codebook=True,
+        publishes=(topics.POSITION, topics.POSE, topics.ODOMETRY)),
+    'transmission': Member(role=Transmission, settings=TransmissionSettings, has_codebook=True),
+    topics.OPTIMIZER_NODE: Member(publishes=(topics.CODEBOOK,)),
+    'channel': Member(role=Channel, settings=Impairments),
+    'user': Member(role=User, requires=('channel', 'bs'), is_unique=False),
+    'bs': Member(
+        role=BaseStation, settings=BaseStationSettings, has_codebook=True,
+        requires=('rhs_controller', 'channel', 'positioner', 'transmission')),
+}
+# Roles of which a network has one node.
+UNIQUE = tuple(name for name, member in ROSTER.items() if member.is_unique)
+
+
+def identifying_endpoints(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the topics that a present role publishes, and those to which it subscribes.
+
+    These are the first that no other role publishes, and the first to which no other role
+    subscribes. One of each is enough, because a node creates them together.
+    """
+    others = [member for other, member in ROSTER.items() if other != name]
+    sent = {topic for member in others for topic in member.sent}
+    received = {topic for member in others for topic in member.received}
+    return (tuple(topic for topic in ROSTER[name].sent if topic not in sent)[:1],
+            tuple(topic for topic in ROSTER[name].received if topic not in received)[:1])

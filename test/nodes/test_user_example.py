@@ -1,0 +1,62 @@
+"""The example of a user that knows only the documented topics."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+import rhs_isac_msgs.msg as ros
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.roster import ROSTER
+
+EXAMPLE = Path(__file__).parents[2] / 'docs' / 'examples' / 'user_node.py'
+# Topics that a role receives.
+TOPICS = sorted({topic for member in ROSTER.values() for topic in member.received})
+
+
+def test_the_example_is_served_without_repetitions(processes, make_watch):
+    space, watch = '/example', make_watch('/example')
+    running = [processes.start(role, namespace=space) for role in ROSTER if role != 'user']
+    with subprocess.Popen(
+            [sys.executable, str(EXAMPLE), '--ros-args', '-r', f'__ns:={space}']) as user:
+        try:
+            watch.until_served(5, user=7, processes=running)
+            _check_topics(watch.node, space)
+        finally:
+            user.terminate()
+    assert user.returncode == 0
+    assert not watch.given_up
+    for end in watch.served[:5]:
+        # A request is repeated after a quarter of a second.
+        assert len(watch.of_cycle(m.PilotRequest, end.cycle_id)) == 1
+
+
+def _check_topics(node, space):
+    """Check that every topic between roles has publishers and subscribers, all compatible."""
+    for topic in TOPICS:
+        publishers = node.get_publishers_info_by_topic(f'{space}/{topic}')
+        subscribers = node.get_subscriptions_info_by_topic(f'{space}/{topic}')
+        assert {info.node_name for info in publishers} - {node.get_name()}, topic
+        assert {info.node_name for info in subscribers} - {node.get_name()}, topic
+        for publisher in publishers:
+            for subscriber in subscribers:
+                assert qos_check_compatible(publisher.qos_profile, subscriber.qos_profile)[0] != (
+                    QoSCompatibility.ERROR), topic
+    hidden = [name for name, _ in node.get_topic_names_and_types()
+              if any(part.startswith('_') for part in name.split('/'))]
+    assert not hidden
+
+
+def test_one_message_by_hand_is_answered(processes, make_watch):
+    """As ``ros2 topic pub --once`` sends it: when there is a subscriber, and once."""
+    space, watch = '/hand', make_watch('/hand')
+    running = [processes.start('user', namespace=space, user_id=4),
+               processes.start('channel', namespace=space)]
+    beacon = watch.node.create_publisher(ros.Beacon, 'beacon', 10)
+    watch.until(lambda: 'listening for beacons' in running[0].log, 'the user', running)
+    watch.until(lambda: beacon.get_subscription_count() > 1, 'the subscription', running)
+    beacon.publish(ros.Beacon(cycle_id=5, first_user=1, last_user=9))
+    watch.until(lambda: watch.received[m.Ack], 'the answer', running)
+    (ack,) = watch.received[m.Ack]
+    assert (ack.cycle_id, ack.user) == (5, 4)
