@@ -28,7 +28,8 @@ PIP_ONLY = {
 OWN = {
     'rhs_isac_ros', 'parts', 'peers', 'diagram', 'sequence', 'run_notebook', 'pictures',
     'conftest',
-    'headless_browser', 'impairment_checks', 'in_memory_network', 'node_processes', 'system', 'test_installation'}
+    'headless_browser', 'impairment_checks', 'in_memory_network', 'node_processes', 'system',
+    'test_installation'}
 
 
 @functools.cache
