@@ -106,8 +106,6 @@ class MeasurementModel:
 
     Attributes
     ----------
-    scenario, beams, surface
-        The arguments.
     elements
         `surface`, or the distribution that the scenario declares.
     radiation
