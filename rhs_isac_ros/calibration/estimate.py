@@ -21,6 +21,7 @@ from rhs_isac_ros.calibration.mixture import (
 from rhs_isac_ros.model import Beamforming, Scenario
 from rhs_isac_ros.model.gaussian import eliminate
 from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import signal_covariance
 from rhs_isac_ros.model.surface_estimate import (
@@ -37,8 +38,6 @@ DEFAULT_FAILED_SHARE = 0.01
 _MAX_ROUNDS = 30
 # The estimation has converged when no parameter moves by more than this share of its deviation.
 TOLERANCE = 0.02
-# Standard deviation from which a wrapped phase is treated as uniform [rad].
-_UNIFORM_STD_RAD = 2.0
 # Share of the largest variance below which a direction of the covariance is dropped.
 _MIN_VARIANCE = 1e-12
 # Pilots evaluated at a time.
@@ -138,7 +137,7 @@ def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
     phases = nuisance.phases
-    uniform = phases[:, np.abs(phases).max(axis=0, initial=0) > _UNIFORM_STD_RAD]
+    uniform = phases[:, np.abs(phases).max(axis=0, initial=0) > UNIFORM_STD_RAD]
     for part, directions in zip(rms, (nuisance.scaled_patterns.real.mean(axis=2).T, uniform),
                                 strict=True):
         # NumPy 1.26 has no rank of an empty matrix.

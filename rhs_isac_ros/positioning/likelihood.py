@@ -21,6 +21,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import eliminate, marginalise
 from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 
@@ -28,9 +29,7 @@ from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 # regular where the signals carry no information, and is weaker than the prior on any usual region
 # of interest.
 MIN_CURVATURE = (1e-3, 1e-1, 1e-1)
-# Standard deviation from which a wrapped phase is treated as uniform [rad], and that of a Gaussian
-# whose density at its centre is the density of a uniform phase.
-UNIFORM_STD_RAD = 2.0
+# Standard deviation of a Gaussian whose density at its centre is that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # Standard deviation from which the search treats the phases of the bands as uniform. Their joint
 # density then has many peaks along the range, too narrow for Gaussians; the information is added

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     is_inside,
@@ -21,7 +22,7 @@ from rhs_isac_ros.positioning.coordinates import (
     to_positions,
 )
 from rhs_isac_ros.positioning.estimate import Estimate
-from rhs_isac_ros.positioning.likelihood import UNIFORM_STD_RAD, Conditional, Likelihood, Signals
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.search import Modes, first_of_each, marginal_at
 
 # Factor of the spread of samples that are a proposal. Tails of the posterior may be heavier than

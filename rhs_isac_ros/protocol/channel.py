@@ -71,8 +71,8 @@ _MAX_PENDING = 256
 _MAX_REMEMBERED = 8
 
 
-class _Deviations:
-    """Deviations from the model: of the surface, of users and of cycles.
+class _Drawn:
+    """Drawn impairments: of the surface, of users and of cycles.
 
     Each depends on the seed, the user and the cycle alone, so that a failed element remains
     failed, and a gain stays with its user.
@@ -110,12 +110,12 @@ class _Cycle:
     """
 
     def __init__(self, scenario: Scenario, truth: m.GroundTruth, multipath: list[np.ndarray],
-                 deviations: _Deviations) -> None:
+                 drawn: _Drawn) -> None:
         self.truth, self.multipath = truth, multipath
         # Computed here rather than on the first pilot, while other roles prepare the cycle.
         self.los = [los_gain(scenario, truth.position[None], band)[0]
                     for band in range(scenario.n_bands)]
-        self.surface, self.factors = deviations.surface, deviations.factors(truth)
+        self.surface, self.factors = drawn.surface, drawn.factors(truth)
 
 
 class Channel(PlainRole):
@@ -128,9 +128,9 @@ class Channel(PlainRole):
     Parameters
     ----------
     seed
-        Seed of the multipath and of the deviations, see `Fading`.
+        Seed of the multipath and of the impairments, see `Fading`.
     impairments
-        Initial deviations from the model; by default those of the scenario. Others take effect
+        Initial impairments of the signals; by default those of the scenario. Others take effect
         with the next cycle after they are offered.
     """
 
@@ -141,7 +141,7 @@ class Channel(PlainRole):
                  impairments: Impairments | None = None) -> None:
         super().__init__()
         self._scenario, self._seed = scenario, seed
-        self._deviate(impairments or Impairments())
+        self._draw(impairments or Impairments())
         self._cycle: _Cycle | None = None
         self._fading = Fading(scenario, seed)
         # Cycle, user, instance and position of the cycles begun.
@@ -159,7 +159,7 @@ class Channel(PlainRole):
         discarded = 0
         match event:
             case SettingsOffered(Impairments() as impairments):
-                self._deviate(impairments)
+                self._draw(impairments)
                 return []
             case m.GroundTruth() if event.cycle_id:
                 self._begin(event, now_s)
@@ -184,9 +184,9 @@ class Channel(PlainRole):
             return 0
         return self._beams.put(key, beam)
 
-    def _deviate(self, impairments: Impairments) -> None:
+    def _draw(self, impairments: Impairments) -> None:
         self._has_memory = impairments.multipath_memory
-        self._deviations = _Deviations(impairments.applied_to(self._scenario), self._seed)
+        self._drawn = _Drawn(impairments.applied_to(self._scenario), self._seed)
 
     def _begin(self, truth: m.GroundTruth, now_s: float) -> None:
         # A restarted base station may repeat a cycle id, with the user at another position.
@@ -197,7 +197,7 @@ class Channel(PlainRole):
         self._begun.put(key, None)
         multipath = self._fading.gains(
             truth.user, truth.cycle_id, now_s, memory=self._has_memory)
-        self._cycle = _Cycle(self._scenario, truth, multipath, self._deviations)
+        self._cycle = _Cycle(self._scenario, truth, multipath, self._drawn)
         stale = [serial for serial, event in self._pending.items()
                  if event.cycle_id != truth.cycle_id]
         for serial in stale:

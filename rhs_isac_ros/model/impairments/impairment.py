@@ -14,6 +14,9 @@ import numpy as np
 
 from rhs_isac_ros.model.scenario import Scenario
 
+# Standard deviation from which a wrapped phase is treated as uniform [rad].
+UNIFORM_STD_RAD = 2.0
+
 
 class Scope(enum.Enum):
     """How long the value of an impairment lasts."""
