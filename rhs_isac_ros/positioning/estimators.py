@@ -27,7 +27,7 @@ from rhs_isac_ros.positioning.fit import (
     outside_probability,
     outside_test,
 )
-from rhs_isac_ros.positioning.grid import Starts, TemplateTable, standard_normal
+from rhs_isac_ros.positioning.grid import Starts, TemplateTable, first_of_each, standard_normal
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
     Conditional,
@@ -46,11 +46,9 @@ from rhs_isac_ros.positioning.posterior import (
     draw_samples,
 )
 from rhs_isac_ros.positioning.search import (
-    LONG_SEARCH_STEPS,
     Modes,
     ascend,
     find_modes,
-    first_of_each,
 )
 from rhs_isac_ros.positioning.store import load_table
 
@@ -123,7 +121,7 @@ class SearchEstimator(abc.ABC):
         self._test = FitTest(n_measurements)
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
-        self._alignment = Alignment(likelihood, self._grid.filters)
+        self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
         self._failures = (FailedElements(likelihood, self._grid)
                           if surface is None and can_enumerate(scenario) else None)
@@ -216,8 +214,6 @@ class SearchEstimator(abc.ABC):
         aligned = self._alignment.values_of_each(signals.received)
         extra = self._failures.search_margin if self._failures else 0.0
         modes = find_modes(likelihood, self._grid, signals, aligned, extra_margin=extra)
-        if not self._failures and not self._dispersed:
-            modes = self._continued(modes, signals, aligned)
         conditionals: list[Sequence[Conditional]] = [[likelihood]] * len(aligned)
         if self._dispersed:
             starts = Starts(modes.phases, modes.roi_points, modes.values)
@@ -240,22 +236,6 @@ class SearchEstimator(abc.ABC):
             outside = [self._outside.log_evidence_of(*phase, likelihood.nuisance)
                        for phase in zip(whitened, aligned, strict=True)]
         return _Search(modes, samples, whitened, outside)
-
-    def _continued(self, modes: Modes, signals: Signals, aligned: np.ndarray) -> Modes:
-        """Search longer in phases whose signals are not explained.
-
-        Strong signals may need more steps to reach the maximum.
-        """
-        starts = first_of_each(modes.phases)
-        best = np.minimum.reduceat(modes.residual, starts)
-        again = np.flatnonzero([self._test.residual_test(energy) for energy in best.tolist()])
-        if not len(again):
-            return modes
-        longer = find_modes(self._likelihood, self._grid, signals.take(again), aligned[again],
-                            LONG_SEARCH_STEPS)
-        return _joined([
-            longer.of_phase(int(np.searchsorted(again, phase))) if phase in again
-            else modes.of_phase(phase) for phase in range(len(aligned))])
 
     def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None, Doubt | None]]:
         """Yield the position of each phase, or why there is none, its modes and the doubt."""

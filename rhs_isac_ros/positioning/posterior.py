@@ -23,7 +23,8 @@ from rhs_isac_ros.positioning.coordinates import (
 )
 from rhs_isac_ros.positioning.estimate import Estimate
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
-from rhs_isac_ros.positioning.search import Modes, first_of_each, marginal_at
+from rhs_isac_ros.positioning.grid import first_of_each
+from rhs_isac_ros.positioning.search import Modes, marginal_at
 
 # Factor of the spread of samples that are a proposal. Tails of the posterior may be heavier than
 # Gaussian.
