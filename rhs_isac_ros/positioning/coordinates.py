@@ -29,7 +29,7 @@ _AMPLITUDE_ERROR = 0.05
 # Radii of an ellipsoid around a mode that contains no other, in the same units.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
-# Steps and radii in range if the phases of the bands carry no information about it, in range cells.
+# Steps and radii in range cells if the phases of the bands carry no information about the range.
 _COARSE_CELLS = 1.5
 # Direction cosines per radian of apertures below a few wavelengths: the gains of elements and of
 # the user also change with the direction.

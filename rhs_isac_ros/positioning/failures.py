@@ -31,8 +31,8 @@ from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
-    Means,
     Local,
+    Means,
     NuisancePrior,
     Signals,
     assemble,

@@ -10,7 +10,7 @@ steps that resolve the carriers, along which one output per band rotates.
 All lengths of the grid follow from the scenario; see `Resolution`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np

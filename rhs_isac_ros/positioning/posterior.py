@@ -22,8 +22,8 @@ from rhs_isac_ros.positioning.coordinates import (
     to_positions,
 )
 from rhs_isac_ros.positioning.estimate import Estimate
-from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.grid import first_of_each
+from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.search import Modes, marginal_at
 
 # Factor of the spread of samples that are a proposal. Tails of the posterior may be heavier than
@@ -40,24 +40,6 @@ _N_COMMON = 8
 _MAX_STD_RAD = 3.0
 
 
-class Doubt(NamedTuple):
-    """The possibility that the user is outside of the region of interest.
-
-    Attributes
-    ----------
-    probability
-        Probability that the user is outside.
-    whitened
-        Whitened signals without the offsets of carrier and timing, complex128 [N_B, N_SB F].
-    scale
-        Factor of the signals, from the gain, that is most probable outside.
-    """
-
-    probability: float
-    whitened: np.ndarray
-    scale: float
-
-
 class Posterior(NamedTuple):
     """The posterior of one positioning phase, for a uniform prior on the region of interest.
 
@@ -69,15 +51,11 @@ class Posterior(NamedTuple):
         Its modes; None without a position.
     signals
         Signals of the phase, N = 1.
-    doubt
-        The possibility that the user is outside of the region, which the covariance includes;
-        None if it is negligible, or without a position.
     """
 
     estimate: Estimate
     modes: Modes | None
     signals: Signals
-    doubt: Doubt | None
 
 
 class Samples(NamedTuple):

@@ -124,21 +124,18 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     margin
         Modes that are less likely than the best of a phase by more are dropped.
     """
-    rows = starts.phases
-    modes, gain = _step(conditional, likelihood, starts, signals.take(rows), state)
-    for number in range(n_steps - 1):
+    modes, gain = _step(conditional, likelihood, starts, signals.take(starts.phases), state)
+    for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = modes.select(chosen), gain[chosen]
         # At the border of the region, small gains may alternate without end.
         (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
-        if not len(moving):
+        if not len(moving) or number == n_steps - 1:
             break
         again = Starts(modes.phases[moving], modes.roi_points[moving], modes.values[moving])
         moved, gain[moving] = _step(
             conditional, likelihood, again, signals.take(again.phases), state)
         modes.replace(moving, moved)
-    chosen = _prune(likelihood, modes, gain, margin)
-    modes, gain = modes.select(chosen), gain[chosen]
     (moving,) = np.nonzero(gain > _MIN_GAIN)
     if len(moving):
         # A step that has not converged may predict any likelihood.

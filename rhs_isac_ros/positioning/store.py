@@ -63,7 +63,6 @@ def _tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
 def table_key(model: MeasurementModel, codebook_id: str) -> str:
     """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
     parts = (dataclasses.astuple(model.scenario), codebook_id, __version__, _FORMAT,
-             outside.RANGE_RATIO, outside.DIRECTION_STEP,
              *([model.surface.id] if model.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
