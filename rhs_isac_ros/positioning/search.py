@@ -154,7 +154,7 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     Takes approximate parameters, [M, Q], from which Newton steps start.
     """
     values = likelihood.settle(points, values, signals)
-    for _ in range(2):
+    for _ in range(2 if values.shape[1] else 1):
         local = conditional.local(points, values, signals)
         marginal = marginalise(local.information, local.gradient)
         values = values + marginal.offset
