@@ -41,11 +41,8 @@ from rhs_isac_ros.positioning.posterior import (
     Posterior,
     Samples,
     WeightedSamples,
-    are_broad,
     draw_broad_samples,
-    draw_enough_samples,
     draw_samples,
-    joined,
 )
 from rhs_isac_ros.positioning.search import (
     Modes,
@@ -217,31 +214,19 @@ class SearchEstimator(abc.ABC):
                        for phase in range(len(aligned))]
             modes = _joined([one for one, _ in refined])
             conditionals = [sets for _, sets in refined]
-        samples = self._samples(modes, signals, conditionals)
+        if likelihood.nuisance.is_coarse:
+            samples = Samples(*(np.concatenate(fields) for fields in zip(*(
+                draw_broad_samples(likelihood, conditionals[phase], self._phases,
+                                   signals.repeated(phase), modes.of_phase(phase), self._normal)
+                for phase in range(len(aligned))), strict=True)))
+        else:
+            samples = draw_samples(modes, self._normal, self._bounds)
         whitened = likelihood.whitened(aligned, signals)
         outside: list[float] = []
         if self._rejects_outside:
             outside = [self._outside.log_evidence_of(*phase, likelihood.nuisance)
                        for phase in zip(whitened, aligned, strict=True)]
         return _Search(modes, samples, whitened, outside)
-
-    def _samples(self, modes: Modes, signals: Signals,
-                 conditionals: Sequence[Sequence[Conditional]]) -> Samples:
-        """Represent the modes of N phases by samples."""
-        likelihood, draw = self._likelihood, draw_broad_samples
-        broad = np.full(len(conditionals), likelihood.nuisance.is_coarse)
-        # With errors of the elements, the likelihood of a sample takes too long.
-        if not (likelihood.nuisance.is_coarse or self._failures or self._dispersed):
-            draw, broad = draw_enough_samples, are_broad(modes, likelihood.resolution)
-        if not broad.any():
-            return draw_samples(modes, self._normal, self._bounds)
-        parts = []
-        for phase, of_phase in enumerate(conditionals):
-            own = modes.of_phase(phase)
-            parts.append(draw(likelihood, of_phase, self._phases, signals.repeated(phase), own,
-                              self._normal)
-                         if broad[phase] else draw_samples(own, self._normal, self._bounds))
-        return joined(parts)
 
     def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None]]:
         """Yield the position of each phase, or why there is none, and its modes."""

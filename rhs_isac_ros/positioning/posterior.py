@@ -1,10 +1,10 @@
 """The posterior of a position: weighted samples of its modes, in the region of interest.
 
-A mode is a Gaussian, whose samples have equal weights inside the region, unless it is broad: the
-likelihood is not quadratic over a mode that extends over a considerable part of a beam, because
-signals are weak, or over metres of range, because the phases of the bands are unknown. The samples
-then serve as a proposal: each has the weight of the posterior relative to the mixture of all
-Gaussians, so that modes may overlap.
+A mode is a Gaussian, whose samples have equal weights inside the region, unless the phases of the
+bands are unknown. Then only delays, amplitudes and the curvature of the wavefront reveal the
+range, and a mode extends over metres, over which the likelihood is not quadratic and the volume
+element changes. The samples then serve as a proposal: each has the weight of the posterior
+relative to the mixture of all Gaussians, so that modes may overlap.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,6 @@ import numpy as np
 
 from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
 from rhs_isac_ros.positioning.coordinates import (
-    Resolution,
     carrier_wavenumbers,
     is_inside,
     jacobian,
@@ -30,15 +29,6 @@ from rhs_isac_ros.positioning.search import Modes, marginal_at
 # Factor of the spread of samples that are a proposal. Tails of the posterior may be heavier than
 # Gaussian.
 _SPREAD = 1.3
-# Standard deviations from which a mode is broad, as phases along the range and at the edge of the
-# aperture [rad], and share of the posterior in broad modes from which samples are weighted.
-_BROAD_RAD = 0.3
-_BROAD_SHARE = 0.1
-# Number of samples of all modes of a phase, and effective number below which there are more. The
-# errors of more modes than this average out.
-_N_SAMPLES = 1024
-_MIN_EFFECTIVE = 64
-_MAX_BROAD_MODES = 64
 # Samples whose log-weight is lower than the best by more have no effect, whatever their phases.
 _LIKELY_MARGIN = 20.0
 # Phases of bands: spacing of the ranges over which their density is averaged, in standard
@@ -176,49 +166,6 @@ class WeightedSamples(NamedTuple):
         offsets = self.positions - np.repeat(mean, counts, axis=0)[:, None]
         weighted = np.swapaxes(offsets * self.weights[..., None], 1, 2)
         return mean, self.sums(np.matmul(weighted, offsets))
-
-
-def are_broad(modes: Modes, resolution: Resolution) -> np.ndarray:
-    """Return for which phases few modes are too broad for Gaussians, bool [N]."""
-    starts = first_of_each(modes.phases)
-    variance = np.diagonal(np.linalg.inv(modes.curvature), axis1=1, axis2=2)
-    scale = np.array([resolution.wavelength_m / (2 * np.pi), *resolution.direction])
-    broad = (variance > (_BROAD_RAD * scale)**2).any(axis=1)
-    mass = modes.roi_log_likelihood - np.linalg.slogdet(modes.curvature)[1] / 2
-    counts = np.diff(starts, append=len(modes.phases))
-    weights = np.exp(mass - np.repeat(np.maximum.reduceat(mass, starts), counts))
-    share = np.add.reduceat(weights * broad, starts) / np.add.reduceat(weights, starts)
-    result: np.ndarray = (share > _BROAD_SHARE) & (counts <= _MAX_BROAD_MODES)
-    return result
-
-
-def draw_enough_samples(
-        likelihood: Likelihood, conditionals: Sequence[Conditional], phases: 'BandPhases',
-        signals: Signals, modes: Modes, normal: np.ndarray) -> Samples:
-    """Weight samples of the modes of one phase, more if few of them have most of the weight."""
-    n = len(modes.phases)
-    n_each = 1 << (_N_SAMPLES // n).bit_length() - 1
-    while True:
-        n_each = min(n_each, len(normal))
-        samples = draw_broad_samples(
-            likelihood, conditionals, phases, signals, modes, normal[:n_each])
-        weights = np.exp(samples.log_weights - samples.log_weights.max())
-        if n_each == len(normal) or weights.sum()**2 >= _MIN_EFFECTIVE * np.sum(weights**2):
-            return samples
-        n_each *= 4
-
-
-def joined(parts: Sequence[Samples]) -> Samples:
-    """Join samples of successive phases, which may have different numbers for each mode."""
-    n = max(part.log_weights.shape[1] for part in parts)
-    filled = []
-    for part in parts:
-        missing = n - part.log_weights.shape[1]
-        weights = part.log_weights + np.log(n / part.log_weights.shape[1])
-        filled.append(Samples(
-            np.pad(part.positions, ((0, 0), (0, missing), (0, 0))),
-            np.pad(weights, ((0, 0), (0, missing)), constant_values=-np.inf), part.spread))
-    return Samples(*(np.concatenate(fields) for fields in zip(*filled, strict=True)))
 
 
 def draw_broad_samples(
