@@ -14,6 +14,8 @@ _LAGS_PER_WAVELENGTH = 64
 NEAR, WIDE = (0.03, 0.3), (0.03, 0.6)
 # Fraction of the pairs that differ in direction only.
 _ZERO_LAG_FRACTION = 0.3
+# Lags in radians, and squared displacements in beam widths, that are zero but for rounding.
+_ROUNDING = 1e-7
 # Number of attempts to draw a position inside the region.
 _MAX_DRAWS = 200
 
@@ -77,17 +79,18 @@ def confusable_volumes(
     true position occupies: with signals whose amplitude is inversely proportional to the range
     r, it grows as r^5.
     """
-    ranges, other_ranges = (
-        np.maximum(np.linalg.norm(points, axis=1), 1e-3) for points in (positions, others))
-    lags, density = _lag_density(scenario)
-    lag = np.abs(other_ranges - ranges)
     # Lags of zero stand for those below the phase of a radian.
     shortest = SPEED_OF_LIGHT_MPS / (2 * np.pi * max(scenario.center_frequencies_hz))
-    by_lag = np.where(lag < 1e-9, _ZERO_LAG_FRACTION / shortest,
+    ranges, other_ranges = (
+        np.maximum(np.linalg.norm(points, axis=1), shortest) for points in (positions, others))
+    lags, density = _lag_density(scenario)
+    lag = np.abs(other_ranges - ranges)
+    by_lag = np.where(lag < _ROUNDING * shortest, _ZERO_LAG_FRACTION / shortest,
                       (1 - _ZERO_LAG_FRACTION) * np.interp(lag, lags, density))
     cosine = np.sum(positions * others, axis=1) / (ranges * other_ranges)
     # The squared displacement in beam widths; its density is an average of Gaussians.
-    square = np.maximum(1 / np.clip(cosine, 0.01, 1)**2 - 1, 1e-8) / _beam_width(scenario)**2
+    square = np.maximum(
+        (1 / np.clip(cosine, 0.01, 1)**2 - 1) / _beam_width(scenario)**2, _ROUNDING)
     narrow, wide = (np.exp(-square / (2 * scale**2)) for scale in scales)
     by_direction = (wide - narrow) / (2 * np.pi * square * np.log(scales[1] / scales[0]))
     volumes: np.ndarray = other_ranges**2 / (

@@ -479,6 +479,15 @@ def test_empty_positions_are_an_error(scenario):
         optimize(scenario, np.zeros((0, 3)), max_steps=1)
 
 
+def test_bounds_below_a_millimetre_are_minimised_as_well(scenario):
+    """With weak multipath, objectives are of the order of 1e-6 m^2."""
+    clear = dataclasses.replace(scenario, multipath_to_los_db=-60.0)
+    result = optimize(clear, n_positions=64, max_steps=STEPS)
+    assert len(result.history) == STEPS + 1
+    assert result.history[0].value_m2 < 1e-4
+    assert result.history[-1].value_m2 < 0.5 * result.history[0].value_m2
+
+
 def test_empty_positions_are_an_error_for_ambiguity(scenario):
     with pytest.raises(ValueError, match='^positions: .*, expected '):
         optimize(scenario, np.zeros((0, 3)), objective='ambiguity', max_steps=1)
