@@ -29,7 +29,7 @@ from rhs_isac_ros.model.impairments.elements import (
     error_terms,
 )
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
-from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
+from rhs_isac_ros.model.multipath import measurement_correlation, spatial_covariance
 from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import one_blas_thread
@@ -292,7 +292,7 @@ def quadratic_gradients(
     scenario = model.scenario
     through_covariance = np.matmul(
         np.conj(measurement_correlation(scenario)) * covariance_terms,
-        np.matmul(model.radiation, multipath_covariance(scenario)))
+        spatial_covariance(scenario).scatter(model.radiation))
     by_radiation = 4 * (through_covariance - mean_terms) / n_items
     terms: list[tuple[np.ndarray | float, np.ndarray | float, np.ndarray]]
     if surface:

@@ -6,6 +6,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
@@ -13,6 +14,8 @@ from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 _BLOCK = 256
 # A normalised matrix with a smaller pivot is singular up to rounding.
 _MIN_PIVOT = 1e-14
+# A region thinner than this, in wavelengths, determines the coordinate.
+_NO_EXTENT = 1e-5
 
 
 @one_blas_thread
@@ -76,7 +79,8 @@ def region_information(scenario: Scenario) -> np.ndarray:
 
     The uniform distribution is replaced by a Gaussian of the same covariance, size^2 / 12.
     """
-    return np.diag(12 / np.array(scenario.roi_size_m)**2)
+    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+    return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:

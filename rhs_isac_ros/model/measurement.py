@@ -24,7 +24,7 @@ from rhs_isac_ros.model.los import (
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     measurement_correlation,
-    multipath_covariance,
+    spatial_covariance,
     square_root,
 )
 from rhs_isac_ros.model.receive import received_signal
@@ -59,8 +59,8 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
 
 def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
     """Compute the covariance of the multipath in the received signals, as `signal_covariance`."""
-    spatial = multipath_covariance(scenario)
-    scattered = np.matmul(np.matmul(radiation, spatial), np.conj(np.swapaxes(radiation, 1, 2)))
+    scattered = np.matmul(spatial_covariance(scenario).scatter(radiation),
+                          np.conj(np.swapaxes(radiation, 1, 2)))
     correlated: np.ndarray = measurement_correlation(scenario) * scattered
     return correlated
 

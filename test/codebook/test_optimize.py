@@ -500,6 +500,15 @@ def test_a_tiny_region_is_accepted(scenario, objective):
     result.codebook.check(tiny)
 
 
+@pytest.mark.parametrize('objective', OBJECTIVES)
+def test_a_flat_region_and_a_rectangular_surface_are_accepted(scenario, objective):
+    flat = dataclasses.replace(scenario, roi_size_m=(*scenario.roi_size_m[:2], 0.0),
+                               elements_per_side=(6, 3))
+    result = optimize(flat, n_positions=16, objective=objective, max_steps=5)
+    result.codebook.check(flat)
+    assert result.history[-1].value_m2 < result.history[0].value_m2
+
+
 def test_a_negative_seed_is_an_error(scenario):
     with pytest.raises(ValueError, match='^seed: -1, expected at least 0$'):
         optimize(scenario, seed=-1)
