@@ -6,12 +6,11 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.measurement import position_blocks
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
-# Positions evaluated at a time.
-_BLOCK = 256
 # A normalised matrix with a smaller pivot is singular up to rounding.
 _MIN_PIVOT = 1e-14
 # A region thinner than this, in wavelengths, determines the coordinate.
@@ -150,8 +149,7 @@ def _information(
     information = np.zeros((len(positions), *[3 + len(patterns)] * 2))
     whiteners = model.whitener
 
-    def fill(start: int) -> None:
-        block = slice(start, start + _BLOCK)
+    def fill(block: slice) -> None:
         if len(patterns):
             directions = patterns * model.mean(positions[block])[:, None]
         for band, whitener in enumerate(whiteners):
@@ -160,7 +158,7 @@ def _information(
                 rows = np.concatenate([rows, directions[:, :, band]], axis=1)
             information[block] += quadratic_form(rows @ whitener.T)
 
-    map_blocks(fill, range(0, len(positions), _BLOCK))
+    map_blocks(fill, position_blocks(model.scenario, len(positions)))
     return information
 
 

@@ -69,7 +69,7 @@ def test_a_model_serves_all_positions(case, monkeypatch):
 
 
 def test_bound_does_not_depend_on_the_blocks(case, monkeypatch):
-    monkeypatch.setattr(fisher, '_BLOCK', 4)
+    monkeypatch.setattr(measurement, '_BLOCK', 4)
     bound = crlb(case.scenario, case.codebook, case.vectors['positions'])
     np.testing.assert_allclose(bound, case.vectors['crlb'], rtol=1e-8)
 
