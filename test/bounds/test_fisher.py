@@ -13,7 +13,7 @@ from rhs_isac_ros.bounds import (
     fisher_information_of,
 )
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario, measurement
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.multipath import multipath_covariance
 
