@@ -159,7 +159,8 @@ class Evaluation:
         rows = self._rows.in_block(block, band)
         n_groups, n, n_rows, rank = rows.shape
         # Accumulate the conjugate, so that the coefficients need not be copied.
-        grouped = np.conj(weighted).reshape(n, n_rows, n_groups, -1)
+        grouped = np.conj(weighted, dtype=rows.dtype, casting='same_kind').reshape(
+            n, n_rows, n_groups, -1)
         for (part, _), weights in zip(self._patterns, self._weights[band], strict=True):
             chosen = rows[:, :, part].reshape(n_groups, -1, rank)
             weights += np.matmul(
@@ -188,13 +189,15 @@ def rows_within(
         patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick) -> MeasurementRows:
     """Return rows with a relative error, see `CompressedRows`; exact ones for an error of 0.
 
-    Few rows that would need a large basis are exact as well. `tick` is called repeatedly.
+    Few rows that would need a large basis are exact up to single precision. `tick` is called
+    repeatedly.
     """
-    few = tolerance == 0 or (n_items * n_rows <= _SKETCHED_ROWS and any(
-        _rank_of_some(scenario, source, n_items, n_rows, tolerance, band) > _MAX_RANK
-        for band in range(scenario.n_bands)))
-    if few:
+    if tolerance == 0:
         return ExactRows(scenario, source, n_items, n_rows, patterns, tick)
+    if n_items * n_rows <= _SKETCHED_ROWS and any(
+            _rank_of_some(scenario, source, n_items, n_rows, tolerance, band) > _MAX_RANK
+            for band in range(scenario.n_bands)):
+        return ExactRows(scenario, source, n_items, n_rows, patterns, tick, np.complex64)
     return CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns, tick)
 
 
@@ -202,7 +205,7 @@ def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: i
                   tolerance: float, band: int) -> int:
     """Rank of some rows and columns, slightly more than `_MAX_RANK`, to a tolerance."""
     size, width = 2 * _MAX_RANK, scenario.n_subbands * scenario.n_elements
-    if min(2 * n_items * n_rows, width) <= 2 * size:
+    if n_items * n_rows <= size or width <= 3 * size:
         return 0
     columns = streams.generator(0, streams.SKETCH, size).permutation(width)[:size]
     parts = []
@@ -222,16 +225,17 @@ class ExactRows(MeasurementRows):
 
     def __init__(
             self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-            patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick) -> None:
+            patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick,
+            kind: type[np.complexfloating] = np.complex128) -> None:
         super().__init__(scenario, n_items, n_rows, patterns, n_groups=scenario.n_subbands)
-        self._source, self._tick = source, tick
-        size = 16 * n_items * n_rows * scenario.n_bands * self.width
+        self._source, self._tick, self._kind = source, tick, kind
+        size = np.dtype(kind).itemsize * n_items * n_rows * scenario.n_bands * self.width
         self._keeps_all = size <= _CACHE_BYTES
         # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
         self._kept: dict[tuple[int, int], np.ndarray] = {}
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
-        """Return the rows of a block, complex128 [N_SB, n, G, N_E]."""
+        """Return the rows of a block, complex [N_SB, n, G, N_E]."""
         key = block.start, band
         if key not in self._kept:
             self._tick()
@@ -239,7 +243,7 @@ class ExactRows(MeasurementRows):
                 self._kept.clear()
             # With sub-bands first, every matrix product reads contiguous memory.
             self._kept[key] = np.ascontiguousarray(
-                np.moveaxis(self._source(block, band), 2, 0))
+                np.moveaxis(self._source(block, band), 2, 0), self._kind)
         return self._kept[key]
 
 
