@@ -173,7 +173,10 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
         start = np.random.default_rng(0).normal(size=spatial.n_elements)
         start = start.astype(float if spatial.is_real else complex)
         operator = LinearOperator((len(start), len(start)), times, dtype=start.dtype)
-        pairs.append(eigsh(operator, _MAX_MODES, v0=start, tol=_MODE_TOLERANCE))
+        powers, directions = eigsh(operator, _MAX_MODES, v0=start, tol=_MODE_TOLERANCE)
+        # Those of complex matrices are in no particular order.
+        order = np.argsort(powers)
+        pairs.append((powers[order], directions[:, order]))
     return np.stack([one for one, _ in pairs]), np.stack([other for _, other in pairs])
 
 
