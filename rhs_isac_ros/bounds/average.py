@@ -12,13 +12,13 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form, region_information
 from rhs_isac_ros.bounds.rows import (
     PLAIN,
-    CompressedRows,
     Evaluation,
-    ExactRows,
-    MeasurementRows,
     Pattern,
     RowSource,
+    Tick,
     blocks,
+    no_tick,
+    rows_within,
 )
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
@@ -29,7 +29,7 @@ from rhs_isac_ros.model.impairments.elements import (
     error_terms,
 )
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
-from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
+from rhs_isac_ros.model.multipath import measurement_correlation, spatial_covariance
 from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import one_blas_thread
@@ -97,6 +97,8 @@ class Average:
         Factors of the rows' means.
     combination
         The form's rows, if they are not those of the source.
+    tick
+        Called repeatedly while the rows are computed; an exception ends the computation.
 
     Attributes
     ----------
@@ -112,13 +114,12 @@ class Average:
     @one_blas_thread
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                  loss: Loss, tolerance: float, patterns: Sequence[Pattern] = PLAIN,
-                 combination: Combination | None = None) -> None:
+                 combination: Combination | None = None, tick: Tick = no_tick) -> None:
         self.scenario, self._loss = scenario, loss
         self._n_rows, self._combination = n_rows, combination
         self.surface: SurfaceEstimate | None = None
-        self.rows: MeasurementRows = (
-            ExactRows(scenario, source, n_items, n_rows, patterns) if tolerance == 0
-            else CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns))
+        self.rows = rows_within(
+            scenario, source, n_items, n_rows, tolerance, patterns, tick)
 
     @one_blas_thread
     def value(self, codebook: Beamforming) -> float:
@@ -155,7 +156,7 @@ class Average:
             yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
 
     def _blocks(self) -> Iterator[slice]:
-        return blocks(self.rows.n_items, self._n_rows)
+        return blocks(self.rows.n_items, self._n_rows, self.rows.width)
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
         exact = self.surface.without_errors() if self.surface else None
@@ -204,7 +205,7 @@ class AverageCrlb(Average):
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
-                 region_prior: bool = False) -> None:
+                 region_prior: bool = False, tick: Tick = no_tick) -> None:
         self.positions = checked_positions(positions)
         if not len(self.positions):
             raise ValueError('positions: none given, expected at least one')
@@ -218,7 +219,7 @@ class AverageCrlb(Average):
         super().__init__(
             scenario, source, len(self.positions), 3 + len(patterns),
             self._marginal_trace if combination else self._trace_of_inverse,
-            tolerance, patterns or PLAIN, combination)
+            tolerance, patterns or PLAIN, combination, tick)
 
     def _trace_of_inverse(
             self, block: slice, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -292,7 +293,7 @@ def quadratic_gradients(
     scenario = model.scenario
     through_covariance = np.matmul(
         np.conj(measurement_correlation(scenario)) * covariance_terms,
-        np.matmul(model.radiation, multipath_covariance(scenario)))
+        spatial_covariance(scenario).scatter(model.radiation))
     by_radiation = 4 * (through_covariance - mean_terms) / n_items
     terms: list[tuple[np.ndarray | float, np.ndarray | float, np.ndarray]]
     if surface:
