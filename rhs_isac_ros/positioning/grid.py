@@ -48,10 +48,9 @@ _MAX_PEAKS = 8192
 _SAME_MODE = 2.0
 # Largest distance of points to compare, in radii of the ellipsoid.
 _MAX_REACH = 3.0
-# Errors of a log-likelihood on the grid before and after the step with the slopes, as a share of
-# the template's energy.
-_GRID_ERROR = 0.08
-_STEP_ERROR = 0.02
+# Error of the likelihood that a step with the slopes predicts, relative to the loss that it makes
+# up for.
+_STEP_ERROR = 0.5
 
 
 class Grid(NamedTuple):
@@ -80,7 +79,7 @@ class Grid(NamedTuple):
     @property
     def points(self) -> np.ndarray:
         """Centres of all pairs, (r [m], u, v), float64 [C, 3]."""
-        points = self.nodes[self.node]
+        points: np.ndarray = self.nodes[self.node]
         points[:, 0] = self.ranges_m[self.cell]
         return points
 
@@ -237,6 +236,10 @@ class TemplateTable:
         self._energy, self._energy_slope = arrays['energy'], arrays['energy_slope']
         self._curvature = arrays['curvature'] + np.diag(self._resolution.curvature_floor)
         self._inverse = np.linalg.inv(self._curvature).astype(np.float32)
+        # Largest loss of log-likelihood between the directions of the grid.
+        half = PHASE_ERROR * self._resolution.direction
+        across = np.abs(arrays['curvature'][:, 1:, 1:])
+        self._loss = np.einsum('a,cab,b->c', half, across, half) / 2
         self._bounds = scenario.roi_bounds_m
         self._wavenumbers = subband_wavenumbers(scenario)
         self._cell_turns = self._turns(grid.ranges_m).astype(np.complex64)
@@ -336,14 +339,14 @@ class TemplateTable:
         if steps and not prior.is_coarse:
             step, value = self._step(outputs, signals, peaks, points, values, prior)
             points = points + step
-        energy = template_energy[peaks.cell]
-        value = value - self._loss_outside(peaks.phases, points, peaks.cell, value,
-                                           margin + _STEP_ERROR * energy)
+        error = _STEP_ERROR * self._loss[peaks.cell]
+        value = value - self._loss_outside(
+            peaks.phases, points, peaks.cell, value, margin + error)
         order = np.lexsort((-value, peaks.phases))
         order = order[np.isfinite(value[order])]
         firsts = first_of_each(peaks.phases[order])
-        slack = _STEP_ERROR * np.repeat(
-            energy[order[firsts]], np.diff(firsts, append=len(order)))
+        slack = error[order] + np.repeat(
+            error[order[firsts]], np.diff(firsts, append=len(order)))
         order = order[heaviest(peaks.phases[order], value[order], margin + slack)]
         phases, points, values = peaks.phases[order], points[order], values[order]
         chosen = separate(phases, points, self._resolution.separation(prior.is_coarse),
@@ -360,17 +363,15 @@ class TemplateTable:
         peaks = self._peaks_of(rows, first.ravel(), outputs, energies, prior, template_energy)
         best = np.full(n, -np.inf)
         np.maximum.at(best, peaks.phases, peaks.value)
-        top = np.zeros(n, int)
-        is_best = peaks.value == best[peaks.phases]
-        top[peaks.phases[is_best]] = peaks.cell[is_best]
-        limit = best - margin - _GRID_ERROR * template_energy[top]
+        limit = best - margin
         bound[rows, first.ravel()] = -np.inf
-        rest = np.nonzero(bound >= limit[:, None])
+        rows, others = np.nonzero(bound + self._loss >= limit[:, None])
         parts = [peaks]
-        if len(rest[0]):
-            parts.append(self._peaks_of(*rest, outputs, energies, prior, template_energy))
+        if len(rows):
+            parts.append(self._peaks_of(rows, others, outputs, energies, prior, template_energy))
         peaks = _Peaks(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
-        likely = np.flatnonzero(peaks.value >= limit[peaks.phases])
+        likely = np.flatnonzero(
+            peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
         likely = likely[np.lexsort((-peaks.value[likely], peaks.phases[likely]))]
         phases = peaks.phases[likely]
         place = np.arange(len(likely)) - np.searchsorted(phases, phases)
@@ -382,7 +383,7 @@ class TemplateTable:
 
     def _points(self, peaks: '_Peaks') -> np.ndarray:
         """Points (r [m], u, v) of peaks, float64 [P, 3]."""
-        points = self._grid.nodes[self._grid.node[peaks.cell]]
+        points: np.ndarray = self._grid.nodes[self._grid.node[peaks.cell]]
         points[:, 0] = peaks.range_m
         return points
 
@@ -401,8 +402,9 @@ class TemplateTable:
             amplitude *= 2
             amplitude -= template_energy
             return amplitude
-        return np.stack([self._over_gain(one, energy, prior)[0] for one, energy in zip(
-            amplitude, energies.tolist(), strict=True)]) - template_energy
+        bounds = [self._over_gain(one, energy, prior)[0]
+                  for one, energy in zip(amplitude, energies.tolist(), strict=True)]
+        return np.stack(bounds) - template_energy
 
     def _over_gain(self, amplitude: np.ndarray, energy: float, prior: NuisancePrior
                    ) -> tuple[np.ndarray, np.ndarray]:
@@ -497,7 +499,8 @@ class TemplateTable:
 
     def _cell_ranges(self, cells: np.ndarray) -> np.ndarray:
         """Ranges of the cells of pairs [K], float64 [K] [m]."""
-        return self._grid.ranges_m[self._grid.cell[cells]]
+        ranges_m: np.ndarray = self._grid.ranges_m[self._grid.cell[cells]]
+        return ranges_m
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:

@@ -51,7 +51,7 @@ _MIN_GAIN_STD = 1e-9
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
 # Phase at the edge of the aperture over which points share an expansion [rad].
-_SHARED_RAD = 0.1
+_SHARED_RAD = 0.05
 # Share of the errors of an estimate in the whitened signals from which their position matters.
 _MIN_ERROR_SHARE = 0.05
 

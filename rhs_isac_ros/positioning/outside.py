@@ -171,7 +171,6 @@ class Outside:
         return by_node
 
 
-
 def _log_sum(values: np.ndarray) -> float:
     """Logarithm of the sum of exponentials."""
     highest = float(values.max())

@@ -136,9 +136,9 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         moved, gain[moving] = _step(
             conditional, likelihood, again, signals.take(again.phases), state)
         modes.replace(moving, moved)
-    (moving,) = np.nonzero(gain > _MIN_GAIN)
+    # A step that has not converged may predict any likelihood.
+    (moving,) = np.nonzero((gain > _MIN_GAIN) | (len(likelihood.nuisance) > 0))
     if len(moving):
-        # A step that has not converged may predict any likelihood.
         again = Starts(modes.phases[moving], modes.points[moving], modes.values[moving])
         modes.replace(moving, _step(conditional, likelihood, again, signals.take(again.phases),
                                     state, moves=False)[0])
