@@ -30,7 +30,7 @@ _AMPLITUDE_ERROR = 0.05
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
 # Steps and radii in range cells if the phases of the bands carry no information about the range.
-_COARSE_CELLS = 1.5
+_COARSE_CELLS = 0.75
 # Direction cosines per radian of apertures below a few wavelengths: the gains of elements and of
 # the user also change with the direction.
 _MAX_DIRECTION = 0.4

@@ -70,7 +70,7 @@ class Estimator(Protocol):
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
         sub-band-major; the estimate has a leading dimension N if the signals have one. It may
-        differ from those of single phases by rounding.
+        differ from those of single phases by less than a hundredth of a standard deviation.
         """
         ...
 

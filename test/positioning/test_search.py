@@ -101,7 +101,7 @@ def test_the_modes_of_a_phase_do_not_depend_on_other_phases(setting):
     for phase in (0, 7, 29):
         alone = find_modes(likelihood, grid, signals.take([phase]), np.zeros((1, 0)))
         for found, expected in zip(alone[1:], modes.of_phase(phase)[1:], strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_curvature_is_the_information_in_polar_coordinates(setting):
