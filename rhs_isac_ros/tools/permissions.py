@@ -1,7 +1,6 @@
 """Permissions of the nodes for topics and services, as a policy for SROS2.
 
-``python3 -m rhs_isac_ros.tools.permissions`` prints the policy; ``config/sros2/policy.xml`` is the
-policy for two users.
+``python3 -m rhs_isac_ros.tools.permissions`` prints the policy.
 """
 
 import argparse
