@@ -29,6 +29,7 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
@@ -116,9 +117,6 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
     result = future.result().result
     if not result.successful:
         raise PushError(f'{optimizer}: codebook rejected: {result.reason}')
-
-
-PUSHER_NODE = 'codebook_pusher'
 
 
 class OptimizerNode(ParameterizedNode):
@@ -300,7 +298,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _push(codebook: Codebook, args: Sequence[str]) -> int:
     rclpy.init(args=list(args))
-    node = Node(PUSHER_NODE)
+    node = Node('codebook_pusher', **WITHOUT_SERVICES)
     try:
         push(node, codebook)
     except PushError as error:

@@ -28,7 +28,7 @@ from rhs_isac_ros.monitoring.cycle_log import CycleLog
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import (
     MAX_USER_NODES,
@@ -134,7 +134,7 @@ def _observe(
     # The network needs a moment to start.
     prepare_drawing()
     rclpy.init(args=[])
-    observer = CycleObserver(recorder, log=log)
+    observer = CycleObserver(recorder, log=log, **WITHOUT_SERVICES)
     discovered_s: list[float] = []
     try:
         return watch(observer, processes, cycles, _show_progress,

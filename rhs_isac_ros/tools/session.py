@@ -18,7 +18,7 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from rhs_isac_ros.executables import discard_stdout
 from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
 
 # Changes of the graph do not wake the executor, so the graph is polled with this period [s].
 _POLL_PERIOD_S = 0.02
@@ -36,7 +36,7 @@ class Session:
     def __init__(self) -> None:
         use_discovery_profile()
         rclpy.init(args=[])
-        self.node = Node(f'_rhs_isac_cli_{os.getpid()}', start_parameter_services=False)
+        self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **WITHOUT_SERVICES)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
 

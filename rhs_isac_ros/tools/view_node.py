@@ -20,6 +20,7 @@ from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import steady_timer, subscribe, subscribe_messages
 from rhs_isac_ros.tools.view_posteriors import Posteriors
 
@@ -53,7 +54,7 @@ class ViewNode(Node):
     def __init__(
             self, scenario: Scenario, posteriors: Posteriors,
             write: Callable[[Iterable[Entry]], None]) -> None:
-        super().__init__('view', start_parameter_services=False)
+        super().__init__('view', **WITHOUT_SERVICES)
         self.view, self._scenario_id = NetworkView(scenario), scenario.id
         self.mismatch = ''
         # Names of a destroyed node are not available.
