@@ -35,6 +35,7 @@ from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
 
 
 class GroupParameterService(ParameterService):
@@ -297,17 +298,20 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _push(codebook: Codebook, args: Sequence[str]) -> int:
-    rclpy.init(args=list(args))
-    node = Node('codebook_pusher', **WITHOUT_SERVICES)
+    node = None
     try:
+        rclpy.init(args=prepare(['', *args]))
+        with one_line():
+            node = Node('codebook_pusher', **WITHOUT_SERVICES)
         push(node, codebook)
-    except PushError as error:
+    except (PushError, SecurityError) as error:
         print_error(error, topics.OPTIMIZER_NODE)
         return 1
     except KeyboardInterrupt:
         return 0
     finally:
-        node.destroy_node()
+        if node is not None:
+            node.destroy_node()
         try_shutdown()
     print(f'codebook {codebook.id} is set')
     return 0

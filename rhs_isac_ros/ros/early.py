@@ -14,6 +14,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from rhs_isac_ros.ros.security import one_line, prepare
+
 # Environment variable with the profile file of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 # Options of nodes that need no services, so that access control need not permit any.
@@ -44,10 +46,11 @@ def use_discovery_profile() -> None:
 def join(args: list[str]) -> None:
     """Join the network with a hidden node, for a command line that begins with the program."""
     use_discovery_profile()
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    _holders.append(Node(
-        f'_starting_{os.getpid()}', use_global_arguments=False, enable_rosout=False,
-        **WITHOUT_SERVICES))
+    rclpy.init(args=prepare(args), signal_handler_options=SignalHandlerOptions.NO)
+    with one_line():
+        _holders.append(Node(
+            f'_starting_{os.getpid()}', use_global_arguments=False, enable_rosout=False,
+            **WITHOUT_SERVICES))
 
 
 def leave() -> None:
