@@ -80,7 +80,7 @@ def test_an_error_has_one_line_that_names_the_variable(monkeypatch, capsys, name
             f'WITHOUT security, because ROS_SECURITY_STRATEGY is not Enforce: {error.value}\n')
 
 
-@pytest.mark.parametrize('executable', ['bs', 'visualizer', 'optimizer'])
+@pytest.mark.parametrize('executable', ['bs', 'optimizer'])
 def test_a_program_that_cannot_use_its_keys_ends_with_one_line(keystore, executable):
     program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
     codebook = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
