@@ -78,7 +78,9 @@ def _check_enclave(enclave: str) -> None:
         raise SecurityError(f'{_KEYSTORE}: {keystore!r}, expected a keystore: '
                             'ros2 security generate_artifacts')
     folder = Path(keystore) / 'enclaves' / enclave.lstrip('/')
-    missing = [name for name in _FILES if not (folder / name).is_file()]
+    # A file *.p11 names a key in a device.
+    missing = [name for name in _FILES if not (
+        (folder / name).is_file() or (folder / name).with_suffix('.p11').is_file())]
     if missing:
         raise SecurityError(f'enclave {enclave}: no {missing[0]} in {folder}; generate its keys, '
                             f'or choose another with --ros-args --enclave or {OVERRIDE}')
