@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from rhs_isac_ros.executables import EXECUTABLES
+
 rclpy = pytest.importorskip('rclpy', reason='ROS is not installed')
 ROOT = Path(__file__).parents[1]
 SCRIPTS = ROOT / 'scripts'
@@ -189,8 +191,7 @@ def test_a_script_prints_one_line_and_exits_with_code_2(index, processes):
 
 
 @pytest.mark.parametrize('executable', [
-    'bs', 'channel', 'network', 'optimizer', 'positioner', 'rhs_controller', 'transmission',
-    'user', 'visualizer'])
+    name for name, package in EXECUTABLES.items() if package == 'nodes'])
 def test_the_help_of_a_node_lists_its_parameters(executable, capsys):
     from rhs_isac_ros.ros.parameters import NODES
     main = importlib.import_module(f'rhs_isac_ros.nodes.{executable}').main

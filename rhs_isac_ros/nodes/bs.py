@@ -24,6 +24,7 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import create_or_refuse
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -42,7 +43,9 @@ class BsNode(RoleNode[BaseStation]):
         self._reply = Reply(False, '')
         for name, event in ((topics.PAUSE, PauseRequested()), (topics.RESUME, ResumeRequested()),
                             (topics.STEP, StepRequested())):
-            self.create_service(Trigger, name, functools.partial(self._on_request, event))
+            answer = functools.partial(self._on_request, event)
+            create_or_refuse(self, f'service {name}', functools.partial(
+                self.create_service, Trigger, name, answer))
 
     def stand_by(self) -> None:
         """Abandon the cycle, and wait."""

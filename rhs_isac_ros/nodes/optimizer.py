@@ -29,11 +29,13 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
 from rhs_isac_ros.ros.diagnostics import Diagnostics
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
 
 
 class GroupParameterService(ParameterService):
@@ -116,9 +118,6 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
     result = future.result().result
     if not result.successful:
         raise PushError(f'{optimizer}: codebook rejected: {result.reason}')
-
-
-PUSHER_NODE = 'codebook_pusher'
 
 
 class OptimizerNode(ParameterizedNode):
@@ -299,17 +298,20 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _push(codebook: Codebook, args: Sequence[str]) -> int:
-    rclpy.init(args=list(args))
-    node = Node(PUSHER_NODE)
+    node = None
     try:
+        rclpy.init(args=prepare(['', *args]))
+        with one_line():
+            node = Node('codebook_pusher', **WITHOUT_SERVICES)
         push(node, codebook)
-    except PushError as error:
+    except (PushError, SecurityError) as error:
         print_error(error, topics.OPTIMIZER_NODE)
         return 1
     except KeyboardInterrupt:
         return 0
     finally:
-        node.destroy_node()
+        if node is not None:
+            node.destroy_node()
         try_shutdown()
     print(f'codebook {codebook.id} is set')
     return 0

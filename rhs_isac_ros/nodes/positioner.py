@@ -53,8 +53,9 @@ class PositionerNode(RoleNode[Positioner]):
         self._worker = BackgroundWorker(self)
         self._pose = create_publisher(
             self, PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
-        self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped})
-        self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry})
+        limit = self.values.user_topics
+        self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped}, limit)
+        self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry}, limit)
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:

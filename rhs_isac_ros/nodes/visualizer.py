@@ -37,7 +37,8 @@ class VisualizerNode(Node):
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
         self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, qos.EXCHANGE)
-        self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path})
+        self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path},
+                                 values.user_topics)
         self._transforms = TransformPublisher(self)
         subscribe_messages(self, RECEIVES, self._scenario.sizes, self._on_message,
                            scenario_id=self._scenario.id)

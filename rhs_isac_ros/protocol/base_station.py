@@ -137,14 +137,11 @@ TABLE = (
     Row(event=m.Ack, guard=Steps.too_often, outcome=Outcome.TOO_OFTEN),
     Row(event=m.Ack, guard=Steps.wrong_cycle, actions=(Steps.count_ack,),
         outcome=Outcome.WRONG_CYCLE),
-    # Of several nodes with the same number, the newest is served.
-    Row(event=m.Ack, guard=Steps.superseded, actions=(Steps.count_ack, Steps.log_superseded),
-        outcome=Outcome.SUPERSEDED),
-    Row(event=m.Ack, guard=Steps.supersedes, actions=(Steps.count_ack, Steps.own_number),
-        outcome=Outcome.SUPERSEDED),
+    # Of several nodes with the same number, the first is served.
+    Row(event=m.Ack, guard=Steps.number_taken, actions=(Steps.count_ack, Steps.reject_number),
+        outcome=Outcome.NUMBER_TAKEN),
     Row(event=m.Ack, guard=Steps.duplicate_ack, actions=(Steps.count_ack,),
         outcome=Outcome.DUPLICATE),
-    Row(event=m.Ack, guard=Steps.crowded, actions=(Steps.count_ack,), outcome=Outcome.CROWDED),
     # A late ack: this cycle no longer collects acks; the user is registered for the next one.
     Row(source=NOT_BEACONING, event=m.Ack, actions=(Steps.count_ack, Steps.register_user),
         outcome=Outcome.LATE_ACK),

@@ -169,7 +169,8 @@ class BaseStationSteps(StateMachine[State]):
 
     def _use(self, settings: BaseStationSettings) -> None:
         self._users.set_policy(settings.policy)
-        self._ack_filter = AckFilter(parse_users(settings.allowed_users), settings.ack_rate_hz)
+        self._ack_filter = AckFilter(
+            parse_users(settings.allowed_users), settings.ack_rate_hz, settings.max_users)
         self._timeouts_s = timeouts(settings, self._pausing)
 
     def status(self) -> Mapping[str, str]:
@@ -243,29 +244,20 @@ class BaseStationSteps(StateMachine[State]):
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.DOWNLINK
 
     def not_allowed(self, event: m.Ack, now_s: float) -> bool:
-        """Whether the user is not in the list of allowed users."""
+        """Whether the user is not in the list of allowed users, or its number is too high."""
         return not self._ack_filter.allows(event.user)
 
     def too_often(self, event: m.Ack, now_s: float) -> bool:
         """Whether the user has reached its rate of acks."""
         return not self._ack_filter.within_rate(event.user, now_s)
 
-    def superseded(self, event: m.Ack, now_s: float) -> bool:
-        """Whether a newer instance owns the number of the user."""
-        return self._instances.is_superseded(event.user, event.sender)
-
-    def supersedes(self, event: m.Ack, now_s: float) -> bool:
-        """Whether an older instance of the user acknowledged this cycle before."""
-        return (self.duplicate_ack(event, now_s)
-                and event.sender > self._instances.owner(event.user))
+    def number_taken(self, event: m.Ack, now_s: float) -> bool:
+        """Whether another instance owns the number of the user."""
+        return self._instances.is_taken(event.user, event.sender, now_s)
 
     def duplicate_ack(self, event: m.Ack, now_s: float) -> bool:
         """Whether the user acknowledged this cycle before."""
         return event.user in self._users.answered
-
-    def crowded(self, event: m.Ack, now_s: float) -> bool:
-        """Whether the user is new and the maximum number of users is reached."""
-        return self._users.is_full_for(event.user)
 
     # Guards: progress within a cycle
 
@@ -430,23 +422,19 @@ class BaseStationSteps(StateMachine[State]):
         """Count an ack against the user's rate."""
         self._ack_filter.count(event.user, now_s)
 
-    def accept_ack(self, event: m.Ack, now_s: float) -> None:
+    def accept_ack(self, event: m.Ack, now_s: float) -> list[Action]:
         """Add a user to those that may be granted the cycle."""
         self._users.add_answer(event.user)
-        self.own_number(event, now_s)
+        return [*self._instances.accept(event.user, event.sender, now_s)]
 
-    def own_number(self, event: m.Ack, now_s: float) -> None:
-        """Record the instance that owns the number of the user."""
-        self._instances.accept(event.user, event.sender)
+    def reject_number(self, event: m.Ack, now_s: float) -> None:
+        """Count an ack of an instance that does not own the number of the user."""
+        self._instances.reject(event.user)
 
-    def log_superseded(self, event: m.Ack, now_s: float) -> list[Action]:
-        """Log once that two nodes have the number of a user."""
-        return [*self._instances.reject(event.user, now_s)]
-
-    def register_user(self, event: m.Ack, now_s: float) -> None:
+    def register_user(self, event: m.Ack, now_s: float) -> list[Action]:
         """Register a user, for which the next cycle waits as well."""
         self._users.register(event.user)
-        self.own_number(event, now_s)
+        return [*self._instances.accept(event.user, event.sender, now_s)]
 
     def grant(self, event: m.Ack | Timeout, now_s: float) -> list[Action]:
         """Grant the cycle to one of the users that answered."""

@@ -30,14 +30,13 @@ class Outcome(enum.Enum):
     WRONG_USER = 'wrong_user', Kind.DROPPED
     WRONG_INSTANCE = 'wrong_instance', Kind.DROPPED
     WRONG_SCENARIO = 'wrong_scenario', Kind.DROPPED
-    SUPERSEDED = 'superseded', Kind.DROPPED
+    NUMBER_TAKEN = 'number_taken', Kind.DROPPED
     WRONG_BAND = 'wrong_band', Kind.DROPPED
     WRONG_CODEBOOK = 'wrong_codebook', Kind.DROPPED
     DUPLICATE = 'duplicate', Kind.DROPPED
     LATE_ACK = 'late_ack', Kind.DROPPED
     NOT_ALLOWED = 'not_allowed', Kind.DROPPED
     TOO_OFTEN = 'too_often', Kind.DROPPED
-    CROWDED = 'crowded', Kind.DROPPED
     STALE_BEACON = 'stale_beacon', Kind.DROPPED
     LATE_GRANT = 'late_grant', Kind.DROPPED
     STALE_COMMAND = 'stale_command', Kind.DROPPED

@@ -9,7 +9,7 @@ from typing import Any
 
 from rhs_isac_ros.model import plugins
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
-from rhs_isac_ros.protocol.user_scheduler import POLICIES, parse_users
+from rhs_isac_ros.protocol.user_scheduler import MAX_USERS, POLICIES, parse_users
 
 # Priors of the position.
 REGION, TRACK = PRIORS = ('region', 'track')
@@ -68,6 +68,8 @@ class BaseStationSettings:
         low=1e-6, high=10.0)
     allowed_users: str = setting(
         '', 'Users whose acks are accepted, such as 1, 4, 10-20; empty: all.')
+    max_users: int = setting(
+        MAX_USERS, 'Highest number of a user whose acks are accepted.', low=1, high=MAX_USERS)
     ack_rate_hz: float = setting(
         200.0, 'Maximum rate of acks accepted from each user.', unit='Hz', low=1.0, high=1e6)
 

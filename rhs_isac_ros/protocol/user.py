@@ -174,11 +174,8 @@ class UserSteps(StateMachine[State]):
         return [LogMessage('beacons resumed')]
 
     def log_other_instance(self, event: m.Grant, now_s: float) -> list[Action]:
-        """Log once that a newer node with the same number is served."""
-        if event.user_instance < self._instance:
-            # A cycle that was granted before the base station received an ack of this node.
-            return []
-        text = (f'user {event.user}: two nodes have this number; the newer one, '
+        """Log once that another node with the same number is served."""
+        text = (f'user {event.user}: two nodes have this number; the first one, '
                 f'{started(event.user_instance)}, is served')
         known = event.user in self._conflicts
         self._conflicts[event.user] = text
@@ -262,9 +259,9 @@ TABLE = (
         target=State.LISTENING),
     Row(event=m.Grant, guard=Steps.other_user),
     Row(source=(State.ACKNOWLEDGED,), event=m.Grant, guard=Steps.other_instance_granted,
-        actions=(Steps.log_other_instance,), target=State.LISTENING, outcome=Outcome.SUPERSEDED),
+        actions=(Steps.log_other_instance,), target=State.LISTENING, outcome=Outcome.NUMBER_TAKEN),
     Row(event=m.Grant, guard=Steps.other_instance, actions=(Steps.log_other_instance,),
-        outcome=Outcome.SUPERSEDED),
+        outcome=Outcome.NUMBER_TAKEN),
     Row(event=m.Grant, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
     Row(event=m.Grant, guard=Steps.late_grant, outcome=Outcome.LATE_GRANT),
     # The base station may wait for longer than the user did.

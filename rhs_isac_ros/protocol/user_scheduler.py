@@ -13,7 +13,7 @@ from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import started
 
 POLICIES = ('round_robin', 'first', 'random')
-# Maximum number of registered users, which bounds the memory whatever ids the acks contain.
+# Highest number of a user, which bounds the memory whatever numbers the acks contain.
 MAX_USERS = 4096
 LAST_NUMBER = 2**32 - 1
 # Number of registered users that the first beacon of a cycle invites, and the factor by which
@@ -112,10 +112,6 @@ class UserScheduler:
         # Without a function of the user, because this is done in every cycle.
         return min(zip(self._served.values(), self._served, strict=True))[1]
 
-    def is_full_for(self, user: int) -> bool:
-        """Return whether a user is new while the maximum number of users is registered."""
-        return user not in self._missed and len(self._missed) >= MAX_USERS
-
     def register(self, user: int) -> None:
         """Wait for a user, without counting it among those that answered.
 
@@ -207,10 +203,13 @@ class AckFilter:
         Ids of the users, as returned by `parse_users`; empty: all.
     rate_hz
         Maximum number of acks of each user in a second.
+    max_users
+        Highest number of a user.
     """
 
-    def __init__(self, allowed: tuple[range, ...] = (), rate_hz: float = math.inf) -> None:
-        self._allowed, self._rate_hz = allowed, rate_hz
+    def __init__(self, allowed: tuple[range, ...] = (), rate_hz: float = math.inf,
+                 max_users: int = MAX_USERS) -> None:
+        self._allowed, self._rate_hz, self._max_users = allowed, rate_hz, max_users
         # Acks by user in the current second; they are discarded every second, which bounds the
         # memory.
         self._acks: collections.Counter[int] = collections.Counter()
@@ -218,7 +217,8 @@ class AckFilter:
 
     def allows(self, user: int) -> bool:
         """Return whether acks of a user may be accepted at all."""
-        return not self._allowed or any(user in numbers for numbers in self._allowed)
+        return user <= self._max_users and (
+            not self._allowed or any(user in numbers for numbers in self._allowed))
 
     def within_rate(self, user: int, now_s: float) -> bool:
         """Return whether another ack of a user is within the rate.
@@ -265,8 +265,9 @@ def _parse_range(part: str) -> range:
     return range(first, last + 1)
 
 
-# Acks of older instances in a row after which the newest one no longer owns the number.
-_MAX_MISSED = 3
+# The owner of a number is silent when it has not answered for this time [s], while others with its
+# number have answered as many beacons: a beacon invites all of them or none.
+SILENT_S, _MAX_MISSED = 1.0, 3
 # Time without a rejected ack after which a conflict has ended [s].
 _CONFLICT_S = 5.0
 
@@ -277,24 +278,23 @@ class _Owner:
 
     Attributes
     ----------
+    answered_s
+        Time of its last ack [s].
     rejected
-        Acks of other instances since the last one of this instance.
+        Acks of other instances since then.
     """
 
     instance: int
+    answered_s: float
     rejected: int = 0
 
 
 class UserInstances:
-    """Assigns each user number to one node, the newest of those that acknowledge with it.
-
-    A restarted user owns its number at once. If the newest node falls silent, the number passes to
-    an older one after a few beacons.
-    """
+    """Assigns each user number to one node: the first to answer, until it is silent."""
 
     def __init__(self) -> None:
         self._owners: dict[int, _Owner] = {}
-        # By user: time of the last rejected ack, and a description.
+        # By user: time of the last conflict, and a description.
         self._conflicts: dict[int, tuple[float, str]] = {}
 
     def owner(self, user: int) -> int:
@@ -302,24 +302,33 @@ class UserInstances:
         owner = self._owners.get(user)
         return owner.instance if owner else 0
 
-    def is_superseded(self, user: int, instance: int) -> bool:
-        """Return whether a newer instance owns a number."""
+    def is_taken(self, user: int, instance: int, now_s: float) -> bool:
+        """Return whether another instance owns a number and is not silent."""
         owner = self._owners.get(user)
-        return owner is not None and instance < owner.instance and owner.rejected < _MAX_MISSED
+        return owner is not None and instance != owner.instance and (
+            owner.rejected < _MAX_MISSED or now_s < owner.answered_s + SILENT_S)
 
-    def accept(self, user: int, instance: int) -> None:
-        """Record an ack of the instance that owns a number from now on."""
-        self._owners[user] = _Owner(instance)
+    def accept(self, user: int, instance: int, now_s: float) -> list[LogMessage]:
+        """Record an ack of the owner of a number, or of its next owner.
 
-    def reject(self, user: int, now_s: float) -> list[LogMessage]:
-        """Record an ack of a superseded instance; return a warning about the first."""
-        owner = self._owners[user]
-        owner.rejected += 1
-        text = (f'user {user}: two nodes have this number; the newer one, '
-                f'{started(owner.instance)}, is served')
+        Returns
+        -------
+        list of LogMessage
+            A warning at the first ack after one of another instance was rejected.
+        """
+        owner = self._owners.get(user)
+        self._owners[user] = _Owner(instance, now_s)
+        if owner is None or owner.instance != instance or not owner.rejected:
+            return []
+        text = (f'user {user}: two nodes have this number; the first one, {started(instance)}, '
+                'is served')
         known = user in self._conflicts
         self._conflicts[user] = now_s, text
         return [] if known else [LogMessage(text, warning=True)]
+
+    def reject(self, user: int) -> None:
+        """Count an ack of an instance that does not own the number."""
+        self._owners[user].rejected += 1
 
     def forget(self, users: Iterable[int], now_s: float) -> None:
         """Release the numbers of users that no longer answer, and end old conflicts."""

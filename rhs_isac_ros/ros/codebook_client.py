@@ -18,7 +18,7 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.diagnostics import LogOnce
-from rhs_isac_ros.ros.endpoints import steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import create_or_refuse, steady_timer, subscribe
 from rhs_isac_ros.ros.parameters import CODEBOOK
 
 _NAMES = list(CODEBOOK)
@@ -52,8 +52,9 @@ class CodebookClient:
     ) -> None:
         self._node, self._scenario, self._on_codebook = node, scenario, on_codebook
         # Only one of the parameter services, so that a security policy need not allow the others.
-        self._client = node.create_client(
-            GetParameters, f'{topics.OPTIMIZER_NODE}/get_parameters')
+        name = f'{topics.OPTIMIZER_NODE}/get_parameters'
+        self._client = create_or_refuse(
+            node, f'client of {name}', lambda: node.create_client(GetParameters, name))
         # Serial numbers of announcements. A response is stale if its request was sent before the
         # latest announcement.
         self._announced, self._requested, self._fetched = 0, 0, 0
@@ -104,7 +105,8 @@ class CodebookClient:
             return
         if time.monotonic() - self._announced_s > _RESPONSE_TIMEOUT_S:
             self._use(())
-        elif self._requested != self._announced and self._client.service_is_ready():
+        elif (self._client is not None and self._requested != self._announced
+                and self._client.service_is_ready()):
             self._requested = self._announced
             future = self._client.call_async(GetParameters.Request(names=_NAMES))
             future.add_done_callback(functools.partial(self._on_response, self._announced))

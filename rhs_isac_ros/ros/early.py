@@ -4,7 +4,9 @@ Fast DDS takes a tenth of a second, and a second longer for each message that it
 """
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from ament_index_python.packages import get_package_share_directory
@@ -12,8 +14,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from rhs_isac_ros.ros.security import one_line, prepare
+
 # Environment variable with the profile file of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+# Options of nodes that need no services, so that access control need not permit any.
+WITHOUT_SERVICES: Mapping[str, Any] = {
+    'start_parameter_services': False,
+    'parameter_overrides': [Parameter('start_type_description_service', value=False)]}
 # Keeps the participant of this process until its nodes do.
 _holders: list[Node] = []
 
@@ -38,11 +46,11 @@ def use_discovery_profile() -> None:
 def join(args: list[str]) -> None:
     """Join the network with a hidden node, for a command line that begins with the program."""
     use_discovery_profile()
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    _holders.append(Node(
-        f'_starting_{os.getpid()}', use_global_arguments=False, enable_rosout=False,
-        start_parameter_services=False, parameter_overrides=[
-            Parameter('start_type_description_service', value=False)]))
+    rclpy.init(args=prepare(args), signal_handler_options=SignalHandlerOptions.NO)
+    with one_line():
+        _holders.append(Node(
+            f'_starting_{os.getpid()}', use_global_arguments=False, enable_rosout=False,
+            **WITHOUT_SERVICES))
 
 
 def leave() -> None:

@@ -2,16 +2,20 @@
 
 Those of subscriptions slow down executors. Those of publishers end a node that destroys one while
 an observer with an incompatible quality of service is present (ros2/rclpy#1644).
+
+The middleware may refuse to create an endpoint, as without a permission. The node then runs
+without it, logs the refusal, and reports it in its diagnostics.
 """
 
 import functools
-import time
+import weakref
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -26,11 +30,52 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> T
     return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
+_CreatedT = TypeVar('_CreatedT')
+# By node: descriptions of what was refused, by kind and name.
+_refusals: weakref.WeakKeyDictionary[Node, dict[str, str]] = weakref.WeakKeyDictionary()
+
+
+def refusals(node: Node) -> dict[str, str]:
+    """Return a description of each endpoint that was refused, by kind and name."""
+    return _refusals.get(node, {})
+
+
+def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> _CreatedT | None:
+    """Return what `create` returns; None, with one log line, if the middleware refuses it."""
+    try:
+        return create()
+    except rclpy_implementation.RCLError as error:
+        text = f'{what} was refused: {str(error).splitlines()[0]}'
+        known = _refusals.setdefault(node, {})
+        if what not in known:
+            node.get_logger().error(text)
+        known[what] = text
+        return None
+
+
+class _NoPublisher(Publisher):
+    """Takes the place of a publisher that was refused, and publishes nothing."""
+
+    def __init__(self, topic_name: str) -> None:
+        self._name = topic_name
+
+    @property
+    def topic_name(self) -> str:
+        return self._name
+
+    def publish(self, msg: Any) -> None:
+        return
+
+    def get_subscription_count(self) -> int:
+        return 0
+
+
 def create_publisher(node: Node, kind: type, name: str, profile: QoSProfile) -> Publisher:
-    """Create a publisher of a ROS type on a topic."""
-    return node.create_publisher(
+    """Create a publisher of a ROS type on a topic; one that was refused publishes nothing."""
+    publisher = create_or_refuse(node, f'publisher of {name}', lambda: node.create_publisher(
         kind, name, profile,
-        event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
+        event_callbacks=PublisherEventCallbacks(use_default_callbacks=False)))
+    return publisher or _NoPublisher(node.resolve_topic_name(name))
 
 
 def subscribe(
@@ -47,9 +92,9 @@ def subscribe(
     callback
         Called with each message, or with its serialized bytes (CDR) if `raw`.
     """
-    node.create_subscription(
+    create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
         kind, name, callback, profile, raw=raw,
-        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False)))
 
 
 def subscribe_messages(
@@ -89,56 +134,36 @@ def subscribe_messages(
                   functools.partial(receive, kind), qos.profile_for(kind, exchange), raw=True)
 
 
-# Every topic takes time in discovery, and the ids of the users come from messages.
-MAX_USERS = 64
-# A user without messages for this time [s] gives up its topics if another user needs them.
-_IDLE_S = 60.0
-
-
 class UserTopics:
-    """Publishers for each of the first `MAX_USERS` users.
+    """Publishers for each user, created on first use.
 
     Parameters
     ----------
     kinds
         Types by name of the topic, which contains ``{user}``.
+    max_users
+        Highest number of a user with topics. The numbers come from messages, and every topic takes
+        time in discovery.
     """
 
-    def __init__(self, node: Node, kinds: Mapping[str, type]) -> None:
-        self._node, self._kinds = node, kinds
+    def __init__(self, node: Node, kinds: Mapping[str, type], max_users: int) -> None:
+        self._node, self._kinds, self._max_users = node, kinds, max_users
         self._publishers: dict[int, tuple[Publisher, ...]] = {}
-        # Time of the latest use [s], by user; the user idle for longest comes first.
-        self._used_s: dict[int, float] = {}
 
     def publishers(self, user: int) -> tuple[Publisher, ...]:
-        """Return the publishers for a user, in the order of `kinds`; empty if there are too many.
-
-        They are created on first use.
-        """
-        now_s = time.monotonic()
-        if user not in self._publishers and not self._has_space(now_s):
+        """Return the publishers for a user, in the order of `kinds`; empty above the limit."""
+        if user > self._max_users:
             self._node.get_logger().warning(
-                f'no topics for user {user}: {MAX_USERS} users have topics', once=True)
+                f'no topics for user {user}, because the limit user_topics is {self._max_users}',
+                once=True)
             return ()
         if user not in self._publishers:
             self._publishers[user] = tuple(
                 create_publisher(self._node, kind, name.format(user=user), qos.EXCHANGE)
                 for name, kind in self._kinds.items())
-        self._used_s.pop(user, None)
-        self._used_s[user] = now_s
         return self._publishers[user]
 
     def remove(self, user: int) -> None:
         """Destroy the publishers for a user, if any."""
-        self._used_s.pop(user, None)
         for publisher in self._publishers.pop(user, ()):
             self._node.destroy_publisher(publisher)
-
-    def _has_space(self, now_s: float) -> bool:
-        if len(self._publishers) < MAX_USERS:
-            return True
-        idle, used_s = next(iter(self._used_s.items()))
-        if now_s < used_s + _IDLE_S:
-            return False
-        self.remove(idle)
-        return True

@@ -146,6 +146,10 @@ _SCENARIO = Parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
 _SEED = Parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
 
+_USER_TOPICS = Parameter(
+    'user_topics', 64, 'Highest number of a user that has topics of its own.', low=0,
+    high=MAX_USERS)
+
 # Parameters of roles that are not settings.
 _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
@@ -157,7 +161,7 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'user': (
         _SEED,
         Parameter('user_id', 1, 'Id of the user, or the first of several.', low=1,
-                  high=2**31 - 1),
+                  high=MAX_USERS),
         Parameter('user_count', 1, 'Number of users of the node, with consecutive ids.', low=1,
                   high=MAX_USERS),
         Parameter('mobility', 'static', 'Mobility model.', choices=mobility.KINDS,
@@ -179,6 +183,7 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'positioner': (
         Parameter('table_folder', '',
                   'Directory in which tables are cached; empty: the cache directory of the user.'),
+        _USER_TOPICS,
     ),
     topics.OPTIMIZER_NODE: (
         Parameter('codebook_file', '', 'Codebook file; empty: the default codebook.'),
@@ -190,6 +195,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
        for name, member in sorted(ROSTER.items())},
     'visualizer': (
         _SCENARIO,
+        _USER_TOPICS,
         Parameter('period_s', 0.2, 'Period at which the scene is published.', 's', 0.01, 60.0),
         Parameter('forget_s', 10.0, 'Time without a message after which a user is removed.', 's',
                   0.1, 3600.0),

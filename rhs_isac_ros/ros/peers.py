@@ -15,7 +15,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.presences import Presence, Presences
 from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import create_publisher, refusals, steady_timer, subscribe
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
 # Poll period while a role is missing or nodes are in conflict, and otherwise. A poll takes half a
@@ -96,10 +96,12 @@ class Peers:
         self._set_period(_POLL_S)
 
     def conflicts(self) -> dict[str, str]:
-        """Return a description of each conflict, by key of the diagnostics."""
+        """Return a description of each conflict and refusal, by key of the diagnostics."""
         return self._presences.conflicts() | {
             f'conflict.qos.{topic.lstrip("/")}.{name.lstrip("/")}': text
-            for (topic, name), text in self._incompatible.items()}
+            for (topic, name), text in self._incompatible.items()} | {
+            f'conflict.{what.replace(" ", "_")}': text
+            for what, text in refusals(self._node).items()}
 
     def _poll(self) -> None:
         self._polls += 1

@@ -14,6 +14,7 @@ from typing import Any
 from ament_index_python.packages import get_package_prefix
 
 from rhs_isac_ros.executables import PARENT_ID
+from rhs_isac_ros.ros.security import OVERRIDE
 
 # Maximum number of users with nodes of their own, unless more are requested; more share one node,
 # because every process takes memory and CPU time, also between its cycles.
@@ -106,6 +107,8 @@ class Processes:
             command_prefix: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
         self._logs, self._command_prefix = logs, command_prefix
         self._environment = {**os.environ, **environment, PARENT_ID: str(os.getpid())}
+        # The enclave of this process; each node has its own.
+        self._environment.pop(OVERRIDE, None)
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._commands: dict[str, list[str]] = {}
 

@@ -242,9 +242,13 @@ def read_scenario(path: str | Path) -> Scenario | None:
         for metadata in reader.iter_metadata():
             if metadata.name == _SCENARIO:
                 try:
-                    return Scenario(**yaml.safe_load(metadata.metadata['yaml']))
+                    text = metadata.metadata['yaml']
+                    # With references, a short text may describe an enormous value.
+                    if '&' in text:
+                        raise TypeError('it contains references')
+                    return Scenario(**yaml.safe_load(text))
                 # The file may come from another version or another program.
-                except (KeyError, TypeError, yaml.YAMLError) as error:
+                except (KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
                     raise RecordingError(f'{path}: invalid scenario: {error}') from None
     return None
 

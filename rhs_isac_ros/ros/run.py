@@ -20,6 +20,7 @@ from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.ros import command_line, parameters
 from rhs_isac_ros.ros.early import leave, use_discovery_profile
 from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
 
 # Maximum time between two checks for a signal.
 _POLL_S = 0.1
@@ -55,7 +56,7 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     use_discovery_profile()
     try:
         if not ok():
-            rclpy.init(args=None if args is None else list(args),
+            rclpy.init(args=prepare(sys.argv if args is None else args),
                        signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         print_error(error, program)
@@ -63,7 +64,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
     nodes: Sequence[Node] = ()
     executor = None
     try:
-        nodes = make()
+        with one_line():
+            nodes = make()
         leave()
         for node in nodes:
             parameters.check_overrides(node)
@@ -78,7 +80,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
             executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass
-    except (ParameterError, ParameterException, ScenarioError, CodebookError) as error:
+    except (ParameterError, ParameterException, ScenarioError, CodebookError,
+            SecurityError) as error:
         print_error(error, program)
         return 2
     finally:

@@ -42,6 +42,7 @@ from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import run
@@ -131,7 +132,7 @@ class CalibratorNode(Node):
     """Collects the pilots of a running network."""
 
     def __init__(self, log: PilotLog, scenario: Scenario) -> None:
-        super().__init__('calibrator')
+        super().__init__('calibrator', **WITHOUT_SERVICES)
         self._log = log
         subscribe_messages(self, RECEIVES, scenario.sizes, log.add, scenario_id=scenario.id)
         subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, qos.LATCHED)

@@ -28,7 +28,7 @@ from rhs_isac_ros.monitoring.cycle_log import CycleLog
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
 from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import (
     MAX_USER_NODES,
@@ -36,6 +36,7 @@ from rhs_isac_ros.ros.processes import (
     private_domain,
 )
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
+from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
 from rhs_isac_ros.tools.demo_picture import draw, prepare_drawing
 from rhs_isac_ros.tools.demo_report import summary, table
 from rhs_isac_ros.tools.demo_times import Parts, process_age_s
@@ -83,7 +84,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     os.environ.update(private_domain())
     use_discovery_profile()
-    return _run(scenario, codebook_file, recorder, options, together, _parts())
+    try:
+        return _run(scenario, codebook_file, recorder, options, together, _parts())
+    except SecurityError as error:
+        print_error(error, parser.prog)
+        return 2
 
 
 def _run(
@@ -133,8 +138,9 @@ def _observe(
     """Observe a number of cycles, and return the error that ended them; empty if none did."""
     # The network needs a moment to start.
     prepare_drawing()
-    rclpy.init(args=[])
-    observer = CycleObserver(recorder, log=log)
+    rclpy.init(args=prepare(['demo']))
+    with one_line():
+        observer = CycleObserver(recorder, log=log, **WITHOUT_SERVICES)
     discovered_s: list[float] = []
     try:
         return watch(observer, processes, cycles, _show_progress,

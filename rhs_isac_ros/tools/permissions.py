@@ -1,13 +1,12 @@
 """Permissions of the nodes for topics and services, as a policy for SROS2.
 
-``python3 -m rhs_isac_ros.tools.permissions`` prints the policy; ``config/sros2/policy.xml`` is the
-policy for two users.
+``python3 -m rhs_isac_ros.tools.permissions`` prints the policy.
 """
 
 import argparse
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from rclpy.exceptions import InvalidNamespaceException
@@ -16,8 +15,8 @@ from rclpy.validate_namespace import validate_namespace
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model.arguments import ArgumentParser, integer
 from rhs_isac_ros.monitoring.scene_state import RECEIVES as SCENE_RECEIVES
-from rhs_isac_ros.nodes.optimizer import PUSHER_NODE
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.recording import recorded_topics
 from rhs_isac_ros.ros.roster import ROSTER
 
 # Topics that every rclpy node publishes, and services that it offers.
@@ -62,18 +61,29 @@ def permissions(users: int) -> dict[str, Permissions]:
     Returns
     -------
     dict
-        Permissions by node. ``operator`` stands for the command-line tools, which may read all
-        topics, set parameters and pause cycles.
+        Permissions by node. ``users`` is a node with all users, ``network`` the process of all
+        nodes of `ROSTER`. ``operator`` stands for all tools, which may read every topic, set
+        parameters and pause cycles, except for ``replay``, which may publish every topic.
     """
     nodes = {
         name if member.is_unique else f'{name}_{number}': _of_member(name, users)
         for name, member in sorted(ROSTER.items())
         for number in range(1, 2 if member.is_unique else users + 1)}
+    nodes['users'] = _of_member('user', users)
+    nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
     nodes['visualizer'] = Permissions(
         publish=(*sorted((topics.MARKERS, topics.TF, topics.TF_STATIC,
                           *_of_users(users, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
         subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
-    return {**nodes, 'operator': _operator(nodes, users)}
+    replay = Permissions(publish=(*sorted(recorded_topics()), *_RCLPY_TOPICS), reply=())
+    return {**nodes, 'operator': _operator(nodes, users), 'replay': replay}
+
+
+def _together(nodes: Mapping[str, Permissions]) -> Permissions:
+    """Return the permissions of a process with several nodes."""
+    return Permissions(*(
+        tuple(sorted({name.replace('~', node) for node, allowed in nodes.items()
+                      for name in getattr(allowed, right)})) for right in Permissions._fields))
 
 
 def _of_member(name: str, users: int) -> Permissions:
@@ -95,15 +105,13 @@ def _of_users(users: int, *names: str) -> tuple[str, ...]:
 def _operator(nodes: Iterable[str], users: int) -> Permissions:
     """Return the permissions to subscribe to all topics and to set the parameters of all nodes.
 
-    The node names of the command-line tools are fixed; those of ``ros2`` end in a number.
+    The nodes of ``ros2``, whose names end in a number or a type, offer services.
     """
-    readable = {*topics.NAMES.values(), topics.CODEBOOK, topics.DIAGNOSTICS, topics.MARKERS,
-                topics.POSITION, topics.PRESENCE, topics.TF, topics.TF_STATIC,
+    readable = {*recorded_topics(), topics.MARKERS, topics.TF, topics.TF_STATIC,
                 *_of_users(users, topics.POSE, topics.ODOMETRY, topics.PATH, topics.TRUE_PATH)}
     return Permissions(
         publish=_RCLPY_TOPICS, subscribe=(*sorted(readable), *_RCLPY_TOPICS),
-        reply=(*(service.replace('~', PUSHER_NODE) for service in _OFFERED_SERVICES),
-               '/_ros2cli_*/get_type_description'),
+        reply=tuple(service.replace('~', '/_ros2cli_*') for service in _OFFERED_SERVICES),
         request=(*(f'{node}/{service}' for node in nodes for service in _PARAMETER_SERVICES),
                  *(service.replace('~', 'bs') for service in _CYCLE_SERVICES)))
 

@@ -11,6 +11,7 @@ from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import ArgumentParser, check_distinct, input_file, output_file
 from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.run import run
 
@@ -19,7 +20,7 @@ class RecorderNode(Node):
     """Records the topics of its namespace until it is destroyed."""
 
     def __init__(self, recorder: Recorder) -> None:
-        super().__init__('recorder')
+        super().__init__('recorder', **WITHOUT_SERVICES)
         self._recorder = recorder
         self._topics: set[str] = set()
         recorder.record_topics(self, self._log_topic)

@@ -19,6 +19,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.ros.run import run
@@ -66,7 +67,7 @@ class RepublisherNode(Node):
     def __init__(
             self, messages: Iterable[tuple[str, Any, float]], names: Collection[str],
             rate: float) -> None:
-        super().__init__('replay', start_parameter_services=False)
+        super().__init__('replay', **WITHOUT_SERVICES)
         self.optimizer: OptimizerNode | None = None
         self.count, self.finished, self.waits_for = 0, False, next(iter(names))
         self._messages, self._rate = iter(messages), rate

@@ -1,6 +1,9 @@
 """A view as a recording of Rerun: in a file, or served to browsers. Needs the library rerun."""
 
 import os
+import socket
+import subprocess
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +42,10 @@ _OUTLINE_WIDTH = 1.2
 _BACKGROUND = (16, 18, 22)
 
 
+# Maximum time until the server of the viewer listens, and the period of the attempts [s].
+_START_S, _POLL_S = 20.0, 0.05
+
+
 class RerunStream:
     """Writes the entries of a view.
 
@@ -59,6 +66,7 @@ class RerunStream:
         rerun.set_strict_mode(True)
         self._stream = rerun.new_recording(_APPLICATION)
         self._path: Path | None = None
+        self._server: subprocess.Popen[bytes] | None = None
 
     def save(self, path: Path) -> None:
         """Write to a file, which is ``<name>.part`` until `close`.
@@ -74,15 +82,50 @@ class RerunStream:
         self._rerun.save(self._partial, default_blueprint=blueprint(), recording=self._stream)
         self._begin()
 
-    def serve(self, port: int, open_browser: bool = False) -> str:
-        """Serve the viewer on a port and the data on the next one; return the address."""
-        # Without the layout: serve_web would wait for the thread that sends it, and hold the
-        # global interpreter lock, which that thread needs to free the arrays of the layout.
-        self._rerun.serve_web(
-            open_browser=open_browser, web_port=port, ws_port=port + 1, recording=self._stream)
+    def serve(self, port: int, bind: str) -> str:
+        """Serve the viewer on a port and the data on the next one; return the address.
+
+        The port after these receives the data from this process.
+
+        Parameters
+        ----------
+        bind
+            Address of the network interface; ``0.0.0.0`` stands for all.
+
+        Raises
+        ------
+        OSError
+            If a port is not free, or the address is not one of this machine.
+        RuntimeError
+            If the server does not start.
+        """
+        ports = range(port, port + 3)
+        for number in ports:
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((bind, number))
+        # A process, because a server in this one would listen on all network interfaces. It ends
+        # with this process. `python -m rerun` would run it as a child of its own.
+        program = Path(self._rerun.__file__).parents[1] / 'rerun_cli' / 'rerun'
+        self._server = subprocess.Popen(
+            ['setpriv', '--pdeathsig', 'TERM', program, '--serve-web', '--bind', bind,
+             '--web-viewer-port', str(port), '--ws-server-port', str(port + 1),
+             '--port', str(port + 2)],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            start_new_session=True)
+        host = 'localhost' if bind in ('127.0.0.1', '0.0.0.0') else bind
+        end_s = time.monotonic() + _START_S
+        for number in ports:
+            while not _is_listening(host, number):
+                if self._server.poll() is not None or time.monotonic() > end_s:
+                    raise RuntimeError('the server of Rerun does not start')
+                time.sleep(_POLL_S)
+        self._rerun.connect_tcp(
+            f'{"127.0.0.1" if host == "localhost" else host}:{ports[-1]}',
+            recording=self._stream)
         self._rerun.send_blueprint(blueprint(), recording=self._stream)
         self._begin()
-        return f'http://localhost:{port}/?url=ws://localhost:{port + 1}'
+        return f'http://{host}:{port}/?url=ws://{host}:{port + 1}'
 
     def write(self, entries: Iterable[Entry]) -> None:
         """Write entries of a view."""
@@ -94,15 +137,21 @@ class RerunStream:
 
     def close(self) -> None:
         """Complete the file, or end the service."""
-        self._rerun.disconnect(recording=self._stream)
+        self._disconnect()
         if self._path is not None:
             os.replace(self._partial, self._path)
 
     def discard(self) -> None:
         """Remove the incomplete file, or end the service."""
-        self._rerun.disconnect(recording=self._stream)
+        self._disconnect()
         if self._path is not None:
             self._partial.unlink(missing_ok=True)
+
+    def _disconnect(self) -> None:
+        self._rerun.disconnect(recording=self._stream)
+        if self._server is not None:
+            self._server.terminate()
+            self._server.wait()
 
     @property
     def _partial(self) -> Path:
@@ -112,6 +161,14 @@ class RerunStream:
     def _begin(self) -> None:
         self._rerun.log(network_view.WORLD, self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP,
                         static=True, recording=self._stream)
+
+
+def _is_listening(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
 
 
 def blueprint() -> 'rerun.blueprint.Blueprint':

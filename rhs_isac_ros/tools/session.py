@@ -18,7 +18,8 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from rhs_isac_ros.executables import discard_stdout
 from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
+from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
 
 # Changes of the graph do not wake the executor, so the graph is polled with this period [s].
 _POLL_PERIOD_S = 0.02
@@ -35,8 +36,9 @@ class Session:
 
     def __init__(self) -> None:
         use_discovery_profile()
-        rclpy.init(args=[])
-        self.node = Node(f'_rhs_isac_cli_{os.getpid()}', start_parameter_services=False)
+        rclpy.init(args=prepare(['']))
+        with one_line():
+            self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **WITHOUT_SERVICES)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
 
@@ -136,7 +138,7 @@ def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
             options.verb(session, options)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
-    except ToolError as error:
+    except (ToolError, SecurityError) as error:
         print(error, file=sys.stderr)
         return 1
     except BrokenPipeError:

@@ -21,6 +21,7 @@ from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.outage_log import join_users
 from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.tools.scene_picture import draw
@@ -43,7 +44,7 @@ class SnapshotNode(Node):
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        super().__init__('snapshot', start_parameter_services=False)
+        super().__init__('snapshot', **WITHOUT_SERVICES)
         self.scene = SceneState()
         self.mismatch = ''
         self._began_s: float | None = None

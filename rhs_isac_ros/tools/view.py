@@ -5,6 +5,7 @@ import itertools
 import signal
 import sys
 import time
+import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -109,11 +110,13 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
         stream.save(options.save)
         return
     try:
-        address = stream.serve(options.port, options.open)
-    except RuntimeError as error:
-        raise _PortError(f'ports {options.port} and {options.port + 1}: {error}; '
+        address = stream.serve(options.port, options.bind)
+    except (OSError, RuntimeError) as error:
+        raise _PortError(f'{options.bind}, ports {options.port} to {options.port + 2}: {error}; '
                          'choose others with --port') from None
     print_now(address)
+    if options.open:
+        webbrowser.open(address)
 
 
 def _show_live(
@@ -179,8 +182,11 @@ def _parser() -> argparse.ArgumentParser:
                         help='calibration of the surface, for the modes of the posterior; by '
                         'default that of the scenario')
     server = parser.add_argument_group('browser')
-    server.add_argument('--port', type=integer(1, 65534), default=_PORT, metavar='P',
-                        help=f'port of the viewer; its data use the next one (default: {_PORT})')
+    server.add_argument('--port', type=integer(1, 65533), default=_PORT, metavar='P',
+                        help=f'port of the viewer; its data use the next two (default: {_PORT})')
+    server.add_argument('--bind', default='127.0.0.1', metavar='ADDRESS',
+                        help='address that the viewer listens on; by default only this machine '
+                        'can connect, with 0.0.0.0 any other')
     server.add_argument('--open', action='store_true', help='open the browser')
     recording = parser.add_argument_group('recording')
     recording.add_argument('--namespace', help='namespace of the recorded network (default: /)')

@@ -20,11 +20,14 @@ from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
-from rhs_isac_ros.ros.endpoints import MAX_USERS, steady_timer, subscribe, subscribe_messages
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
+from rhs_isac_ros.ros.endpoints import steady_timer, subscribe, subscribe_messages
 from rhs_isac_ros.tools.view_posteriors import Posteriors
 
 # If no cycle is observed for this time, the reason is logged.
 _SILENCE_S = 5.0
+# Maximum number of users whose tracks are followed, because their numbers come from messages.
+_MAX_TRACKS = 64
 # Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
 _BEAM_PERIOD_S = 0.2
 
@@ -51,7 +54,7 @@ class ViewNode(Node):
     def __init__(
             self, scenario: Scenario, posteriors: Posteriors,
             write: Callable[[Iterable[Entry]], None]) -> None:
-        super().__init__('view', start_parameter_services=False)
+        super().__init__('view', **WITHOUT_SERVICES)
         self.view, self._scenario_id = NetworkView(scenario), scenario.id
         self.mismatch = ''
         # Names of a destroyed node are not available.
@@ -160,7 +163,7 @@ class ViewNode(Node):
 
     def _follow_track(self, user: int) -> None:
         """Subscribe to the track of a user, published if the positioner has ``prior:=track``."""
-        if user in self._users or len(self._users) >= MAX_USERS:
+        if user in self._users or len(self._users) >= _MAX_TRACKS:
             return
         self._users.add(user)
         subscribe(self, Odometry, topics.ODOMETRY.format(user=user),

@@ -17,6 +17,7 @@ from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
 from rhs_isac_ros.ros import diagnostics, qos, topics
 from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.tools.session import print_now
@@ -43,7 +44,7 @@ class WatchNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__('watch', start_parameter_services=False)
+        super().__init__('watch', **WITHOUT_SERVICES)
         self.overview = Overview()
         # Log messages would disturb the view; the nodes themselves count malformed messages.
         subscribe_messages(

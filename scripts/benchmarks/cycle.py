@@ -5,8 +5,10 @@ computations of the nodes in between. How much time does the network add to bare
 is the same number of hops, measured in the same run and with the same executor as ping-pong of a
 bare publisher and subscription: between two processes for a network whose nodes are processes, and
 between two nodes of one process for a network in one process. The messages alone are those that
-need no estimate and no beam, compared with as many hops. The 10th percentile is less sensitive
-than the median to other programs on the machine.
+need no estimate and no beam, compared with as many hops. Ping-pong keeps both processes in the
+caches, and a cycle does not: the same messages between as many bare processes, with the same
+receivers and pauses, show how much of a cycle is not due to the nodes. The 10th percentile is less
+sensitive than the median to other programs on the machine.
 """
 
 import argparse
@@ -19,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from parts.bare_cycle import bare_cycles
 from parts.chain import ChainObserver, Cycle
 from parts.hops import CHAIN, ping_pong
 from rclpy.experimental import EventsExecutor
@@ -76,6 +79,7 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
     try:
         before_s = ping_pong(scenario, composed)
         chains, cpu_s = run_cycles(scenario, users, cycles, composed)
+        bare_s = None if composed else np.median(bare_cycles(REST_S))
         after_s = ping_pong(scenario, composed)
     finally:
         rclpy.try_shutdown()
@@ -95,7 +99,7 @@ def measure(users: int, cycles: int, composed: bool) -> dict:
         'messages_ms': 1e3 * np.median(messages_s),
         'messages_ratio': np.median(messages_s) / (n_messages * hop_s),
         'messages_ratio_p10': np.percentile(messages_s, 10) / (n_messages * quick_hop_s),
-        'cpu_ms': 1e3 * cpu_s,
+        'bare_ms': bare_s and 1e3 * bare_s, 'cpu_ms': 1e3 * cpu_s,
         'cycle_p10_ms': 1e3 * quick_s, 'hop_p10_us': 1e6 * quick_hop_s,
         'ratio_p10': quick_s / (n_hops * quick_hop_s),
         'phases_ms': {phase.name.lower(): value for phase, value in zip(
@@ -164,6 +168,9 @@ def report(figures: dict, layout: str) -> None:
           'estimate and beam')
     print(f'ratio     {figures["messages_ratio"]:7.2f}     of the medians; of the 10th '
           f'percentiles {figures["messages_ratio_p10"]:.2f}')
+    if figures['bare_ms']:
+        print(f'bare      {figures["bare_ms"]:7.2f} ms  all messages of the cycle between bare '
+              'processes, with the same receivers and pauses')
     print(f'CPU time  {figures["cpu_ms"]:7.2f} ms  of all nodes, for each cycle and its pause')
     for phase, value in figures['phases_ms'].items():
         print(f'  {phase:12s}{value:7.2f} ms')

@@ -5,8 +5,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.roster import UNIQUE
 
-NODES = {'bs', 'channel', 'rhs_controller', 'positioner', 'transmission', 'optimizer', 'user_1'}
+NODES = {*UNIQUE, 'user_1'}
 
 
 def test_every_node_reports_phase_cycles_drops_and_codebook(processes, make_watch, small_files):

@@ -9,6 +9,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.roster import UNIQUE
 
 
 @pytest.fixture(scope='module')
@@ -48,8 +49,7 @@ def test_each_network_serves_its_users_and_none_of_the_other(networks):
     positions = [{tuple(truth.position) for truth in network.watch.received[m.GroundTruth]}
                  for network in (networks.a, networks.b)]
     assert not positions[0] & positions[1]
-    names = {'network', 'bs', 'channel', 'rhs_controller', 'positioner', 'transmission',
-             'optimizer', 'user_1', 'watch'}
+    names = {'network', *UNIQUE, 'user_1', 'watch'}
     expected = {'/a': names, '/b': {*names, 'user_2'}}
 
     def nodes():

@@ -8,9 +8,9 @@ import pytest
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.roster import ROSTER
 
-EXECUTABLES = ('bs', 'user', 'rhs_controller', 'channel', 'positioner', 'transmission',
-               'optimizer')
+EXECUTABLES = tuple(ROSTER)
 
 
 @pytest.fixture(scope='module', params=[signal.SIGINT, signal.SIGTERM],

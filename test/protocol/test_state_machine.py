@@ -72,7 +72,7 @@ class Light(LightSteps):
     TABLE = (
         Transition(event=Go, guard=LightSteps.past, outcome=Outcome.STALE),
         Transition(source=(State.RED,), event=Go, guard=LightSteps.fast, target=State.GREEN,
-                   outcome=Outcome.CROWDED),
+                   outcome=Outcome.OVERFLOW),
         Transition(source=(State.RED,), event=Go, target=State.GREEN,
                    actions=(LightSteps.log, LightSteps.record, LightSteps.log)),
         Transition(source=(State.GREEN,), event=Go, target=State.GREEN),
@@ -109,7 +109,7 @@ def test_the_first_row_whose_guard_holds_is_taken():
     assert light.handle(Go(fast=True), 101.0) == []
     assert (light.state, light.counters) == (State.RED, {'stale': 1})
     assert light.handle(Go(fast=True), 5.0) == []
-    assert (light.state, light.counters) == (State.GREEN, {'stale': 1, 'crowded': 1})
+    assert (light.state, light.counters) == (State.GREEN, {'stale': 1, 'overflow': 1})
 
 
 def test_rows_for_a_state_include_those_for_any_in_order():

@@ -205,7 +205,7 @@ def test_repeated_steps_restart_their_timeout_or_the_users_cycle():
 def test_rows_that_drop_messages_precede_rows_of_single_states(name):
     """A message that is wrong is counted as such in every state."""
     dropped = {outcome for outcome in Outcome if outcome.value.startswith('wrong')}
-    dropped |= {Outcome.NOT_ALLOWED, Outcome.TOO_OFTEN, Outcome.CROWDED, Outcome.STALE_BEACON,
+    dropped |= {Outcome.NOT_ALLOWED, Outcome.TOO_OFTEN, Outcome.STALE_BEACON,
                  Outcome.STALE_COMMAND, Outcome.LATE_GRANT}
     table = ROLES[name].machine.TABLE
     assert {row.outcome for row in table} & dropped

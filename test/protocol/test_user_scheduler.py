@@ -6,7 +6,6 @@ import pytest
 from rhs_isac_ros.protocol.user_scheduler import (
     INVITED,
     LAST_NUMBER,
-    MAX_USERS,
     POLICIES,
     UserScheduler,
 )
@@ -203,18 +202,6 @@ def test_registering_again_does_not_change_the_turn(make):
     scheduler.register(1)
     scheduler.register(2)
     assert cycle(scheduler, 2, 1) == 1
-
-
-def test_the_number_of_registered_users_is_limited(make):
-    scheduler = make()
-    scheduler.begin_cycle()
-    for user in range(1, MAX_USERS + 1):
-        assert not scheduler.is_full_for(user)
-        scheduler.add_answer(user)
-    assert scheduler.is_full_for(5000)
-    assert not scheduler.is_full_for(17)
-    scheduler.remove(17)
-    assert not scheduler.is_full_for(5000)
 
 
 def test_a_new_policy_keeps_the_turns(make):

@@ -55,10 +55,9 @@ def monitor(bench, monkeypatch):
     return monitor
 
 
-def test_a_role_is_identified_by_topics_that_only_it_publishes_or_receives():
-    assert {role: identifying_endpoints(role) for role in ROSTER} == {
+def test_a_required_role_is_identified_by_topics_that_only_it_publishes_or_receives():
+    assert {role: one for required in REQUIRED.values() for role, one in required.items()} == {
         'bs': (('beacon',), ('ack',)),
-        'user': (('ack',), ('beacon',)),
         'rhs_controller': (('rhs/configuration',), ('rhs/command',)),
         'channel': (('feed_signals',), ('pilot',)),
         'positioner': (('position_estimate',), ('received_signals',)),

@@ -12,6 +12,7 @@ from ament_index_python.packages import get_package_prefix
 
 from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.ros import processes
+from rhs_isac_ros.ros.roster import UNIQUE
 
 TIMEOUT_S = 60.0
 # A parent that starts two nodes and prints their process ids.
@@ -54,7 +55,7 @@ def test_no_node_survives_a_demonstration_that_is_killed(tmp_path):
         folder = f'/proc/{demo.pid}/task/{demo.pid}/children'
         with open(folder, encoding='ascii') as file:
             children = [os.pidfd_open(int(pid)) for pid in file.read().split()]
-        assert len(children) == 8
+        assert len(children) == len(UNIQUE) + 2
         demo.send_signal(signal.SIGKILL)
         until_ended(children)
 

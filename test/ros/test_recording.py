@@ -162,6 +162,17 @@ def test_a_scenario_of_another_version_is_an_error(tmp_path):
         read_scenario(tmp_path / 'run.mcap')
 
 
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('n_frames: [&a [1, 1], &b [*a, *a]]', 'it contains references'),
+    (10_000 * '[', 'maximum recursion depth exceeded')])
+def test_a_scenario_that_would_occupy_the_process_is_an_error(
+        tmp_path, monkeypatch, text, reason):
+    monkeypatch.setattr(yaml, 'safe_dump', lambda changes: text)
+    Recorder(tmp_path / 'run.mcap', Scenario()).close()
+    with pytest.raises(RecordingError, match=f'run.mcap: invalid scenario: {reason}'):
+        read_scenario(tmp_path / 'run.mcap')
+
+
 def test_a_recording_with_other_fields_is_an_error(recording, monkeypatch):
     """Such as one from before the messages had headers: its bytes would be misread."""
     path, _ = recording

@@ -7,8 +7,18 @@ from pathlib import Path
 
 import pytest
 
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.recording import Recorder, recorded_topics
 from rhs_isac_ros.tools import permissions
+from rhs_isac_ros.tools.calibrate import CalibratorNode, PilotLog
+from rhs_isac_ros.tools.record import RecorderNode
+from rhs_isac_ros.tools.republish import RepublisherNode
+from rhs_isac_ros.tools.session import Session
+from rhs_isac_ros.tools.snapshot import SnapshotNode
+from rhs_isac_ros.tools.view_node import ViewNode
+from rhs_isac_ros.tools.view_posteriors import Posteriors
+from rhs_isac_ros.tools.watch import WatchNode
 
 ROOT = Path(__file__).parents[2]
 RIGHTS = ('publish', 'subscribe', 'reply', 'request')
@@ -31,10 +41,9 @@ def rules(text):
     return found
 
 
-def test_the_file_matches_the_output_of_the_command(capsys):
+def test_the_command_prints_the_policy_of_two_users(capsys):
     assert permissions.main([]) == 0
-    printed = capsys.readouterr().out
-    assert printed == (ROOT / 'config' / 'sros2' / 'policy.xml').read_text(encoding='utf-8')
+    assert capsys.readouterr().out == permissions.policy('/', 2)
 
 
 def test_a_user_may_not_publish_messages_of_another_role():
@@ -48,11 +57,54 @@ def test_a_user_may_not_publish_messages_of_another_role():
 
 
 def test_only_the_operator_may_set_parameters_of_other_nodes():
-    for path, rights in rules(permissions.policy()).items():
-        assert path == '/operator' or not any('/bs/' in name for name in rights['request'])
-        if path != '/operator':
-            assert rights['request'] <= {'/optimizer/get_parameters'}
-            assert {name.rpartition('/')[0] for name in rights['reply']} == {path}
+    allowed = rules(permissions.policy())
+    assert {'/bs/set_parameters', '/bs/pause', '/users/set_parameters'} <= allowed.pop(
+        '/operator')['request']
+    for path, rights in allowed.items():
+        assert rights['request'] <= {'/optimizer/get_parameters'}
+        if path != '/network':
+            assert {name.rpartition('/')[0] for name in rights['reply']} <= {path}
+
+
+def test_the_process_of_a_network_has_the_permissions_of_its_nodes():
+    allowed = rules(permissions.policy(users=2))
+    others = [rights for path, rights in allowed.items()
+              if path not in ('/network', '/operator', '/replay', '/visualizer')]
+    for right in RIGHTS:
+        united = set().union(*(rights[right] for rights in others))
+        assert allowed['/network'][right] - united <= {
+            service.replace('~', '/network') for service in permissions._OFFERED_SERVICES}
+        assert united <= allowed['/network'][right]
+
+
+def test_a_replay_may_publish_every_recorded_topic_and_read_none():
+    replay = rules(permissions.policy(users=2))['/replay']
+    assert replay['publish'] == {
+        *(f'/{name}' for name in recorded_topics()), '/parameter_events', '/rosout'}
+    assert not replay['subscribe'] | replay['reply'] | replay['request']
+
+
+def test_the_tools_use_no_more_than_the_permissions_of_the_operator(tmp_path):
+    allowed = rules(permissions.policy(users=2))
+    scenario = Scenario()
+    with Session() as session:
+        view = ViewNode(scenario, Posteriors(scenario), lambda entries: None)
+        # Only tracks have odometry.
+        view._follow_track(1)
+        nodes = [session.node, view, CalibratorNode(PilotLog(scenario), scenario), WatchNode(),
+                 SnapshotNode(scenario), RecorderNode(Recorder(tmp_path / 'a.mcap', scenario)),
+                 RepublisherNode([], [*recorded_topics()], 1.0)]
+        for node in nodes:
+            rights = allowed['/replay' if node.get_name() == 'replay' else '/operator']
+            for right, find in [
+                    ('publish', session.node.get_publisher_names_and_types_by_node),
+                    ('subscribe', session.node.get_subscriber_names_and_types_by_node),
+                    ('reply', session.node.get_service_names_and_types_by_node)]:
+                names = {name for name, _ in find(node.get_name(), '/')}
+                assert names <= rights[right], (node.get_name(), right)
+                assert right != 'publish' or '/rosout' in names
+        for node in nodes[1:]:
+            node.destroy_node()
 
 
 def test_publishers_are_those_of_the_documentation():
@@ -63,9 +115,10 @@ def test_publishers_are_those_of_the_documentation():
     for topic, publishers in rows:
         allowed_to = {path[1:].replace('user_1', 'user') for path, rights in allowed.items()
                if f'/{topic}' in rights['publish']}
-        # The operator does not publish.
+        # These stand for several nodes, or publish for others.
+        allowed_to -= {'network', 'users', 'replay'}
         reporting = {path[1:].replace('user_1', 'user') for path in allowed} - {
-            'visualizer', 'operator'}
+            'visualizer', 'operator', 'network', 'users', 'replay'}
         expected = (reporting if publishers == 'every node except visualizer'
                     else set(publishers.split(', ')))
         assert allowed_to == expected
@@ -82,15 +135,17 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
     """A running network uses all allowed rights and no others."""
     space, watch = '/closed', make_watch('/closed')
     network = processes.start(
-        'network', namespace=space, users=2, rest_s=0.0,
+        'network', namespace=space, users=2, rest_s=0.0, prior='track',
         scenario_file=small_files / 'scenario.yaml', codebook_file=small_files / 'first.yaml')
     visualizer = processes.start(
         'visualizer', namespace=space, scenario_file=small_files / 'scenario.yaml')
-    allowed = rules(permissions.policy(space, users=2))
-    del allowed[f'{space}/operator']
-    # Only tracks have a velocity.
-    for rights in allowed.values():
-        rights['publish'] = {name for name in rights['publish'] if not name.endswith('/odometry')}
+    users = processes.start(
+        'user', namespace=space, name='users', user_id=3, user_count=2,
+        scenario_file=small_files / 'scenario.yaml')
+    allowed = rules(permissions.policy(space, users=4))
+    # Those of several nodes have tests of their own, and users 3 and 4 have one node.
+    for name in ('operator', 'replay', 'network', 'user_3', 'user_4'):
+        del allowed[f'{space}/{name}']
     if not importlib.util.find_spec('tf2_msgs'):
         allowed[f'{space}/visualizer']['publish'] -= {topics.TF, topics.TF_STATIC}
 
@@ -107,7 +162,8 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
                 for right, pairs in found.items()}
 
     # After two cycles, all nodes have created all their publishers and subscriptions.
-    watch.until_served(2, processes=[network, visualizer])
+    for user in range(1, 5):
+        watch.until_served(2, user, processes=[network, visualizer, users])
     watch.until(lambda: {f'{place}/{name}' for name, place in
                          watch.node.get_node_names_and_namespaces()} >= allowed.keys(),
                 'every node in the graph', [network, visualizer])

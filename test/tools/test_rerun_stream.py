@@ -143,7 +143,7 @@ def test_serving_does_not_block():
     program = (
         'import socket\n'
         'from rhs_isac_ros.tools.rerun_stream import RerunStream\n'
-        'for _ in range(20):\n'
+        'for _ in range(5):\n'
         '    while True:\n'
         '        with socket.socket() as one, socket.socket() as two:\n'
         '            one.bind(("", 0))\n'
@@ -154,7 +154,7 @@ def test_serving_does_not_block():
         '            except OSError:\n'
         '                pass\n'
         '    stream = RerunStream()\n'
-        '    stream.serve(port)\n'
+        '    stream.serve(port, "127.0.0.1")\n'
         '    stream.close()\n')
     subprocess.run([sys.executable, '-c', program], timeout=60, check=True)
 

@@ -51,7 +51,7 @@ def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, 
     (['--save', 'view.txt'], "argument --save: 'view.txt', expected a name that ends with .rrd"),
     (['run.mcap', '--track-speed', '2'], 'argument --track-speed: expected together with --track'),
     (['--track'], 'arguments --track and --namespace: expected together with a recording'),
-    (['--port', '65535'], 'argument --port: '),
+    (['--port', '65534'], 'argument --port: '),
     (['missing.mcap'], 'argument file: ')])
 def test_an_invalid_argument_is_named(arguments, reason, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
@@ -224,7 +224,8 @@ def is_free(port):
 @pytest.fixture
 def served(recording, built_scripts):
     """Address of a view of the recording, on free ports; a signal ends it."""
-    port = next(port for port in range(9100, 9900, 2) if is_free(port) and is_free(port + 1))
+    port = next(port for port in range(9100, 9900, 3)
+                if all(map(is_free, range(port, port + 3))))
     with subprocess.Popen([SCRIPT, recording, '--port', str(port)], stdout=subprocess.PIPE,
                           text=True, env={**os.environ, 'PYTHONUNBUFFERED': '1'}) as process:
         try:
@@ -232,6 +233,23 @@ def served(recording, built_scripts):
         finally:
             process.send_signal(signal.SIGINT)
             assert process.wait(TIMEOUT_S) == 0
+
+
+def test_the_viewer_listens_on_the_loopback_address_alone(served):
+    for port in map(int, re.findall(r':(\d+)', served)):
+        socket.create_connection(('127.0.0.1', port), timeout=5.0).close()
+        # A server for all addresses would accept this one, too.
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(('127.0.0.2', port), timeout=5.0)
+
+
+def test_a_port_that_is_used_is_an_error_of_one_line(recording, capsys):
+    with socket.socket() as other:
+        other.bind(('127.0.0.1', 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert main([str(recording), '--port', str(min(port, 65533))]) == 1
+    assert 'Address already in use; choose others with --port' in capsys.readouterr().err
 
 
 def pixels(png):

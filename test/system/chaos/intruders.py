@@ -43,6 +43,8 @@ _NAMES_OF_CONFLICTS = (
 class IntrusionTrial(Trial):
     """Result of one trial, whose fault ends with the intruder.
 
+    Of two users with one number, the first is killed instead, and the second is served.
+
     Attributes
     ----------
     intruder
@@ -143,12 +145,16 @@ def _intrude(
     observer.spin_until(lambda: bool(_diagnosed(observer)), TIMEOUT_S)
     observer.spin_for(seconds)
     served = sum(record.outcome == 'served' for record in observer.log.ended[first:])
-    processes.kill(_PROCESS)
+    # A number belongs to the first node with it, a role to the last.
+    processes.kill(_USER_NODE if intruder == USER else _PROCESS)
     # The older node creates its publishers again.
     observer.invariants.expect_rediscovery(
         PUBLISHES[node or executable], by_another=True)
     recovery_s = measure_recovery(
         observer, time.monotonic(), 1 if intruder == USER else None)
+    if intruder == USER:
+        processes.kill(_PROCESS)
+        processes.restart(_USER_NODE)
     logged = tuple(line for line in warnings_since(processes, log_lengths)
                    if any(text in line for text in _NAMES_OF_CONFLICTS))
     return IntrusionTrial(
