@@ -13,7 +13,7 @@ import yaml
 
 from rhs_isac_ros.codebook import provenance_text
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model.files import read_yaml, write_whole
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
 
@@ -23,8 +23,6 @@ PARAMETER_NODE = '/**/optimizer'
 _POWER_TOLERANCE = 1e-6
 # Tolerance of amplitudes, which must be levels of the elements.
 _LEVEL_TOLERANCE = 1e-9
-# The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
-_YAML_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class CodebookError(ValueError):
@@ -182,11 +180,9 @@ class Codebook:
             If the file cannot be read or contains no valid codebook.
         """
         try:
-            content = yaml.load(Path(path).read_text(encoding='utf-8'), _YAML_LOADER)
-        # PyYAML raises ValueError for invalid UTF-8 and impossible dates.
-        except (OSError, ValueError, yaml.YAMLError) as error:
-            reason = ' '.join(str(error).split())
-            raise CodebookError(f'{path}: cannot be read: {reason}') from error
+            content = read_yaml(path)
+        except ValueError as error:
+            raise CodebookError(str(error)) from error
         for node in content.values() if isinstance(content, dict) else ():
             parameters = node.get('ros__parameters', {}) if isinstance(node, dict) else {}
             values = parameters.get('codebook') if isinstance(parameters, dict) else None

@@ -10,6 +10,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import yaml
+
+# Maximum size of a YAML file [bytes], and depth of its lists and mappings.
+_MAX_YAML_BYTES, _MAX_YAML_DEPTH = 2**28, 16
+# The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
+_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class ArchiveError(ValueError):
@@ -62,6 +68,35 @@ def check_writable(path: Path) -> None:
         os.lstat(path.parent / f'.{path.name}.{"x" * 8}')
 
 
+def read_yaml(path: str | Path) -> Any:
+    """Read a YAML file without references, which let a short text describe an enormous value.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, is too large, is not valid YAML, is nested too deeply, or
+        contains a reference.
+    """
+    try:
+        with open(path, 'rb') as stream:
+            data = stream.read(_MAX_YAML_BYTES + 1)
+        if len(data) > _MAX_YAML_BYTES:
+            raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
+        text, depth = data.decode(), 0
+        # The C loader ends the process if the nesting is deep.
+        for event in yaml.parse(text, _LOADER):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MAX_YAML_DEPTH:
+                raise ValueError(f'nested more than {_MAX_YAML_DEPTH} times')
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f'reference *{event.anchor}, expected none')
+        return yaml.load(text, _LOADER)
+    # PyYAML also raises ValueError, for impossible dates.
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ValueError(f'{path}: cannot be read: {" ".join(str(error).split())}') from error
+
+
 def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
                   about: Mapping[str, Any]) -> None:
     """Write arrays and a description that JSON can represent to NumPy's format ``.npz``.
@@ -93,11 +128,16 @@ def read_archive(path: str | Path, kind: str, version: int, names: set[str]
     try:
         with open(path, 'rb') as stream:
             file = np.load(stream, allow_pickle=False)
-            arrays = {key: file[key] for key in getattr(file, 'files', ())}
+            found = getattr(file, 'files', ())
+            # Compressed arrays may be far larger than the file. NumPy compresses on request only.
+            is_expected = set(found) - {'about'} == names and not any(
+                member.compress_type for member in file.zip.infolist())
+            arrays = {key: file[key] for key in found} if is_expected else {}
         about = json.loads(str(arrays.pop('about', '{}')))
-    # Reading verifies the checksum that the format holds for every array.
-    except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError,
-            zipfile.BadZipFile) as error:
+    # Reading verifies the checksum that the format holds for every array. The shape of an array
+    # may be anything.
+    except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError, MemoryError,
+            OverflowError, RecursionError, zipfile.BadZipFile) as error:
         reason = ' '.join(str(error).split())
         raise ArchiveError(f'{path}: cannot be read: {reason}') from error
     if not isinstance(about, dict) or about.pop('format', 0) != version or set(arrays) != names:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rhs_isac_ros.model import plugins
+from rhs_isac_ros.model.files import read_yaml
 from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
 from rhs_isac_ros.model.plugins import PluginError
 
@@ -238,11 +238,9 @@ class Scenario(Extensions, Table1):
             If the file cannot be read, is not a mapping, or has an unknown field or invalid value.
         """
         try:
-            content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-        # PyYAML also raises ValueError, for invalid bytes and dates.
-        except (OSError, ValueError, yaml.YAMLError) as error:
-            reason = ' '.join(str(error).split())
-            raise ScenarioError(f'{path}: cannot be read: {reason}') from error
+            content = read_yaml(path)
+        except ValueError as error:
+            raise ScenarioError(str(error)) from error
         content = {} if content is None else content
         if not isinstance(content, dict):
             raise ScenarioError(f'{path}: expected a mapping of field names to values')
