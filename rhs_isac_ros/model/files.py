@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import secrets
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
@@ -33,14 +34,15 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
         If the file cannot be written; an existing file is left as it was.
     """
     path = Path(path)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+    # Unlike those of `tempfile`, the file has the permissions of any new file.
+    temporary = path.with_name(f'.{path.name}.{secrets.token_hex(4)}')
+    stream = open(temporary, 'xb')
     try:
-        with os.fdopen(descriptor, 'wb') as stream:
+        with stream:
             if callable(content):
                 content(stream)
             else:
                 stream.write(content.encode() if isinstance(content, str) else content)
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
         os.unlink(temporary)

@@ -1,6 +1,7 @@
 """Files of a stranger are rejected in one line, within a second and little memory."""
 
 import io
+import os
 import subprocess
 import sys
 import zipfile
@@ -8,7 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model.files import ArchiveError, read_archive, read_yaml
+from rhs_isac_ros.model.files import ArchiveError, read_archive, read_yaml, write_whole
 
 # Each list contains the one before ten times.
 BOMB = ', '.join(['&a0 [1, 1]', *(
@@ -73,3 +74,14 @@ def test_archives(tmp_path, name, content, compression):
         archive.writestr(f'{name}.npy', content)
     with pytest.raises(ArchiveError, match='a.npz: (cannot be read|not a model)'):
         read_archive(file, 'model', 1, {'x'})
+
+
+@pytest.mark.parametrize(('umask', 'mode'), [(0o077, 0o600), (0o022, 0o644), (0o002, 0o664)])
+def test_a_written_file_has_the_permissions_of_a_new_file(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        write_whole(tmp_path / 'a', 'text')
+    finally:
+        os.umask(before)
+    assert (tmp_path / 'a').stat().st_mode & 0o777 == mode
+    assert [path.name for path in tmp_path.iterdir()] == ['a']
