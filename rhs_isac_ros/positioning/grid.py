@@ -48,6 +48,8 @@ _MAX_PEAKS = 8192
 _SAME_MODE = 2.0
 # Largest distance of points to compare, in radii of the ellipsoid.
 _MAX_REACH = 3.0
+# Errors within a range cell, as a share of the energy of the template.
+_TABLE_ERROR = 0.015
 # Error of the likelihood that a step with the slopes predicts, relative to the loss that it makes
 # up for.
 _STEP_ERROR = 0.5
@@ -239,7 +241,7 @@ class TemplateTable:
         # Largest loss of log-likelihood between the directions of the grid.
         half = PHASE_ERROR * self._resolution.direction
         across = np.abs(arrays['curvature'][:, 1:, 1:])
-        self._loss = np.einsum('a,cab,b->c', half, across, half) / 2
+        self._loss = np.einsum('a,cab,b->c', half, across, half) / 2 + _TABLE_ERROR * self._energy
         self._bounds = scenario.roi_bounds_m
         self._wavenumbers = subband_wavenumbers(scenario)
         self._cell_turns = self._turns(grid.ranges_m).astype(np.complex64)

@@ -26,13 +26,17 @@ from rhs_isac_ros.positioning.likelihood import NuisancePrior
 # Relative to the nearest range of the region: distance from it up to which a user may be located
 # at its border, and nearest range outside.
 _BORDER = 0.1
+_NEAREST = 0.3
 # The nearest range is at least this multiple of the radius of the aperture.
 _MIN_APERTURES = 4.0
 # Farthest range in units of the farthest range of the region, and ratio of successive ranges.
 _MAX_RANGE_FACTOR = 3.0
 _RANGE_RATIO = 1.15
-# Phase error of a template at the edge of the aperture from which another direction takes over.
+# Phase error of a template at the edge of the aperture from which another direction takes over, and
+# number of templates above which it is larger: large apertures distinguish more directions than a
+# comparison of two hypotheses needs.
 _DIRECTION_RAD = 0.25
+_MAX_TEMPLATES = 40_000
 # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
 _GAIN_STEP = 0.04
 _GAIN_REACH = 4.0
@@ -190,7 +194,7 @@ def _ranges(scenario: Scenario) -> np.ndarray:
     """Ranges of the grid in geometric progression, float64 [R] [m]."""
     resolution = Resolution.of(scenario)
     aperture_m = np.linalg.norm(element_positions(scenario), axis=1).max()
-    nearest_m = max(_BORDER * resolution.nearest_m, _MIN_APERTURES * aperture_m)
+    nearest_m = max(_NEAREST * resolution.nearest_m, _MIN_APERTURES * aperture_m)
     ratio = _MAX_RANGE_FACTOR * resolution.farthest_m / nearest_m
     n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(_RANGE_RATIO))))
     return nearest_m * _RANGE_RATIO**np.arange(n_ranges)
@@ -198,7 +202,10 @@ def _ranges(scenario: Scenario) -> np.ndarray:
 
 def _directions(scenario: Scenario) -> np.ndarray:
     """Direction cosines (u, v) over the half space, float64 [V, 2]."""
-    counts = np.ceil(0.5 / (_DIRECTION_RAD * Resolution.of(scenario).direction)).astype(int)
+    direction = Resolution.of(scenario).direction
+    n_ranges = len(_template_ranges(scenario, _ranges(scenario))[0])
+    fewest = np.sqrt(np.pi / 4 * n_ranges / (np.prod(direction) * _MAX_TEMPLATES))
+    counts = np.ceil(0.5 / (max(_DIRECTION_RAD, fewest) * direction)).astype(int)
     lines = [(np.arange(2 * n) + 0.5) / n - 1 for n in counts.tolist()]
     grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
     result: np.ndarray = grid[np.hypot(*grid.T) < _MAX_SINE]
