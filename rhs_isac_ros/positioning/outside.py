@@ -32,9 +32,9 @@ _MIN_APERTURES = 4.0
 # Farthest range in units of the farthest range of the region, and ratio of successive ranges.
 _MAX_RANGE_FACTOR = 3.0
 _RANGE_RATIO = 1.15
-# Phase error of a template at the edge of the aperture from which another direction takes over, and
-# number of templates above which it is larger: large apertures distinguish more directions than a
-# comparison of two hypotheses needs.
+# Phase error of a template at the edge of the aperture from which another direction takes over,
+# and number of templates above which it is larger: large apertures distinguish more directions
+# than a comparison of two hypotheses needs.
 _DIRECTION_RAD = 0.25
 _MAX_TEMPLATES = 40_000
 # Quadrature over the gain: spacing [nepers], and reach in standard deviations.

@@ -299,6 +299,7 @@ class PositionEstimate(Message):
     crlb_m2: float = optional_float()
     estimator: str
     latency_s: float = number(0, 3600)
+    outside_probability: float = number(0, 1, default=0.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

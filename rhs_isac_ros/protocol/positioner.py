@@ -295,7 +295,8 @@ class Positioner(PlainRole):
             cycle_id=received.cycle_id, user=received.user,
             user_instance=received.user_instance, codebook_id=received.codebook_id,
             position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
-            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s))]
+            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s,
+            outside_probability=float(np.nan_to_num(estimate.outside_probability))))]
         if isinstance(estimate, TrackEstimate):
             actions.append(PublishTrack(received.user, estimate))
         if received.user in self._without_fix:
