@@ -10,7 +10,7 @@ from rhs_isac_ros.link.water_filling import water_filling
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain_at
-from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
@@ -31,7 +31,7 @@ class BandLink:
     los
         Line-of-sight gains, complex128 [N_SB, N_E].
     spatial
-        V_i, which is real, float64 [N_E, N_E].
+        V_i [N_E, N_E]: float64 if it is declared, and complex128 if it is measured.
     noise_power_w, power_w
         Noise power of a sub-band, and power of the digital part over all sub-bands [W].
     fixed
@@ -111,6 +111,10 @@ class BandLink:
     def scatter(self, weights: np.ndarray) -> np.ndarray:
         """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
         n = weights.shape[-1]
+        if np.iscomplexobj(self.spatial):
+            several: np.ndarray = np.matmul(
+                weights.reshape(*self.spatial.shape[:-2], -1, n), self.spatial)
+            return several.reshape(weights.shape)
         rows = weights.reshape(*self.spatial.shape[:-2], -1, n)
         # A real product takes half the time of a complex one.
         parts = np.concatenate([rows.real, rows.imag], axis=-2) @ self.spatial
@@ -147,7 +151,9 @@ def arrays(scenario: Scenario, surface: SurfaceEstimate | None
         fixed = surface.failed
         coefficients = np.where(fixed, surface.offsets, surface.gains)
         onboard = surface.band_gains[:, None, None, None] * coefficients * onboard
-    spatial = np.ascontiguousarray(multipath_covariance(scenario).real)
+    spatial = spatial_covariance(scenario)
+    if not scenario.multipath:
+        spatial = np.ascontiguousarray(spatial.real)
     for array in (onboard, spatial, fixed):
         array.flags.writeable = False
     return onboard, spatial, fixed

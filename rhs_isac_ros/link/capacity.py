@@ -59,11 +59,16 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
     bands = [beam.band for beam in beams]
     radiation = np.stack([_radiation(scenario, beam) for beam in beams])
     direct = np.abs(los_sums(scenario, positions, bands, radiation))**2
-    # V is real: the real and imaginary parts of the radiation contribute separately.
     spatial = arrays(scenario, None)[1][band_index(bands)]
+    # Of a Hermitian V, the imaginary part mixes the real and imaginary parts of the radiation. It
+    # is zero unless V was measured.
     parts = np.concatenate([radiation.real, radiation.imag], axis=1)
-    scattered = np.sum((parts @ spatial) * parts, axis=-1).reshape(len(beams), 2, 1, -1)
-    snr = (direct + scattered.sum(axis=1)) / scenario.noise_power_w
+    scattered = np.sum((parts @ spatial.real) * parts, axis=-1).reshape(len(beams), 2, 1, -1)
+    scattered = scattered.sum(axis=1)
+    if np.iscomplexobj(spatial):
+        mixed = (radiation.real @ spatial.imag) * radiation.imag
+        scattered += 2 * np.sum(mixed, axis=-1)[:, None]
+    snr = (direct + scattered) / scenario.noise_power_w
     rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
     return rates
 

@@ -139,7 +139,7 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
 
 
 def _modes(spatial: np.ndarray) -> np.ndarray:
-    """Return the strongest modes of the multipath in each band, float64 [N_B, N_E, L].
+    """Return the strongest modes of the multipath in each band, [N_B, N_E, L].
 
     Bands with fewer modes than others have columns of zeros.
     """

@@ -1,6 +1,8 @@
 """Multipath: spatial covariance, correlation over sub-bands and frames, random gains.
 
-Indices of bands, sub-bands and frames start at 0. Bands are independent.
+Indices of bands, sub-bands and frames start at 0. Bands are independent. Fields of a scenario
+declare the covariance of the gains; a measured one adds a term of the rank of its measurements to
+it, see `multipath_estimate`.
 """
 
 import functools
@@ -9,6 +11,7 @@ import numpy as np
 
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
+from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
 # Gauss-Legendre nodes on the quarter of the angular domain in which the profile is smooth.
@@ -19,7 +22,7 @@ _ROI_NODES = 24
 
 @functools.lru_cache(maxsize=16)
 def multipath_covariance(scenario: Scenario) -> np.ndarray:
-    """Implements Eq. (2). Covariance of the multipath gains of the elements.
+    """Implements Eq. (2). Covariance of the multipath gains of the elements that fields declare.
 
     The power-angle profile is a product of two Laplacians of `angular_spread_deg`, normalised
     over the half space in front of the surface and scaled by the mean line-of-sight power in the
@@ -47,7 +50,7 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
         along_y = np.einsum('a,eay->ey', weights, along_y)
         along_z = np.cos(wavenumber * np.sin(azimuth)[:, None] * offsets)
         lattice = np.einsum('e,ey,ez->zy', weights, along_y, along_z)
-        scale = mean_los_power(scenario, band) * 10 ** (scenario.multipath_to_los_db / 10)
+        scale = mean_los_power(scenario, band) * 10 ** (_fields(scenario).multipath_to_los_db / 10)
         if not isinstance(scenario.element_gain, GainPattern):
             scale *= scenario.element_gain**2
         covariance[band] = scale * lattice[rows, columns]
@@ -79,7 +82,7 @@ def frequency_correlation(
     """Implements Eq. (3). Correlation rho_f of two sub-bands, complex128; indices broadcast."""
     frequencies = subband_frequencies_hz(scenario)[band]
     difference = frequencies[first] - frequencies[second]
-    correlation: np.ndarray = 1 / (1 + 2j * np.pi * scenario.delay_spread_s * difference)
+    correlation: np.ndarray = 1 / (1 + 2j * np.pi * _fields(scenario).delay_spread_s * difference)
     return correlation
 
 
@@ -123,6 +126,47 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
     return correlation
 
 
+def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Compute the declared covariance between signals received with two radiation matrices [W].
+
+    Returns complex128 [N_B, N_SB F, N_SB F] for matrices T_i, complex128 [N_B, N_SB F, N_E].
+    """
+    scattered = np.matmul(radiation @ multipath_covariance(scenario),
+                          np.conj(np.swapaxes(other, 1, 2)))
+    covariance: np.ndarray = measurement_correlation(scenario) * scattered
+    return covariance
+
+
+def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
+    """Compute the covariance of the multipath in the received signals, as `signal_covariance`."""
+    covariance = coupling(scenario, radiation, radiation)
+    if measured := scenario.multipath:
+        to_survey = coupling(scenario, radiation, measured.radiation)
+        covariance += np.matmul(
+            to_survey @ measured.excess, np.conj(np.swapaxes(to_survey, 1, 2)))
+    return covariance
+
+
+@functools.lru_cache(maxsize=16)
+def spatial_covariance(scenario: Scenario) -> np.ndarray:
+    """Compute the covariance of the gains of the elements, averaged over the measurements.
+
+    Returns complex128 [N_B, N_E, N_E], read-only. A declared covariance is real and the same in
+    all measurements.
+    """
+    declared = multipath_covariance(scenario)
+    if not (measured := scenario.multipath):
+        return declared
+    correlation = measurement_correlation(scenario)
+    weights = measured.excess * np.matmul(
+        np.swapaxes(correlation, 1, 2), correlation.conj()) / correlation.shape[1]
+    across = np.matmul(declared, np.conj(np.swapaxes(measured.radiation, 1, 2)))
+    covariance: np.ndarray = declared + np.matmul(
+        across @ weights, np.conj(np.swapaxes(across, 1, 2)))
+    covariance.flags.writeable = False
+    return covariance
+
+
 @functools.lru_cache(maxsize=16)
 def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Compute the factors with which `draw_multipath` correlates the gains.
@@ -140,8 +184,34 @@ def draw_multipath(
     """Draw multipath gains h^MP of n independent phases, complex128 [n, N_SB F, N_E]."""
     spatial, over_rows = multipath_factors(scenario)[band]
     white = complex_normal((n, over_rows.shape[1], spatial.shape[1]), rng)
+    if scenario.multipath:
+        basis, stretch = _stretches(scenario)[band]
+        flat = white.reshape(n, -1)
+        white = white + (flat @ basis.conj() @ stretch.T @ basis.T).reshape(white.shape)
     gains: np.ndarray = over_rows @ (white @ spatial.T)
     return gains
+
+
+@functools.lru_cache(maxsize=16)
+def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Compute how a measured covariance changes the white numbers of `draw_multipath`.
+
+    For each band, these are Q with orthonormal columns and D, so that white numbers z become
+    z + Q D Q^H z.
+    """
+    assert scenario.multipath
+    stretches = []
+    for (spatial, over_rows), radiation, excess in zip(
+            multipath_factors(scenario), scenario.multipath.radiation, scenario.multipath.excess,
+            strict=True):
+        # The signals of the survey are linear in the white numbers.
+        signals = (over_rows[:, :, None] * (radiation @ spatial)[:, None]).reshape(
+            len(radiation), -1)
+        basis, triangle = np.linalg.qr(np.conj(signals.T))
+        values, vectors = np.linalg.eigh(triangle @ excess @ np.conj(triangle.T))
+        growth = np.sqrt(np.maximum(1 + values, 0.0)) - 1
+        stretches.append((basis, vectors * growth @ np.conj(vectors.T)))
+    return tuple(stretches)
 
 
 def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -150,11 +220,16 @@ def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarr
     return numbers
 
 
+def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
+    """Return the owner of the three fields that declare the covariance."""
+    return scenario.multipath or scenario
+
+
 def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """Nodes on [0, pi/2] and weights of the Laplacian profile, normalised to a sum of one."""
     nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
     angles = (nodes + 1) * np.pi / 4
-    spread = np.deg2rad(scenario.angular_spread_deg)
+    spread = np.deg2rad(_fields(scenario).angular_spread_deg)
     # The interval begins at the cusp, zero, and ends earlier for a narrow profile.
     reach = min(1.0, 30 * spread / (np.pi / 2))
     angles = angles * reach
