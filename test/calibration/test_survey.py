@@ -6,8 +6,15 @@ import warnings
 import numpy as np
 import pytest
 
-from rhs_isac_ros.calibration import SurveyWarning, survey, survey_report
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.calibration import (
+    Pilots,
+    SurveyWarning,
+    calibrate,
+    load_surface,
+    survey,
+    survey_report,
+)
+from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.positioning import make_estimator
 
 # The multipath of the hall differs from that of Table I, which is declared.
@@ -42,7 +49,7 @@ def test_the_covariance_is_that_of_the_hall(estimate, shipped):
     white = true.whitener @ measured.covariance() @ np.conj(np.swapaxes(true.whitener, 1, 2))
     values = np.linalg.eigvalsh(white) / estimate.about['inflation']
     assert 0.6 < values.min() and values.max() < 1.6
-    assert 1 <= estimate.about['inflation'] < 1.3
+    assert 1 <= estimate.about['inflation'] < 1.4
 
 
 def test_the_report_lists_what_was_found(estimate):
@@ -97,8 +104,6 @@ def test_impairments_are_estimated_with_the_multipath(shipped):
 
 def test_a_calibrated_surface_takes_part(shipped):
     """A gain of a band is not multipath if the surface explains it."""
-    from rhs_isac_ros.model import ElementErrors
-
     rng = np.random.default_rng(0)
     gains = 1 + 0.2 * rng.normal(size=(100, 2)) @ [1, 1j]
     surface = ElementErrors(gains, np.full(100, np.nan))
@@ -108,6 +113,13 @@ def test_a_calibrated_surface_takes_part(shipped):
               for known in (surface, None)]
     assert levels[0] == pytest.approx(-5, abs=1.5)
     assert levels[1] > levels[0] + 1
+
+
+def test_a_calibration_holds_in_every_hall(estimate, shipped, tmp_path):
+    calibrate(DECLARED, [Pilots(shipped, *send(DECLARED, shipped, 5))]).save(tmp_path / 's.npz')
+    measured = dataclasses.replace(DECLARED, multipath=estimate)
+    surface = load_surface(str(tmp_path / 's.npz'), measured)
+    assert make_estimator('bayes', measured, shipped, surface=surface).surface is surface
 
 
 @pytest.mark.parametrize('n', [1, 3])
