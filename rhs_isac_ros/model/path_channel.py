@@ -110,14 +110,9 @@ class PathChannel(ArrayFile):
 
     def nearest(self, positions: np.ndarray) -> np.ndarray:
         """Return the index of the user nearest to each position [N, 3] [m], int64 [N]."""
-        return self._tree.query(positions)[1].astype(np.int64)  # type: ignore[no-any-return]
-
-    @functools.cached_property
-    def _tree(self) -> Any:
-        # Every node imports this module, and SciPy takes longer to load than ROS.
-        from scipy.spatial import KDTree
-
-        return KDTree(self.users)
+        squares = np.sum((positions[:, None] - self.users)**2, axis=2)
+        nearest: np.ndarray = np.argmin(squares, axis=1)
+        return nearest
 
     def content(self) -> tuple[np.ndarray, ...]:
         """Return the arrays that the digest covers."""
@@ -141,10 +136,15 @@ class PathChannel(ArrayFile):
         return ''
 
     def save(self, path: str | Path) -> None:
-        """Write the paths to a compressed file of NumPy's format ``.npz``."""
+        """Write the paths to a compressed file of NumPy's format ``.npz``.
+
+        Amplitudes and virtual sources are rounded to single precision.
+        """
         arrays = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         del arrays['path']
-        present = {name: array for name, array in arrays.items() if array is not None}
+        types = {'a': np.complex64, 'gains': np.complex64, 'src': np.float32, 'n': np.int8}
+        present: dict[str, Any] = {name: np.asarray(array, types.get(name))
+                   for name, array in arrays.items() if array is not None}
         write_whole(path, lambda stream: np.savez_compressed(stream, **present))
 
     @classmethod

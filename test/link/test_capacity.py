@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.calibration import survey
-from rhs_isac_ros.link import Beam, capacity, expected_capacity, steer
+from rhs_isac_ros.link import (
+    Beam,
+    actual_capacity,
+    capacity,
+    capacity_report,
+    expected_capacity,
+    steer,
+)
 from rhs_isac_ros.link.capacity import posterior_points
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.multipath import spatial_covariance
+from rhs_isac_ros.model.path_channel import PathChannel
 
 POSITION = np.array([9.0, 1.5, -0.4])
 # Long in range and short across, as are the posteriors of the shipped codebook.
@@ -242,3 +250,26 @@ def test_a_measured_covariance_has_its_own_capacity(table1, reference_link, ship
     steered = steer(measured, POSITION)
     assert capacity(measured, steered, POSITION[None])[0] > 1.1 * capacity(
         measured, beam, POSITION[None])[0]
+
+
+def test_the_actual_capacity_is_that_of_the_paths(small):
+    """A reflection in phase with the direct path doubles the amplitude."""
+    scenario, rng = small.scenario, np.random.default_rng(0)
+    beam, users = random_beam(scenario, rng), scenario.sample_positions(3, rng)
+    assert actual_capacity(scenario, beam, users) == pytest.approx(
+        capacity(scenario, beam, users))
+    f0 = scenario.center_frequencies_hz[0]
+    distance = np.linalg.norm(users, axis=1)[:, None]
+    a = np.tile(299_792_458 / (4 * np.pi * f0 * distance), (1, 2)) + 0j
+    paths = PathChannel(users, a, np.stack([users, users], axis=1), np.tile([0, 1], (3, 1)), f0)
+    traced = dataclasses.replace(scenario, channel=paths)
+    no_multipath = dataclasses.replace(
+        scenario, multipath_to_los_db=-200.0, noise_psd_dbm_hz=scenario.noise_psd_dbm_hz
+        - 10 * np.log10(4))
+    np.testing.assert_allclose(actual_capacity(traced, beam, users),
+                               capacity(no_multipath, beam, users), rtol=1e-6)
+    np.testing.assert_allclose(capacity(traced, beam, users), capacity(scenario, beam, users))
+    report = capacity_report(traced, steer(traced, users[0]), users[0])
+    assert abs(report.loss_percent) < 1
+    assert report.actual_bps == pytest.approx(
+        actual_capacity(traced, steer(traced, users[0]), users[:1])[0], rel=1e-9)

@@ -104,9 +104,13 @@ def test_random_positions_are_those_of_users(mirror, users):
 
 def test_a_file_holds_the_paths(mirror, tmp_path):
     mirror.save(tmp_path / 'hall.npz')
-    assert PathChannel.load(tmp_path / 'hall.npz') == mirror
+    loaded = PathChannel.load(tmp_path / 'hall.npz')
+    np.testing.assert_array_equal(loaded.users, mirror.users)
+    np.testing.assert_allclose(loaded.coefficients, mirror.coefficients, rtol=1e-6)
+    np.testing.assert_allclose(loaded.sources, mirror.sources, rtol=1e-6)
     scenario = Scenario(channel=tmp_path / 'hall.npz')
-    assert scenario.id == Scenario(channel=mirror).id != Scenario().id
+    assert scenario.id == Scenario(channel=loaded).id != Scenario().id
+    assert Scenario(**scenario.changes()) == scenario
 
 
 # Array, its value as a function of the valid one, and the expected message.
