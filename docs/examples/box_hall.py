@@ -5,11 +5,15 @@ polarised and have no pattern. Walls, floor and ceiling reflect specularly, up t
 script writes the paths of users on a raster, and a survey of users at random positions:
 
     python3 docs/examples/box_hall.py hall_paths.npz hall_multipath.npz
+
+With a folder as its only argument, it writes the files for ``scripts/benchmark channels``, of a
+narrower and lower hall.
 """
 
 import dataclasses
 import itertools
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +22,9 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, PathChannel, Scenario, simulate_received
 
 # Corners of the hall [m], and the frequency of the amplitudes [Hz].
-LOW, HIGH, F0_HZ = np.array([-0.05, -7.0, -2.0]), np.array([19.95, 7.0, 3.0]), 2.75e9
+HALL = np.array([[-0.05, -7.0, -2.0], [19.95, 7.0, 3.0]])
+NARROW_HALL = np.array([[-0.05, -5.2, -1.5], [24.0, 5.6, 1.8]])
+F0_HZ = 2.75e9
 # Relative permittivity and conductivity of concrete, ITU-R P.2040, and the number of reflections.
 PERMITTIVITY = 5.24 - 1j * 0.0462 * (F0_HZ / 1e9)**0.7822 * 17.98 / (F0_HZ / 1e9)
 MAX_ORDER = 2
@@ -27,13 +33,14 @@ RASTER_M, HEIGHT_M = 0.5, -0.5
 N_SURVEY = 100
 
 
-def trace(users: np.ndarray) -> PathChannel:
-    """Return the paths of users, float64 [N, 3] [m]."""
-    orders = [order for order in itertools.product(range(-MAX_ORDER, MAX_ORDER + 1), repeat=3)
-              if sum(map(abs, order)) <= MAX_ORDER]
+def trace(users: np.ndarray, hall: np.ndarray = HALL, max_order: int = MAX_ORDER) -> PathChannel:
+    """Return the paths of users, float64 [N, 3] [m], in a hall with two corners, [2, 3] [m]."""
+    low, high = hall
+    orders = [order for order in itertools.product(range(-max_order, max_order + 1), repeat=3)
+              if sum(map(abs, order)) <= max_order]
     n = np.array(orders)
     # An odd number of reflections along an axis mirrors the user; an even number shifts it.
-    sources = np.where(n % 2, LOW + HIGH - users[:, None], users[:, None]) + n * (HIGH - LOW)
+    sources = np.where(n % 2, low + high - users[:, None], users[:, None]) + n * (high - low)
     # The elements receive nothing from behind the surface.
     in_front = sources[..., 0] > 0
     distance = np.linalg.norm(sources, axis=2)
@@ -67,5 +74,18 @@ def main(paths_file: str, multipath_file: str) -> None:
     survey(scenario, codebook, positions, received).save(multipath_file)
 
 
+def write_scene(folder: Path) -> None:
+    """Write the files of the narrow hall for the benchmark."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    for name, n, max_order in (('empty_test', 300, 0), ('hall_test', 300, MAX_ORDER),
+                               ('hall_survey', 1000, MAX_ORDER)):
+        users = Scenario().sample_positions(n, rng)
+        trace(users, NARROW_HALL, max_order).save(folder / f'{name}.npz')
+
+
 if __name__ == '__main__':
-    main(*sys.argv[1:])
+    if len(sys.argv) == 2:
+        write_scene(Path(sys.argv[1]))
+    else:
+        main(*sys.argv[1:])

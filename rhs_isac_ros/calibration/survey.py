@@ -9,6 +9,9 @@ Fields and nu maximise the evidence, so that few positions yield almost the fiel
 sample covariance. Multipath of few strong paths is not Gaussian: errors of positions then exceed
 the bound of L for t = 1. Each position is therefore left out in turn, and t makes the 95 % region
 of the local bound contain 95 % of the positions left out, and the test of the residual pass 99 %.
+
+Positions whose signals are more probable without a direct path, as multipath of an unknown level,
+are left out.
 """
 
 import dataclasses
@@ -42,8 +45,11 @@ _MIN_SPAN = 0.5
 _DELAYS, _ANGLES, _LEVELS, _WEIGHTS = (1e-3, 10.0), (0.5, 300.0), (-80.0, 60.0), (0.5, 1e4)
 # Steps of the search: level [dB] and the logarithms of the others.
 _STEPS = (3.0, 1.0, 0.7, 1.0)
-# Rounds of alignment of impairments and estimation, and steps of each alignment.
-_ROUNDS, _ALIGNMENT_STEPS = 2, 6
+# Prior probability of a position without direct path, and standard deviation of its level [dB].
+_BLOCKED_PROBABILITY, _BLOCKED_STD_DB = 0.1, 10.0
+# Rounds of alignment of impairments, estimation and search for positions without direct path; and
+# steps of each alignment.
+_ROUNDS, _ALIGNMENT_STEPS = 4, 6
 
 
 class SurveyWarning(UserWarning):
@@ -90,26 +96,35 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     if not n:
         raise ValueError('positions: none given, expected at least one')
     fields = dataclasses.replace(scenario, multipath=None)
-    for _ in range(_ROUNDS if len(nuisance_of(scenario)) else 1):
+    in_sight, n_sight = np.ones(n, bool), n
+    for _ in range(_ROUNDS):
         model = MeasurementModel(fields, codebook, surface)
         residuals = _residuals(model, pilots)
-        sample = np.einsum('nir,nis->irs', residuals, residuals.conj()) / n
-        fields, weight = _most_likely(fields, model, sample, n)
-    model = MeasurementModel(fields, codebook, surface)
-    declared = model.covariance()
-    left_out = _left_out(model, pilots.positions, residuals, weight * declared + n * sample,
-                         weight + n - 1)
+        sample = np.einsum('nir,nis->irs', residuals[in_sight], residuals[in_sight].conj())
+        fields, weight = _most_likely(fields, model, sample / n_sight, n_sight)
+        model = MeasurementModel(fields, codebook, surface)
+        declared = model.covariance()
+        total = weight * declared + sample
+        before, in_sight = in_sight, _in_sight(
+            model, pilots.positions, residuals, in_sight, total, weight + n_sight)
+        n_sight = int(in_sight.sum())
+        if (in_sight == before).all() and not len(nuisance_of(scenario)):
+            break
+    in_sight, n_sight = before, int(before.sum())
+    left_out = _left_out(model, pilots.positions[in_sight], residuals[in_sight], total,
+                         weight + n_sight - 1)
     inflation = _inflation(left_out, int(np.prod(model.shape)))
-    measured = inflation * (weight * declared + n * sample) / (weight + n)
+    measured = inflation * total / (weight + n_sight)
     inverse = np.linalg.inv(declared)
     excess = inverse @ (measured - declared) @ inverse
-    texts = _warnings(scenario, pilots.positions)
+    texts = _warnings(scenario, pilots.positions[in_sight])
     if texts:
         warnings.warn('; '.join(texts), SurveyWarning, stacklevel=3)
     inside = int(np.sum(left_out.distances <= inflation * _radius()))
     about: dict[str, Any] = {
-        'positions': n, 'prior_weight': weight, 'inflation': inflation,
-        'coverage': [inside / n, *_interval(inside, n)], 'warnings': texts,
+        'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': weight,
+        'inflation': inflation, 'coverage': [inside / n_sight, *_interval(inside, n_sight)],
+        'warnings': texts,
         'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
     plain = scenario.fields()
     return MultipathEstimate(
@@ -123,7 +138,8 @@ def survey_report(estimate: MultipathEstimate) -> str:
     about = estimate.about
     coverage, low, high = (100 * share for share in about['coverage'])
     return '\n'.join([
-        f'{about["positions"]} positions, codebook {about["codebook"]}',
+        f'{about["positions"]} positions, {about["blocked"]} more without a direct path, codebook '
+        f'{about["codebook"]}',
         f'fields: multipath / direct path {estimate.multipath_to_los_db:.1f} dB, delay spread '
         f'{1e9 * estimate.delay_spread_s:.0f} ns, angular spread '
         f'{estimate.angular_spread_deg:.1f} deg; they weigh as much as '
@@ -245,6 +261,33 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     covariance = np.linalg.inv(information)[:, :3, :3]
     return _LeftOut(np.einsum('na,nab,nb->n', gradient, covariance, gradient),
                     n_others * np.sum(own - 1, axis=1))
+
+
+def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
+              in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
+    """Return which positions probably have a direct path, given the others, bool [N].
+
+    Without it, signals are multipath of an unknown level. `total` is the sum over the positions
+    that are `in_sight` and of the prior, of this weight, complex128 [N_B, R, R].
+    """
+    whitener = np.linalg.inv(np.linalg.cholesky(total))
+    with_path = np.einsum('irs,nis->nir', whitener, residuals)
+    without = with_path + np.einsum('irs,nis->nir', whitener, model.mean(positions))
+    # A position does not explain itself: its term in the total is a change of rank one.
+    share, counts = np.sum(np.abs(with_path)**2, axis=2), in_sight[:, None]
+    cross = np.abs(np.sum(with_path.conj() * without, axis=2))**2
+    others = weight - in_sight
+    energy = others * np.sum(share / (1 - share * counts), axis=1)
+    energy_without = others * np.sum(
+        np.sum(np.abs(without)**2, axis=2) + counts * cross / (1 - share * counts), axis=1)
+    level = np.log(10) / 10 * _BLOCKED_STD_DB * np.linspace(-3, 3, 61)
+    prior = np.exp(-np.linspace(-3, 3, 61)**2 / 2)
+    exponents = -energy_without[:, None] * np.exp(-level) - np.prod(model.shape) * level
+    highest = exponents.max(axis=1)
+    blocked = highest + np.log(np.exp(exponents - highest[:, None]) @ (prior / prior.sum()))
+    log_odds = np.log(1 / _BLOCKED_PROBABILITY - 1) - energy - blocked
+    result: np.ndarray = log_odds > 0
+    return result if result.any() else np.ones(len(result), bool)
 
 
 def _inflation(left_out: _LeftOut, n_measurements: int) -> float:

@@ -54,7 +54,7 @@ def test_the_covariance_is_that_of_the_hall(estimate, shipped):
 
 def test_the_report_lists_what_was_found(estimate):
     text = survey_report(estimate)
-    assert text.startswith('100 positions, codebook ')
+    assert text.startswith('100 positions, 0 more without a direct path, codebook ')
     assert 'in the 95 % region' in text
     assert 'warning' not in text
 
@@ -86,6 +86,19 @@ def test_estimates_after_a_survey_are_in_their_regions(shipped):
     assert shares['measured'][0] >= 0.98
     assert 0.91 <= shares['measured'][1] <= 0.995
     assert min(shares['declared']) < 0.8
+
+
+def test_positions_behind_obstacles_are_left_out(shipped):
+    """A third of the positions receives multipath alone, 6 dB weaker than that of the others."""
+    positions, received = send(HALL, shipped, 60)
+    model = MeasurementModel(HALL, shipped)
+    received[::3] = (received[::3] - model.mean(positions[::3])) / 2
+    estimate = survey(DECLARED, shipped, positions, received)
+    assert estimate.about['blocked'] == 20
+    seen = np.arange(60) % 3 > 0
+    alone = survey(DECLARED, shipped, positions[seen], received[seen])
+    np.testing.assert_allclose(estimate.excess, alone.excess, rtol=0.2,
+                               atol=0.05 * np.abs(alone.excess).max())
 
 
 def test_impairments_are_estimated_with_the_multipath(shipped):
