@@ -36,7 +36,7 @@ _PASSING = 0.99
 _FALSE_ALARM = 1e-9
 # Inflation that a survey without positions would have, and its weight in positions: a margin for
 # small surveys, in which the quantiles above are uncertain.
-_INFLATION, _INFLATION_WEIGHT = 1.6, 100
+_INFLATION, _INFLATION_WEIGHT = 1.8, 40
 # Smaller surveys, and those that span less of a side of the region, cause a warning.
 MIN_POSITIONS = 20
 _MIN_SPAN = 0.5

@@ -8,6 +8,7 @@ elements and users apply to a path as they do to a line of sight to its source.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,59 @@ class PathChannel(ArrayFile):
         if offset.size and offset.max() > _MAX_OFFSET_M:
             raise ArchiveError(f'src: {offset.max():.3g} m from the user for a direct path, '
                                f'expected at most {_MAX_OFFSET_M:g} m')
+
+    @classmethod
+    def from_sionna(cls, paths: Any, f0: float) -> 'PathChannel':
+        """Convert paths of Sionna RT, as its `PathSolver` returns them.
+
+        Users are the transmitters, and the only receiver is at the surface's centre, with axes
+        like those of the scenario. Both have one isotropic antenna. Paths from behind the surface
+        are removed.
+
+        Parameters
+        ----------
+        paths
+            Paths with specular reflections only.
+        f0
+            Frequency of the scene [Hz].
+
+        Raises
+        ------
+        ArchiveError
+            If there are several receivers or antennas, or the result is not possible.
+        """
+        a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
+        if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):
+            raise ArchiveError(f'a: shape {a.shape}, expected [1, 1, N, 1, P] of one receiver and '
+                               'N transmitters with one antenna each')
+        centre = np.array(paths.targets, float).T
+        users = np.array(paths.sources, float).T - centre
+        elevation, azimuth, delay = (
+            np.array(angles, float)[0] for angles in (paths.theta_r, paths.phi_r, paths.tau))
+        direction = np.stack([np.sin(elevation) * np.cos(azimuth),
+                              np.sin(elevation) * np.sin(azimuth), np.cos(elevation)], axis=-1)
+        sources = _SPEED_OF_LIGHT_MPS * delay[..., None] * direction
+        present = np.array(paths.valid)[0] & (sources[..., 0] > 0)
+        n = np.sum(np.array(paths.interactions)[:, 0] > 0, axis=0).astype(int)
+        return cls(users, np.where(present, a[0, 0, :, 0], 0),
+                   np.where(present[..., None], sources, 0.0), np.where(present, n, -1), f0)
+
+    @classmethod
+    def joined(cls, parts: Sequence['PathChannel']) -> 'PathChannel':
+        """Join the users of several channels of one frequency and without factors `gains`."""
+        n_paths = max(part.a.shape[1] for part in parts)
+
+        def padded(name: str, value: float) -> np.ndarray:
+            arrays = [getattr(part, name) for part in parts]
+            return np.concatenate([np.pad(
+                array, [(0, 0), (0, n_paths - array.shape[1]), *[(0, 0)] * (array.ndim - 2)],
+                constant_values=value) for array in arrays])
+
+        if len({part.f0 for part in parts}) > 1 or any(part.gains is not None for part in parts):
+            raise ArchiveError('f0: channels of several frequencies or with gains, expected one '
+                               'frequency and no gains')
+        return cls(np.concatenate([part.users for part in parts]), padded('a', 0),
+                   padded('src', 0), padded('n', -1), parts[0].f0)
 
     @functools.cached_property
     def sources(self) -> np.ndarray:

@@ -2,11 +2,14 @@
 
 import dataclasses
 import re
+import types
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, simulate_received
+from rhs_isac_ros.model.files import ArchiveError
 from rhs_isac_ros.model.los import direct_gain, los_gain
 from rhs_isac_ros.model.path_channel import PathChannel
 
@@ -149,3 +152,48 @@ def test_users_in_another_frame_are_refused(mirror):
                                 src=mirror.src + [40, 0, 0], a=0.1 * mirror.a)
     with pytest.raises(ScenarioError, match=re.escape('channel: users: 0 % in the region')):
         Scenario(channel=moved)
+
+
+@pytest.fixture(scope='module')
+def traced():
+    """Paths of two users in a concrete hall of 20 x 14 x 5 m, as Sionna RT 2.2 returned them."""
+    with np.load(Path(__file__).parents[1] / 'data' / 'sionna.npz') as archive:
+        arrays = dict(archive)
+    a = arrays.pop('a_real'), arrays.pop('a_imag')
+    return types.SimpleNamespace(a=a, **arrays)
+
+
+def test_paths_of_sionna_are_mirror_images(traced):
+    paths = PathChannel.from_sionna(traced, F0)
+    np.testing.assert_allclose(paths.users, [[8, 1, -0.5], [12, -3, 0.5]])
+    for user, image in ((0, [8, 13, -0.5]), (0, [8, -15, -0.5]), (0, [8, 1, -3.5]),
+                        (1, [27.9, -3, 0.5])):
+        distance = np.linalg.norm(paths.src[user] - image, axis=1)
+        (found,) = np.flatnonzero(distance < 1e-4)
+        assert paths.n[user, found] == 1
+        assert 0.01 < abs(paths.coefficients[user, found]) < 0.8
+    direct = (paths.n == 0) & (paths.a != 0)
+    assert direct.sum() == 2
+    np.testing.assert_allclose(paths.coefficients[direct], 1, rtol=1e-4)
+    assert (paths.src[paths.a != 0][:, 0] > 0).all()
+    assert (paths.n[paths.a == 0] == -1).all()
+    Scenario(channel=paths)
+
+
+def test_channels_are_joined_with_missing_paths(empty, mirror, users):
+    joined = Scenario(channel=PathChannel.joined([
+        empty, dataclasses.replace(mirror, users=users, src=mirror.src)]))
+    for rows, part in ((slice(20), empty), (slice(20, 40), mirror)):
+        np.testing.assert_array_equal(joined.channel.users[rows], part.users)
+        np.testing.assert_array_equal(
+            joined.channel.coefficients[rows, :part.a.shape[1]], part.coefficients)
+    assert (joined.channel.n[:20, 1] == -1).all()
+    with pytest.raises(ArchiveError, match='^f0: '):
+        PathChannel.joined([empty, dataclasses.replace(empty, f0=2.7e9)])
+
+
+def test_paths_of_sionna_to_several_antennas_are_refused(traced):
+    twice = types.SimpleNamespace(**vars(traced) | {
+        'a': [np.repeat(part, 2, axis=1) for part in traced.a]})
+    with pytest.raises(ArchiveError, match=r'^a: shape \(1, 2, 2, 1, '):
+        PathChannel.from_sionna(twice, F0)
