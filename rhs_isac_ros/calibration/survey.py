@@ -95,40 +95,26 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     n = len(pilots.positions)
     if not n:
         raise ValueError('positions: none given, expected at least one')
-    fields = dataclasses.replace(scenario, multipath=None)
-    in_sight, n_sight = np.ones(n, bool), n
-    for _ in range(_ROUNDS):
-        model = MeasurementModel(fields, codebook, surface)
-        residuals = _residuals(model, pilots)
-        sample = np.einsum('nir,nis->irs', residuals[in_sight], residuals[in_sight].conj())
-        fields, weight = _most_likely(fields, model, sample / n_sight, n_sight)
-        model = MeasurementModel(fields, codebook, surface)
-        declared = model.covariance()
-        total = weight * declared + sample
-        before, in_sight = in_sight, _in_sight(
-            model, pilots.positions, residuals, in_sight, total, weight + n_sight)
-        n_sight = int(in_sight.sum())
-        if (in_sight == before).all() and not len(nuisance_of(scenario)):
-            break
-    in_sight, n_sight = before, int(before.sum())
-    left_out = _left_out(model, pilots.positions[in_sight], residuals[in_sight], total,
-                         weight + n_sight - 1)
+    fit = _fitted(dataclasses.replace(scenario, multipath=None), pilots, surface)
+    model, n_sight = MeasurementModel(fit.fields, codebook, surface), int(fit.in_sight.sum())
+    left_out = _left_out(model, pilots.positions[fit.in_sight], fit.residuals[fit.in_sight],
+                         fit.total, fit.weight + n_sight - 1)
     inflation = _inflation(left_out, int(np.prod(model.shape)))
-    measured = inflation * total / (weight + n_sight)
+    measured, declared = inflation * fit.total / (fit.weight + n_sight), model.covariance()
     inverse = np.linalg.inv(declared)
     excess = inverse @ (measured - declared) @ inverse
-    texts = _warnings(scenario, pilots.positions[in_sight])
+    texts = _warnings(scenario, pilots.positions[fit.in_sight])
     if texts:
         warnings.warn('; '.join(texts), SurveyWarning, stacklevel=3)
     inside = int(np.sum(left_out.distances <= inflation * _radius()))
     about: dict[str, Any] = {
-        'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': weight,
+        'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': fit.weight,
         'inflation': inflation, 'coverage': [inside / n_sight, *_interval(inside, n_sight)],
-        'warnings': texts,
-        'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
+        'warnings': texts, 'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
     plain = scenario.fields()
     return MultipathEstimate(
-        **{name: getattr(fields, name) for name in FIELDS}, radiation=np.array(model.radiation),
+        **{name: getattr(fit.fields, name) for name in FIELDS},
+        radiation=np.array(model.radiation),
         excess=(excess + np.conj(np.swapaxes(excess, 1, 2))) / 2,
         conditions={name: plain[name] for name in CONDITIONS}, about=about)
 
@@ -147,6 +133,45 @@ def survey_report(estimate: MultipathEstimate) -> str:
         f'inflation of the covariance: {about["inflation"]:.2f}; {coverage:.1f} % '
         f'[{low:.1f}, {high:.1f}] of the positions left out are in the 95 % region',
         *(f'warning: {text}' for text in about['warnings'])])
+
+
+class _Fit(NamedTuple):
+    """The most likely fields of a scenario, and what follows from them.
+
+    Attributes
+    ----------
+    fields, weight
+        Scenario with the fields, and weight of the prior in positions.
+    residuals
+        Of all positions, complex128 [N, N_B, R].
+    in_sight
+        Which positions have a direct path, bool [N].
+    total
+        Sum over these positions and of the prior, complex128 [N_B, R, R].
+    """
+
+    fields: Scenario
+    weight: float
+    residuals: np.ndarray
+    in_sight: np.ndarray
+    total: np.ndarray
+
+
+def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
+    """Fit fields, impairments and positions without direct path in turn."""
+    has_nuisance, in_sight = len(nuisance_of(fields)) > 0, np.ones(len(pilots.positions), bool)
+    for _ in range(_ROUNDS):
+        model = MeasurementModel(fields, pilots.beams, surface)
+        residuals, n = _residuals(model, pilots), int(in_sight.sum())
+        sample = np.einsum('nir,nis->irs', residuals[in_sight], residuals[in_sight].conj())
+        fields, weight = _most_likely(fields, model, sample / n, n)
+        model = MeasurementModel(fields, pilots.beams, surface)
+        fit = _Fit(fields, weight, residuals, in_sight, weight * model.covariance() + sample)
+        in_sight = _in_sight(
+            model, pilots.positions, residuals, in_sight, fit.total, weight + n)
+        if (in_sight == fit.in_sight).all() and not has_nuisance:
+            break
+    return fit
 
 
 def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
