@@ -151,15 +151,15 @@ class Plain:
         return s.center_frequencies_hz[i] + (j + 1 - (s.n_subbands + 1) / 2) * s.subband_width_hz
 
     def element(self, m):
-        side = self.scenario.elements_per_side
-        middle = (side - 1) / 2
-        return np.array([0, m % side - middle, m // side - middle]) * self.interval
+        columns, rows = self.scenario.n_columns, self.scenario.n_rows
+        return np.array([0, m % columns - (columns - 1) / 2, m // columns - (rows - 1) / 2]) * (
+            self.interval)
 
     def feed(self, k):
         s = self.scenario
         if s.feed_positions_m is not None:
             return np.array(s.feed_positions_m[k])
-        board = s.elements_per_side * self.interval
+        board = s.n_columns * self.interval
         return np.array([0, ((k + 0.5) / s.n_feeds - 0.5) * board, 0])
 
     def los(self, position, i, j, m):

@@ -39,7 +39,7 @@ def geometry():
     plan.legend(loc='upper left', fontsize='small')
     board.plot(*elements[:, 1:].T * 100, 's', color='0.6', ms=7, label='elements')
     board.plot(*feeds[:, 1:].T * 100, 'D', color='C1', ms=6, mec='k', label='feeds')
-    for number in (0, 1, scenario.elements_per_side):
+    for number in (0, 1, scenario.n_columns):
         board.annotate(str(number), elements[number, 1:] * 100, ha='center', va='center',
                        fontsize=6)
     board.set(xlabel='$y$ [cm]', ylabel='$z$ [cm]', aspect='equal', title='from the region')

@@ -12,13 +12,13 @@ import numpy as np
 from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form, region_information
 from rhs_isac_ros.bounds.rows import (
     PLAIN,
-    CompressedRows,
     Evaluation,
-    ExactRows,
-    MeasurementRows,
     Pattern,
     RowSource,
+    Tick,
     blocks,
+    no_tick,
+    rows_within,
 )
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
@@ -31,8 +31,8 @@ from rhs_isac_ros.model.impairments.elements import (
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
 from rhs_isac_ros.model.multipath import (
     coupling,
+    declared_covariance,
     measurement_correlation,
-    multipath_covariance,
 )
 from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
@@ -101,6 +101,8 @@ class Average:
         Factors of the rows' means.
     combination
         The form's rows, if they are not those of the source.
+    tick
+        Called repeatedly while the rows are computed; an exception ends the computation.
 
     Attributes
     ----------
@@ -116,13 +118,12 @@ class Average:
     @one_blas_thread
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
                  loss: Loss, tolerance: float, patterns: Sequence[Pattern] = PLAIN,
-                 combination: Combination | None = None) -> None:
+                 combination: Combination | None = None, tick: Tick = no_tick) -> None:
         self.scenario, self._loss = scenario, loss
         self._n_rows, self._combination = n_rows, combination
         self.surface: SurfaceEstimate | None = None
-        self.rows: MeasurementRows = (
-            ExactRows(scenario, source, n_items, n_rows, patterns) if tolerance == 0
-            else CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns))
+        self.rows = rows_within(
+            scenario, source, n_items, n_rows, tolerance, patterns, tick)
 
     @one_blas_thread
     def value(self, codebook: Beamforming) -> float:
@@ -159,7 +160,7 @@ class Average:
             yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
 
     def _blocks(self) -> Iterator[slice]:
-        return blocks(self.rows.n_items, self._n_rows)
+        return blocks(self.rows.n_items, self._n_rows, self.rows.width)
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
         exact = self.surface.without_errors() if self.surface else None
@@ -208,7 +209,7 @@ class AverageCrlb(Average):
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
-                 region_prior: bool = False) -> None:
+                 region_prior: bool = False, tick: Tick = no_tick) -> None:
         self.positions = checked_positions(positions)
         if not len(self.positions):
             raise ValueError('positions: none given, expected at least one')
@@ -222,7 +223,7 @@ class AverageCrlb(Average):
         super().__init__(
             scenario, source, len(self.positions), 3 + len(patterns),
             self._marginal_trace if combination else self._trace_of_inverse,
-            tolerance, patterns or PLAIN, combination)
+            tolerance, patterns or PLAIN, combination, tick)
 
     def _trace_of_inverse(
             self, block: slice, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -295,13 +296,14 @@ def quadratic_gradients(
     """
     scenario = model.scenario
     correlation = np.conj(measurement_correlation(scenario))
-    spatial = multipath_covariance(scenario)
-    through_covariance = np.matmul(correlation * covariance_terms, model.radiation @ spatial)
+    declared = declared_covariance(scenario)
+    through_covariance = np.matmul(
+        correlation * covariance_terms, declared.scatter(model.radiation))
     if measured := scenario.multipath:
         to_survey = coupling(scenario, model.radiation, measured.radiation)
         through_covariance += np.matmul(
             correlation * (covariance_terms @ to_survey @ measured.excess),
-            measured.radiation @ spatial)
+            declared.scatter(measured.radiation))
     by_radiation = 4 * (through_covariance - mean_terms) / n_items
     terms: list[tuple[np.ndarray | float, np.ndarray | float, np.ndarray]]
     if surface:

@@ -6,13 +6,15 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import marginalise
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.measurement import position_blocks
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
-# Positions evaluated at a time.
-_BLOCK = 256
 # A normalised matrix with a smaller pivot is singular up to rounding.
 _MIN_PIVOT = 1e-14
+# A region thinner than this, in wavelengths, determines the coordinate.
+_NO_EXTENT = 1e-5
 
 
 @one_blas_thread
@@ -76,7 +78,8 @@ def region_information(scenario: Scenario) -> np.ndarray:
 
     The uniform distribution is replaced by a Gaussian of the same covariance, size^2 / 12.
     """
-    return np.diag(12 / np.array(scenario.roi_size_m)**2)
+    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+    return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:
@@ -146,8 +149,7 @@ def _information(
     information = np.zeros((len(positions), *[3 + len(patterns)] * 2))
     whiteners = model.whitener
 
-    def fill(start: int) -> None:
-        block = slice(start, start + _BLOCK)
+    def fill(block: slice) -> None:
         if len(patterns):
             directions = patterns * model.mean(positions[block])[:, None]
         for band, whitener in enumerate(whiteners):
@@ -156,7 +158,7 @@ def _information(
                 rows = np.concatenate([rows, directions[:, :, band]], axis=1)
             information[block] += quadratic_form(rows @ whitener.T)
 
-    map_blocks(fill, range(0, len(positions), _BLOCK))
+    map_blocks(fill, position_blocks(model.scenario, len(positions)))
     return information
 
 

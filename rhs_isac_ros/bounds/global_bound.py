@@ -120,15 +120,21 @@ class _Lattice:
         u, v = (axis.ravel() for axis in np.meshgrid(*directions, indexing='ij'))
         sight = np.stack([np.sqrt(np.maximum(1 - u**2 - v**2, 0)), u, v], axis=1)
         inside = np.ones((len(sight), len(ranges)), bool)
+        thickness: np.ndarray | float = 1.0
         for axis, (least, most) in enumerate(scenario.roi_bounds_m.T):
-            coordinate = sight[:, axis, None] * ranges
-            inside &= (coordinate >= least) & (coordinate <= most)
+            coordinate, cell = sight[:, axis, None] * ranges, steps[axis] * (ranges if axis else 1)
+            # A region thinner than a cell of the lattice has the thickness of a cell.
+            excess = np.maximum(cell - (most - least), 0) / 2
+            inside &= (coordinate >= least - excess) & (coordinate <= most + excess)
+            if np.any(excess):
+                thickness = thickness * (most - least + 2 * excess)
+        self._extends = np.ptp(scenario.roi_bounds_m, axis=0) > 0
         used = inside.any(axis=1)
         sight, inside = sight[used], inside[used]
         self._sight, self._ranges = sight, ranges
         with np.errstate(divide='ignore'):
             # The density of (r, u, v) is that of the position times r^2 / w.
-            self._prior = np.log(np.where(inside, ranges**2 / sight[:, :1], 0.0))
+            self._prior = np.log(np.where(inside, ranges**2 / thickness / sight[:, :1], 0.0))
         self._interpolate(sight, ranges, box[:, 0])
 
     def _interpolate(self, sight: np.ndarray, ranges: np.ndarray, limits: np.ndarray) -> None:
@@ -202,7 +208,7 @@ class _Lattice:
         weights = np.exp(values - values.max())
         weights /= weights.sum()
         truth, ranges = self._sight[ray] * self._ranges[index], self._ranges[at]
-        offsets = self._sight[rays[chosen]] * ranges[:, None] - truth
+        offsets = (self._sight[rays[chosen]] * ranges[:, None] - truth) * self._extends
         mean = weights @ offsets
         return np.array([
             *truth, weights @ np.sum((offsets - mean)**2, axis=1),
@@ -250,8 +256,10 @@ def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarra
     information = fisher_information_of(model, positions)
     diagonal = np.einsum('nap,nab,nbp->np', slopes, information, slopes).mean(axis=0)
     low, high = _polar_box(model.scenario)
+    extent = high - low
     steps: np.ndarray = np.minimum(
-        _STEPS / np.sqrt(np.maximum(diagonal, 1e-30)), (high - low) / _MIN_STEPS)
-    n_points = np.prod((high - low) / steps)
+        _STEPS / np.sqrt(np.maximum(diagonal, 1e-30)),
+        np.where(extent > 0, extent / _MIN_STEPS, np.inf))
+    n_points = np.prod(np.maximum(extent / steps, 1.0))
     coarseness = float(max(n_points / _MAX_POINTS, 1.0))**(1 / 3)
     return steps * coarseness, coarseness

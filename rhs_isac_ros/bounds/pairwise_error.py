@@ -11,7 +11,7 @@ import copy
 import numpy as np
 
 from rhs_isac_ros.bounds.average import Average, Combination
-from rhs_isac_ros.bounds.rows import PLAIN, CompressedRows
+from rhs_isac_ros.bounds.rows import PLAIN, CompressedRows, Tick, no_tick
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_gain
 from rhs_isac_ros.model.scenario import Scenario
@@ -42,6 +42,8 @@ class PairwiseErrorCost(Average):
         Weights of the pairs, float64 [N]; 1 by default.
     tolerance
         Relative error of the differences, see `CompressedRows`; 0 for exact ones.
+    tick
+        Called repeatedly while the differences are computed; an exception ends the computation.
 
     Raises
     ------
@@ -52,7 +54,8 @@ class PairwiseErrorCost(Average):
 
     def __init__(
             self, scenario: Scenario, first_positions: np.ndarray, second_positions: np.ndarray,
-            weights: np.ndarray | None = None, tolerance: float = 0.0) -> None:
+            weights: np.ndarray | None = None, tolerance: float = 0.0,
+            tick: Tick = no_tick) -> None:
         first_positions = checked_positions(first_positions)
         second_positions = checked_positions(second_positions)
         n = len(first_positions)
@@ -74,11 +77,11 @@ class PairwiseErrorCost(Average):
         if not self._scales.size:
             super().__init__(
                 scenario, lambda block, band: np.subtract(*gains(block, band))[:, None],
-                n, 1, self._confusion, tolerance)
+                n, 1, self._confusion, tolerance, tick=tick)
             return
         super().__init__(
             scenario, lambda block, band: np.stack(gains(block, band), axis=1), n, 2,
-            self._confusion, tolerance, PLAIN, _rows_of_bands(scenario.n_bands))
+            self._confusion, tolerance, PLAIN, _rows_of_bands(scenario.n_bands), tick)
 
     def sample(
             self, codebook: Beamforming, n: int, rng: np.random.Generator

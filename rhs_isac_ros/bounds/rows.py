@@ -17,14 +17,20 @@ from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 # Callable that takes (block of n items, band) and returns the items' rows, complex128
 # [n, G, N_SB, N_E].
 RowSource = Callable[[slice, int], np.ndarray]
+# Callable that a long computation calls repeatedly, and that may raise an exception to end it.
+Tick = Callable[[], None]
 # Rows and the factor of their means in each band and measurement, complex128 [N_B, N_SB F]; None
 # for 1. Together, the slices cover all rows.
 Pattern = tuple[slice, np.ndarray | None]
 PLAIN: Sequence[Pattern] = ((slice(None), None),)
 # Items of three rows per block: the arrays of a block fit into the cache.
 _BLOCK = 128
+# Largest number of complex numbers in a block of exact rows.
+_BLOCK_NUMBERS = 1 << 21
 # Memory for exact rows that are kept between evaluations.
 _CACHE_BYTES = 1 << 30
+# Products with a basis of more vectors take as long as those with the rows of a few positions.
+_MAX_RANK = 192
 # Minimum number of columns of the first sketch. Each further sketch has twice as many.
 _MIN_SKETCH = 128
 # Number of rows from which the basis of many rows is found, and the share of the tolerance that
@@ -33,6 +39,10 @@ _SKETCHED_ROWS = 2048
 _SKETCH_MARGIN = 0.8
 # Smaller relative errors are lost in the rounding of Gram matrices.
 MIN_TOLERANCE = 1e-7
+
+
+def no_tick() -> None:
+    """Do nothing."""
 
 
 class GradientSums(NamedTuple):
@@ -63,6 +73,8 @@ class MeasurementRows:
                  patterns: Sequence[Pattern], n_groups: int) -> None:
         self.n_items, self.n_rows, self.patterns = n_items, n_rows, patterns
         self.n_groups, self._n_in_group = n_groups, scenario.n_subbands // n_groups
+        # Complex numbers of an exact row.
+        self.width = scenario.n_subbands * scenario.n_elements
         self.bases: list[np.ndarray | None] = [None] * scenario.n_bands
 
     def begin(self, model: MeasurementModel) -> 'Evaluation':
@@ -147,7 +159,8 @@ class Evaluation:
         rows = self._rows.in_block(block, band)
         n_groups, n, n_rows, rank = rows.shape
         # Accumulate the conjugate, so that the coefficients need not be copied.
-        grouped = np.conj(weighted).reshape(n, n_rows, n_groups, -1)
+        grouped = np.conj(weighted, dtype=rows.dtype, casting='same_kind').reshape(
+            n, n_rows, n_groups, -1)
         for (part, _), weights in zip(self._patterns, self._weights[band], strict=True):
             chosen = rows[:, :, part].reshape(n_groups, -1, rank)
             weights += np.matmul(
@@ -171,28 +184,66 @@ class Evaluation:
             self._rows.sums(band, total), np.conj(whitener.T) @ products @ whitener)
 
 
+def rows_within(
+        scenario: Scenario, source: RowSource, n_items: int, n_rows: int, tolerance: float,
+        patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick) -> MeasurementRows:
+    """Return rows with a relative error, see `CompressedRows`; exact ones for an error of 0.
+
+    Few rows that would need a large basis are exact up to single precision. `tick` is called
+    repeatedly.
+    """
+    if tolerance == 0:
+        return ExactRows(scenario, source, n_items, n_rows, patterns, tick)
+    if n_items * n_rows <= _SKETCHED_ROWS and any(
+            _rank_of_some(scenario, source, n_items, n_rows, tolerance, band) > _MAX_RANK
+            for band in range(scenario.n_bands)):
+        return ExactRows(scenario, source, n_items, n_rows, patterns, tick, np.complex64)
+    return CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns, tick)
+
+
+def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
+                  tolerance: float, band: int) -> int:
+    """Rank of some rows and columns, slightly more than `_MAX_RANK`, to a tolerance."""
+    size, width = 2 * _MAX_RANK, scenario.n_subbands * scenario.n_elements
+    if n_items * n_rows <= size or width <= 3 * size:
+        return 0
+    columns = streams.generator(0, streams.SKETCH, size).permutation(width)[:size]
+    parts = []
+    for block in blocks(n_items, n_rows, width):
+        chosen = slice(block.start, block.stop, max(n_items * n_rows // size, 1))
+        rows = source(chosen, band)
+        parts.append(rows.reshape(-1, width)[:, columns])
+    some = np.concatenate(parts)
+    norms = np.linalg.norm(some, axis=1)
+    coefficients = some[norms > 0] / norms[norms > 0, None]
+    values = np.linalg.eigvalsh(np.conj(coefficients.T) @ coefficients / max(len(some), 1))
+    return int(np.sum(np.cumsum(values) > tolerance**2))
+
+
 class ExactRows(MeasurementRows):
     """Rows without approximation, kept between evaluations if they fit within the memory limit."""
 
     def __init__(
             self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-            patterns: Sequence[Pattern] = PLAIN) -> None:
+            patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick,
+            kind: type[np.complexfloating] = np.complex128) -> None:
         super().__init__(scenario, n_items, n_rows, patterns, n_groups=scenario.n_subbands)
-        self._source = source
-        size = 16 * n_items * n_rows * scenario.n_bands * scenario.n_subbands * scenario.n_elements
+        self._source, self._tick, self._kind = source, tick, kind
+        size = np.dtype(kind).itemsize * n_items * n_rows * scenario.n_bands * self.width
         self._keeps_all = size <= _CACHE_BYTES
         # Beyond the limit, only the current block is kept: an evaluation uses its rows twice.
         self._kept: dict[tuple[int, int], np.ndarray] = {}
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
-        """Return the rows of a block, complex128 [N_SB, n, G, N_E]."""
+        """Return the rows of a block, complex [N_SB, n, G, N_E]."""
         key = block.start, band
         if key not in self._kept:
+            self._tick()
             if not self._keeps_all and any(start != block.start for start, _ in self._kept):
                 self._kept.clear()
             # With sub-bands first, every matrix product reads contiguous memory.
             self._kept[key] = np.ascontiguousarray(
-                np.moveaxis(self._source(block, band), 2, 0))
+                np.moveaxis(self._source(block, band), 2, 0), self._kind)
         return self._kept[key]
 
 
@@ -210,18 +261,22 @@ class CompressedRows(MeasurementRows):
     """
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
-                 tolerance: float, patterns: Sequence[Pattern] = PLAIN) -> None:
+                 tolerance: float, patterns: Sequence[Pattern] = PLAIN,
+                 tick: Tick = no_tick) -> None:
         super().__init__(scenario, n_items, n_rows, patterns, n_groups=1)
+        width, self.width = self.width, 0
         self.coefficients: list[np.ndarray] = []
         for band in range(scenario.n_bands):
             def flat_rows(block: slice, band: int = band) -> np.ndarray:
                 # A single item can have another memory layout, of which a view as real numbers
                 # fails.
+                tick()
                 rows = source(block, band)
                 return np.ascontiguousarray(rows.reshape(-1, rows.shape[2] * rows.shape[3]))
 
             coefficients, basis = _compress(
-                flat_rows, n_items, n_rows, tolerance, _first_sketch(scenario))
+                flat_rows, list(blocks(n_items, n_rows, width)), n_items * n_rows, tolerance,
+                _first_sketch(scenario))
             self.coefficients.append(coefficients)
             self.bases[band] = basis.reshape(1, scenario.n_subbands, scenario.n_elements, -1)
 
@@ -249,30 +304,33 @@ class CompressedRows(MeasurementRows):
         return rows.reshape(1, -1, self.n_rows, rows.shape[1])
 
 
-def blocks(n_items: int, n_rows: int = 3) -> Iterator[slice]:
-    """Split items of `n_rows` rows each, in order, into blocks that fit into the cache."""
+def blocks(n_items: int, n_rows: int = 3, width: int = 0) -> Iterator[slice]:
+    """Split items of `n_rows` rows each, in order, into blocks that fit into the cache.
+
+    Blocks of very wide rows are smaller.
+    """
     size = max(3 // n_rows, 1) * _BLOCK
+    size = max(min(size, _BLOCK_NUMBERS // max(n_rows * width, 1)), 1)
     for start in range(0, n_items, size):
         yield slice(start, min(start + size, n_items))
 
 
 def _first_sketch(scenario: Scenario) -> int:
     """Columns of the first sketch: enough for Table I, and more for larger surfaces."""
-    return max(_MIN_SKETCH, scenario.n_elements // 2)
+    return max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK))
 
 
-def _compress(rows_of: Callable[[slice], np.ndarray], n_items: int, n_rows: int,
+def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows: int,
               tolerance: float, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients [n_items n_rows, R] and an orthonormal basis [N_SB N_E, R] of the rows."""
+    """Coefficients [n_rows, R] and an orthonormal basis [N_SB N_E, R] of the rows of blocks."""
     if not MIN_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f'tolerance: {tolerance:g}, expected {MIN_TOLERANCE:g} to 1, or 0 for exact rows')
-    every = list(blocks(n_items))
     # A basis is found from some of many rows, and accepted if its error for all rows is small.
-    used = every[::max(n_items * n_rows // _SKETCHED_ROWS, 1)]
+    used = every[::max(n_rows // _SKETCHED_ROWS, 1)]
     while True:
         wanted = tolerance if len(used) == len(every) else _SKETCH_MARGIN * tolerance
-        n_used = sum(block.stop - block.start for block in used) * n_rows
+        n_used = sum(block.stop - block.start for block in used) * n_rows // every[-1].stop
         basis = _sketch(rows_of, used, min(size, n_used))
         coefficients, relative = _project(rows_of, used, basis)
         keep, error = _leading(relative, wanted)

@@ -201,7 +201,7 @@ def report(calibration: Calibration, scenario: Scenario) -> str:
 
 
 def _place(scenario: Scenario, element: int) -> str:
-    row, column = divmod(element, scenario.elements_per_side)
+    row, column = divmod(element, scenario.n_columns)
     return f'element {element} (row {row}, column {column})'
 
 

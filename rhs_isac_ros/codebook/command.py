@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import dataclasses
 import importlib.util
+import math
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -270,12 +271,17 @@ def _progress_bar(options: argparse.Namespace) -> Iterator[Callable[[Progress], 
     with tqdm(total=total, unit='step', disable=None if sys.stderr.isatty() else False,
               mininterval=0.2 if sys.stderr.isatty() else 10.0) as bar:
         def show(progress: Progress) -> None:
-            bar.set_description(f'{progress.value_m2:.5f} m^2', refresh=False)
+            bar.set_description(_value(progress), refresh=False)
             bar.update(progress.step - bar.n)
         yield show
 
 
 def _print_progress(progress: Progress) -> None:
     if progress.step % 50 == 0:
-        print(f'step {progress.step}: {progress.value_m2:.5f} m^2 after '
-              f'{progress.elapsed_s:.0f} s', file=sys.stderr)
+        print(f'step {progress.step}: {_value(progress)} after {progress.elapsed_s:.0f} s',
+              file=sys.stderr)
+
+
+def _value(progress: Progress) -> str:
+    return ('setting up the objective' if math.isinf(progress.value_m2)
+            else f'{progress.value_m2:.5f} m^2')

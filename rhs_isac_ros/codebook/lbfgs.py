@@ -31,16 +31,27 @@ def run_lbfgs(
         on_step: Callable[[], None], memory: int = _MEMORY) -> OptimizeResult:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    `on_step` is called after each of at most `max_steps` steps; `memory` is the number of
-    corrections.
+    The result does not depend on the unit of the function, whose value is positive. `on_step` is
+    called after each of at most `max_steps` steps; `memory` is the number of corrections.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
 
     # SciPy multiplies the corrections with a BLAS of its own.
     one_blas_thread.find_libraries()
-    return minimize(
-        objective, start, jac=True, method='L-BFGS-B', bounds=bounds,
+    unit = 0.0
+
+    def relative(variables: np.ndarray) -> tuple[float, np.ndarray]:
+        """Divide by the value at the start: SciPy's tolerances are for values of about 1."""
+        nonlocal unit
+        value, gradient = objective(variables)
+        unit = unit or value or 1.0
+        return value / unit, gradient / unit
+
+    result = minimize(
+        relative, start, jac=True, method='L-BFGS-B', bounds=bounds,
         callback=lambda _: on_step(),
         options={'maxiter': max_steps, 'maxfun': 20 * max_steps,
                  'maxcor': memory, 'ftol': 1e-10, 'gtol': 1e-10})
+    result.fun, result.jac = unit * result.fun, unit * result.jac
+    return result

@@ -1,4 +1,8 @@
-"""Objectives of the codebook optimisation."""
+"""Objectives of the codebook optimisation.
+
+`tick` is called repeatedly while the parts of an objective that do not depend on the codebook are
+computed; an exception ends the computation.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -7,6 +11,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import AverageCrlb, PairwiseErrorCost
 from rhs_isac_ros.bounds.average import Average
+from rhs_isac_ros.bounds.rows import Tick, no_tick
 from rhs_isac_ros.codebook.sampling import WIDE, confusable_volumes, draw_confusable
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import checked_positions
@@ -23,16 +28,18 @@ _VOLUME_POWER = 0.6
 
 
 def average_bound(
-        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
+        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
+        tick: Tick = no_tick) -> Average:
     """Implements Eq. (17). Objective of P1 [m^2] on sampled positions, float64 [N_sam, 3] [m].
 
     Raise ValueError if `positions` is empty or not a finite [N, 3] array. `rng` is unused.
     """
-    return AverageCrlb(scenario, positions, ROW_TOLERANCE)
+    return AverageCrlb(scenario, positions, ROW_TOLERANCE, tick=tick)
 
 
 def nuisance(
-        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
+        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
+        tick: Tick = no_tick) -> Average:
     """Objective [m^2]: average bound with unknown phases of the bands and the region as prior.
 
     A phase is unknown in effect even where the signals carry it, because the same phase occurs in
@@ -45,11 +52,12 @@ def nuisance(
     """
     uniform = dataclasses.replace(
         scenario, band_phase_std_rad=max(scenario.band_phase_std_rad, 2 * np.pi))
-    return AverageCrlb(uniform, positions, ROW_TOLERANCE, region_prior=True)
+    return AverageCrlb(uniform, positions, ROW_TOLERANCE, region_prior=True, tick=tick)
 
 
 def ambiguity(
-        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
+        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
+        tick: Tick = no_tick) -> Average:
     """Objective [m^2]: mean cost of confusing sampled positions with similar-looking ones.
 
     The positions are float64 [N_sam, 3] [m]; `rng` draws those that they may be confused with.
@@ -58,10 +66,12 @@ def ambiguity(
     first_positions = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng)
     return PairwiseErrorCost(
-        scenario, first_positions, second_positions, tolerance=ROW_TOLERANCE)
+        scenario, first_positions, second_positions, tolerance=ROW_TOLERANCE, tick=tick)
 
 
-def error(scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -> Average:
+def error(
+        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
+        tick: Tick = no_tick) -> Average:
     """Objective [m^2]: the cost of `ambiguity`, with weights close to those of the squared error.
 
     Pairs extend farther across the line of sight, up to the far side lobes. Their weights grow
@@ -78,9 +88,9 @@ def error(scenario: Scenario, positions: np.ndarray, rng: np.random.Generator) -
     if len(weights):
         weights /= weights.mean()
     return PairwiseErrorCost(
-        scenario, first_positions, second_positions, weights, ROW_TOLERANCE)
+        scenario, first_positions, second_positions, weights, ROW_TOLERANCE, tick)
 
 
-OBJECTIVES: Mapping[str, Callable[[Scenario, np.ndarray, np.random.Generator], Average]] = {
+OBJECTIVES: Mapping[str, Callable[..., Average]] = {
     'ambiguity': ambiguity, 'crlb': average_bound, 'error': error,
     'nuisance': nuisance}

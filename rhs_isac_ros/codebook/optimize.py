@@ -1,7 +1,8 @@
 """Optimisation of a codebook by any method: sampling, start, limits and provenance."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from rhs_isac_ros.codebook.search import BudgetSpent, Progress, Search
 from rhs_isac_ros.codebook.start import STARTS, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, streams
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.model.threads import one_blas_thread
 
 # Sobol points; as good as 1200 independent positions.
@@ -35,7 +37,7 @@ class Method(NamedTuple):
     """An optimisation method with its default limit on update steps.
 
     `minimize` takes a `Search` and returns the reason for stopping. `minimize` is None for a
-    method whose result is its start.
+    method whose result is its start; its objective is not set up.
     """
 
     minimize: Callable[[Search], str] | None
@@ -116,7 +118,8 @@ def optimize(
     max_evaluations
         Maximum number of evaluations of the objective; by default unlimited.
     progress
-        Called after each step.
+        Called after each step, and once a second while the objective is set up, with an infinite
+        value. An exception ends the optimisation; on KeyboardInterrupt, the start is returned.
     keep
         Called at most every ten seconds with the result so far.
 
@@ -157,28 +160,43 @@ def optimize(
     first = resume or start or STARTS.get(method, random_codebook)(
         scenario, streams.generator(seed, streams.START))
     check_start(first, scenario)
-    average = OBJECTIVES[objective](scenario, positions, streams.generator(seed, streams.PAIRS))
     surface = None
     if calibration:
         calibration.check(scenario)
-        average.surface = surface = calibration.surface
-    problem = Problem(scenario, average)
+        surface = calibration.surface
 
-    def result(reason: str) -> OptimizeResult:
-        best = problem.unpack(search.best)
+    def result(best: Codebook, history: Sequence[Progress], reason: str) -> OptimizeResult:
         bound = float(crlb_of(MeasurementModel(scenario, best, surface), positions).mean())
-        text = provenance.to_text(search.history[-1], reason)
+        if not history:
+            # Without an objective, only the bound is known.
+            value_m2 = _determined(bound) if objective == 'crlb' else np.nan
+            history = [Progress(done.steps, done.evaluations, value_m2, 0.0)]
+            report(history[0])
+        text = provenance.to_text(history[-1], reason)
         return OptimizeResult(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
-            tuple(search.history), reason)
+            tuple(history), reason)
 
+    report = _Report(progress, Progress(done.steps, done.evaluations, np.inf, 0.0))
+    unsearched = dataclasses.replace(first, analog=on_levels(scenario, first.analog))
+    if METHODS[method].minimize is None:
+        return result(unsearched, (), 'nothing to optimise')
+    try:
+        average = OBJECTIVES[objective](
+            scenario, positions, streams.generator(seed, streams.PAIRS), report.tick)
+    except KeyboardInterrupt:
+        return result(unsearched, (), INTERRUPTED)
+    average.surface = surface
+    problem = Problem(scenario, average)
     minimize = _minimizer(problem, method)
     search = Search(
         problem, problem.pack(first), max_steps, max_evaluations,
         streams.generator(seed, streams.METHOD),
-        _PeriodicCall(progress, lambda: keep(result('not finished'))) if keep else progress,
-        (done.steps, done.evaluations))
-    return result(_run(search, minimize))
+        _PeriodicCall(report, lambda: keep(
+            result(problem.unpack(search.best), search.history, 'not finished')))
+        if keep else report, (done.steps, done.evaluations))
+    reason = _run(search, minimize)
+    return result(problem.unpack(search.best), search.history, reason)
 
 
 def check_start(codebook: Codebook, scenario: Scenario) -> None:
@@ -190,7 +208,7 @@ def check_start(codebook: Codebook, scenario: Scenario) -> None:
     codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
 
 
-def _minimizer(problem: Problem, method: str) -> Callable[[Search], str] | None:
+def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
     """Return the function of a method, or raise ValueError if it needs continuous amplitudes."""
     scenario = problem.scenario
     if scenario.amplitude_levels and method == 'lbfgs':
@@ -201,26 +219,54 @@ def _minimizer(problem: Problem, method: str) -> Callable[[Search], str] | None:
             "'lbfgs' or 'genetic'")
     if method == 'lbfgs' and problem.n_pairs >= FEWEST_PAIRS:
         return minimize_sampled
-    return METHODS[method].minimize
+    minimize = METHODS[method].minimize
+    assert minimize is not None
+    return minimize
 
 
-def _run(search: Search, minimize: Callable[[Search], str] | None) -> str:
+def _determined(value_m2: float) -> float:
+    """Return the objective at the start, or raise ValueError if it is not finite."""
+    if not np.isfinite(value_m2):
+        raise ValueError(
+            f'positions: objective {value_m2} at the start, expected a finite one: the signals '
+            'of the scenario do not determine the position')
+    return value_m2
+
+
+def _run(search: Search, minimize: Callable[[Search], str]) -> str:
     """Evaluate the start, run a method, and return why it stopped."""
     try:
-        value = search.begin()
-        if not np.isfinite(value):
-            raise ValueError(
-                f'positions: objective {value} at the start, expected a finite one: the signals '
-                'of the scenario do not determine the position')
-        if search.max_steps < 1:
-            return 'max_steps reached'
-        return minimize(search) if minimize else 'nothing to optimise'
+        _determined(search.begin())
+        return 'max_steps reached' if search.max_steps < 1 else minimize(search)
     except BudgetSpent:
         search.finish()
         return 'max_evaluations reached'
     except KeyboardInterrupt:
         search.finish()
         return INTERRUPTED
+
+
+class _Report:
+    """Progress callback that is also called once a second before the first step."""
+
+    _PERIOD_S = 1.0
+
+    def __init__(self, progress: Callable[[Progress], None] | None, before: Progress) -> None:
+        self._progress, self._before = progress, before
+        self._begin, self._is_searching = time.perf_counter(), False
+
+    def __call__(self, entry: Progress) -> None:
+        self._is_searching = True
+        if self._progress:
+            self._progress(entry)
+
+    def tick(self) -> None:
+        """Report the time since the beginning, at most once per period."""
+        elapsed_s = time.perf_counter() - self._begin
+        if not (self._is_searching or elapsed_s < self._before.elapsed_s + self._PERIOD_S):
+            self._before = dataclasses.replace(self._before, elapsed_s=elapsed_s)
+            if self._progress:
+                self._progress(self._before)
 
 
 class _PeriodicCall:

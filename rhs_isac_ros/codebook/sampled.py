@@ -45,15 +45,13 @@ def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple
     scale[search.n_analog:] = _DIGITAL_SCALE
     sample = search.sample(start, n_pairs)
     lowest, point, done = np.inf, start, 0
-    # The tolerances of L-BFGS-B are for values of about 1.
-    unit = max(search.value_m2, np.finfo(float).tiny)
 
     def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal lowest, point
         value, gradient = sample(scaled * scale)
         if value < lowest:
             lowest, point = value, scaled * scale
-        return value / unit, gradient * scale / unit
+        return value, gradient * scale
 
     def on_step() -> None:
         nonlocal done

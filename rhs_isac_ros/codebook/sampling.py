@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import element_interval_m
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
 # Grid points of the range lag per shortest carrier wavelength.
@@ -14,6 +15,8 @@ _LAGS_PER_WAVELENGTH = 64
 NEAR, WIDE = (0.03, 0.3), (0.03, 0.6)
 # Fraction of the pairs that differ in direction only.
 _ZERO_LAG_FRACTION = 0.3
+# Lags in radians, and squared displacements in beam widths, that are zero but for rounding.
+_ROUNDING = 1e-7
 # Number of attempts to draw a position inside the region.
 _MAX_DRAWS = 200
 
@@ -77,17 +80,18 @@ def confusable_volumes(
     true position occupies: with signals whose amplitude is inversely proportional to the range
     r, it grows as r^5.
     """
-    ranges, other_ranges = (
-        np.maximum(np.linalg.norm(points, axis=1), 1e-3) for points in (positions, others))
-    lags, density = _lag_density(scenario)
-    lag = np.abs(other_ranges - ranges)
     # Lags of zero stand for those below the phase of a radian.
     shortest = SPEED_OF_LIGHT_MPS / (2 * np.pi * max(scenario.center_frequencies_hz))
-    by_lag = np.where(lag < 1e-9, _ZERO_LAG_FRACTION / shortest,
+    ranges, other_ranges = (
+        np.maximum(np.linalg.norm(points, axis=1), shortest) for points in (positions, others))
+    lags, density = _lag_density(scenario)
+    lag = np.abs(other_ranges - ranges)
+    by_lag = np.where(lag < _ROUNDING * shortest, _ZERO_LAG_FRACTION / shortest,
                       (1 - _ZERO_LAG_FRACTION) * np.interp(lag, lags, density))
     cosine = np.sum(positions * others, axis=1) / (ranges * other_ranges)
     # The squared displacement in beam widths; its density is an average of Gaussians.
-    square = np.maximum(1 / np.clip(cosine, 0.01, 1)**2 - 1, 1e-8) / _beam_width(scenario)**2
+    square = np.maximum(
+        (1 / np.clip(cosine, 0.01, 1)**2 - 1) / _beam_width(scenario)**2, _ROUNDING)
     narrow, wide = (np.exp(-square / (2 * scale**2)) for scale in scales)
     by_direction = (wide - narrow) / (2 * np.pi * square * np.log(scales[1] / scales[0]))
     volumes: np.ndarray = other_ranges**2 / (
@@ -98,7 +102,8 @@ def confusable_volumes(
 def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
                rng: np.random.Generator, scales: tuple[float, float]) -> np.ndarray:
     """Move positions by range lags of random sign and randomly across the line of sight."""
-    n = len(positions)
+    n, (low, high) = len(positions), scenario.roi_bounds_m
+    free = high > low
     ranges = np.linalg.norm(positions, axis=1, keepdims=True)
     sight = positions / np.maximum(ranges, 1e-9)
     least, most = np.log(scales)
@@ -106,10 +111,13 @@ def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
     transverse = rng.normal(size=(n, 3)) * scale
     transverse -= sight * np.sum(transverse * sight, axis=1, keepdims=True)
     lags = lags * rng.choice([-1, 1], size=n)
-    moved = positions + transverse
-    rescaled: np.ndarray = (
-        moved * (ranges + lags[:, None]) / np.linalg.norm(moved, axis=1, keepdims=True))
-    return rescaled
+    moved: np.ndarray = positions + free * transverse
+    # Coordinates without extent stay as they are, and the others determine the range.
+    wanted = ranges[:, 0] + lags
+    within = np.sqrt(np.maximum(wanted**2 - np.sum(moved[:, ~free]**2, axis=1), 0))
+    within = np.copysign(within, wanted) / np.linalg.norm(moved[:, free], axis=1)
+    moved[:, free] *= within[:, None]
+    return moved
 
 
 def _lag_distribution(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +141,6 @@ def _lag_density(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 def _beam_width(scenario: Scenario) -> float:
     """Return the width of the narrowest beam that the surface can form [rad]."""
-    frequencies = np.array(scenario.center_frequencies_hz)
-    side = (scenario.elements_per_side * scenario.element_interval_wavelengths
-            * np.mean(SPEED_OF_LIGHT_MPS / frequencies))
-    return float(min(SPEED_OF_LIGHT_MPS / frequencies.max() / side, 1.0))
+    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+    side = max(scenario.n_columns, scenario.n_rows) * element_interval_m(scenario)
+    return float(min(shortest / side, 1.0))

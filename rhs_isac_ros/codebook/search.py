@@ -102,7 +102,7 @@ class Search:
 
     def finish(self) -> None:
         """Record a last step if there were evaluations since the previous one."""
-        if self._evaluations > self.history[-1].evaluations:
+        if not self.history or self._evaluations > self.history[-1].evaluations:
             self.on_step()
 
     def value(self, variables: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from rhs_isac_ros.link.water_filling import water_filling
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain_at
-from rhs_isac_ros.model.multipath import spatial_covariance
+from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
@@ -31,7 +31,7 @@ class BandLink:
     los
         Line-of-sight gains, complex128 [N_SB, N_E].
     spatial
-        V_i [N_E, N_E]: float64 if it is declared, and complex128 if it is measured.
+        V_i.
     noise_power_w, power_w
         Noise power of a sub-band, and power of the digital part over all sub-bands [W].
     fixed
@@ -40,7 +40,7 @@ class BandLink:
 
     onboard: np.ndarray
     los: np.ndarray
-    spatial: np.ndarray
+    spatial: SpatialCovariance
     noise_power_w: float
     power_w: float
     fixed: np.ndarray
@@ -57,14 +57,14 @@ class BandLink:
         ValueError
             If the position is not a finite [3] array.
         """
-        onboard, spatial, fixed = arrays(scenario, surface)
+        onboard, fixed = arrays(scenario, surface)
         if isinstance(bands, int):
             (los,) = los_gain_at(scenario, position, [bands])
         else:
             los = los_gain_at(scenario, position, bands)
         index = band_index(bands)
-        return cls(onboard[index], los, spatial[index], scenario.noise_power_w,
-                   scenario.max_power_w, fixed)
+        return cls(onboard[index], los, spatial_covariance(scenario)[index],
+                   scenario.noise_power_w, scenario.max_power_w, fixed)
 
     def at_subbands(self, subbands: np.ndarray) -> 'BandLink':
         """Return the links in some sub-bands, with the share of the power that is theirs."""
@@ -101,26 +101,11 @@ class BandLink:
         Returns B_j diag(c), complex128 [..., N_SB, K, N_E], its product with V_i, and its product
         with the line-of-sight gains, complex128 [..., N_SB, K, 1].
         """
-        several = self.spatial.ndim == 3
         onboard, los = self.onboard, self.los[..., None]
-        if several:
+        if onboard.ndim == 4:
             onboard, los = onboard[:, None], los[:, None]
         configured = onboard * analog[..., None, None, :]
-        return configured, self.scatter(configured), np.matmul(configured, los)
-
-    def scatter(self, weights: np.ndarray) -> np.ndarray:
-        """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
-        n = weights.shape[-1]
-        if np.iscomplexobj(self.spatial):
-            several: np.ndarray = np.matmul(
-                weights.reshape(*self.spatial.shape[:-2], -1, n), self.spatial)
-            return several.reshape(weights.shape)
-        rows = weights.reshape(*self.spatial.shape[:-2], -1, n)
-        # A real product takes half the time of a complex one.
-        parts = np.concatenate([rows.real, rows.imag], axis=-2) @ self.spatial
-        result = np.empty(rows.shape, complex)
-        result.real, result.imag = np.split(parts, 2, axis=-2)
-        return result.reshape(weights.shape)
+        return configured, self.spatial.scatter(configured), np.matmul(configured, los)
 
     @staticmethod
     def correlations(
@@ -141,22 +126,19 @@ def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
 
 @functools.lru_cache(maxsize=16)
 def arrays(scenario: Scenario, surface: SurfaceEstimate | None
-           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the arrays that do not depend on the position: `onboard`, `spatial` and `fixed`.
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the arrays that do not depend on the position, both read-only.
 
-    Those of the first two are of all bands. All are read-only.
+    These are `onboard` of all bands, and `fixed`.
     """
     onboard, fixed = onboard_matrix(scenario), np.zeros(scenario.n_elements, bool)
     if surface:
         fixed = surface.failed
         coefficients = np.where(fixed, surface.offsets, surface.gains)
         onboard = surface.band_gains[:, None, None, None] * coefficients * onboard
-    spatial = spatial_covariance(scenario)
-    if not scenario.multipath:
-        spatial = np.ascontiguousarray(spatial.real)
-    for array in (onboard, spatial, fixed):
+    for array in (onboard, fixed):
         array.flags.writeable = False
-    return onboard, spatial, fixed
+    return onboard, fixed
 
 
 @functools.lru_cache(maxsize=16)

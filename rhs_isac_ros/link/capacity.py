@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rhs_isac_ros.link.band_link import arrays, band_index
+from rhs_isac_ros.link.band_link import band_index
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import direct_gain, los_sums
+from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.model.threads import one_blas_thread
@@ -59,15 +60,8 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
     bands = [beam.band for beam in beams]
     radiation = np.stack([_radiation(scenario, beam) for beam in beams])
     direct = np.abs(los_sums(scenario, positions, bands, radiation))**2
-    spatial = arrays(scenario, None)[1][band_index(bands)]
-    # Of a Hermitian V, the imaginary part mixes the real and imaginary parts of the radiation. It
-    # is zero unless V was measured.
-    parts = np.concatenate([radiation.real, radiation.imag], axis=1)
-    scattered = np.sum((parts @ spatial.real) * parts, axis=-1).reshape(len(beams), 2, 1, -1)
-    scattered = scattered.sum(axis=1)
-    if np.iscomplexobj(spatial):
-        mixed = (radiation.real @ spatial.imag) * radiation.imag
-        scattered += 2 * np.sum(mixed, axis=-1)[:, None]
+    through = spatial_covariance(scenario)[band_index(bands)].scatter(radiation)
+    scattered = np.sum((through * np.conj(radiation)).real, axis=-1)[:, None]
     snr = (direct + scattered) / scenario.noise_power_w
     rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
     return rates

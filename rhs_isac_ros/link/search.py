@@ -8,10 +8,14 @@ import numpy as np
 from rhs_isac_ros.link import band_link
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
-# Largest share of the multipath power that the modes may omit.
-_MAX_OMITTED = 0.02
+# Largest share of the multipath power that the modes may omit, unless that takes more of them.
+# The ascent from the configurations that are found includes all of it.
+_MAX_OMITTED, _MAX_MODES = 0.02, 256
+# Relative accuracy of the powers of modes.
+_MODE_TOLERANCE = 1e-3
 # Sub-bands whose phases drift apart by more than this over the surface are searched separately,
 # up to a limited number.
 _MAX_DRIFT_RAD = 1.0
@@ -118,10 +122,10 @@ def candidate_configurations(
 @functools.lru_cache(maxsize=16)
 def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     """Compute the tables for a scenario and a calibrated surface."""
-    onboard, spatial, failed = band_link.arrays(scenario, surface)
+    onboard, failed = band_link.arrays(scenario, surface)
     subbands = band_link.representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
     on_board = np.moveaxis(onboard[:, subbands], -1, 1)
-    modes = _modes(spatial)
+    modes = _modes(scenario)
     paths = np.zeros((*on_board.shape, 1 + modes.shape[2]), np.complex64)
     paths[..., 1:] = on_board[..., None] * modes[:, :, None, None]
     rng = np.random.default_rng(0)
@@ -138,18 +142,41 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
         peaks, _scattered_configurations(scaled, fixed, rng), fixed)
 
 
-def _modes(spatial: np.ndarray) -> np.ndarray:
+def _modes(scenario: Scenario) -> np.ndarray:
     """Return the strongest modes of the multipath in each band, [N_B, N_E, L].
 
     Bands with fewer modes than others have columns of zeros.
     """
-    powers, directions = np.linalg.eigh(spatial)
+    spatial = spatial_covariance(scenario)
+    powers, directions = (
+        _strongest(spatial) if spatial.matrix is None else np.linalg.eigh(spatial.matrix))
     powers, directions = np.maximum(powers[:, ::-1], 0), directions[:, :, ::-1]
-    omitted = 1 - np.cumsum(powers, axis=1) / powers.sum(axis=1, keepdims=True)
+    omitted = 1 - np.cumsum(powers, axis=1) / np.sum(spatial.power, axis=1, keepdims=True)
     n_modes = 1 + np.sum(omitted > _MAX_OMITTED, axis=1)
     powers[np.arange(powers.shape[1]) >= n_modes[:, None]] = 0
     modes: np.ndarray = directions * np.sqrt(powers)[:, None]
     return modes[:, :, :n_modes.max()]
+
+
+def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest eigenvalues and the eigenvectors, as `numpy.linalg.eigh` does."""
+    from scipy.sparse.linalg import LinearOperator, eigsh
+
+    pairs = []
+    for band in range(len(spatial.power)):
+        def times(vector: np.ndarray, own: SpatialCovariance = spatial[band]) -> np.ndarray:
+            # V is Hermitian: V w is the conjugate of conj(w) V.
+            product = np.conj(own.scatter(np.conj(vector.ravel())))
+            return np.asarray(product.real if own.is_real else product)
+
+        start = np.random.default_rng(0).normal(size=spatial.n_elements)
+        start = start.astype(float if spatial.is_real else complex)
+        operator = LinearOperator((len(start), len(start)), times, dtype=start.dtype)
+        powers, directions = eigsh(operator, _MAX_MODES, v0=start, tol=_MODE_TOLERANCE)
+        # Those of complex matrices are in no particular order.
+        order = np.argsort(powers)
+        pairs.append((powers[order], directions[:, order]))
+    return np.stack([one for one, _ in pairs]), np.stack([other for _, other in pairs])
 
 
 def _scattered_configurations(

@@ -24,13 +24,14 @@ def element_positions(scenario: Scenario) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        Float64 [N_E, 3] [m], read-only. The index of an element is row * side + column; a row
-        runs along y, a column along z.
+        Float64 [N_E, 3] [m], read-only. The index of an element is row * n_columns + column; a
+        row runs along y, a column along z.
     """
-    side = scenario.elements_per_side
-    line = (np.arange(side) - (side - 1) / 2) * element_interval_m(scenario)
-    z, y = np.meshgrid(line, line, indexing='ij')
-    positions = np.stack([np.zeros(side**2), y.ravel(), z.ravel()], axis=1)
+    y, z = ((np.arange(n) - (n - 1) / 2) * element_interval_m(scenario)
+            for n in (scenario.n_columns, scenario.n_rows))
+    lattice = np.zeros((scenario.n_rows, scenario.n_columns, 3))
+    lattice[..., 1], lattice[..., 2] = y, z[:, None]
+    positions: np.ndarray = lattice.reshape(-1, 3)
     positions.flags.writeable = False
     return positions
 
@@ -43,7 +44,7 @@ def feed_positions(scenario: Scenario) -> np.ndarray:
     if scenario.feed_positions_m is not None:
         return np.array(scenario.feed_positions_m)
     n_feeds = scenario.n_feeds
-    length = scenario.elements_per_side * element_interval_m(scenario)
+    length = scenario.n_columns * element_interval_m(scenario)
     positions = np.zeros((n_feeds, 3))
     positions[:, 1] = ((np.arange(n_feeds) + 0.5) / n_feeds - 0.5) * length
     return positions

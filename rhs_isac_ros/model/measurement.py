@@ -35,8 +35,8 @@ from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
 
 # Knowledge of the elements of one surface: their errors, or an estimate of them.
 Surface = ElementErrors | SurfaceEstimate
-# Positions evaluated at a time.
-_BLOCK = 256
+# Largest number of positions evaluated at a time, and of gains of all elements and sub-bands.
+_BLOCK, _MAX_GAINS = 256, 1 << 21
 # Gain, radial factor, and boresight term or None, complex128 [N_SB, N, N_E].
 _Terms: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 # Number of unit phasors in the table of `_phasors`.
@@ -77,6 +77,12 @@ def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
     products = np.matmul(stacked, np.swapaxes(frames, 1, 2))
     derivative: np.ndarray = np.moveaxis(products, 0, 1).reshape(n, n_rows, -1)
     return derivative
+
+
+def position_blocks(scenario: Scenario, n: int) -> list[slice]:
+    """Split n positions into blocks whose line-of-sight gains need little memory."""
+    size = max(min(_BLOCK, _MAX_GAINS // (scenario.n_subbands * scenario.n_elements)), 1)
+    return [slice(start, start + size) for start in range(0, n, size)]
 
 
 class MeasurementModel:
@@ -199,12 +205,11 @@ class MeasurementModel:
         positions = checked_positions(positions)
         result = np.empty((len(positions), *rows, *self.shape), complex)
 
-        def fill(start: int) -> None:
-            block = slice(start, start + _BLOCK)
+        def fill(block: slice) -> None:
             for band in range(len(self.radiation)):
                 result[block, ..., band, :] = of_band(positions[block], band)
 
-        map_blocks(fill, range(0, len(positions), _BLOCK))
+        map_blocks(fill, position_blocks(self.scenario, len(positions)))
         return result
 
     def mean_and_jacobian(

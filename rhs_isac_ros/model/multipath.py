@@ -6,6 +6,9 @@ it, see `multipath_estimate`.
 """
 
 import functools
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,48 +17,236 @@ from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_
 from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
-# Gauss-Legendre nodes on the quarter of the angular domain in which the profile is smooth.
+# Gauss-Legendre nodes on an interval of angles in which the profile is smooth, and the largest
+# phase over the elements that they resolve.
 _ANGLE_NODES = 160
+_PANEL_PHASE_RAD = 400.0
+# Number of elements above which products with V_i are convolutions.
+_MAX_MATRIX = 1024
+# Complex numbers processed at a time.
+_BLOCK_NUMBERS = 1 << 22
 # Nodes along each side of the region of interest, where 1 / r^2 is smooth.
 _ROI_NODES = 24
 
 
-@functools.lru_cache(maxsize=16)
 def multipath_covariance(scenario: Scenario) -> np.ndarray:
     """Implements Eq. (2). Covariance of the multipath gains of the elements that fields declare.
 
-    The power-angle profile is a product of two Laplacians of `angular_spread_deg`, normalised
-    over the half space in front of the surface and scaled by the mean line-of-sight power in the
-    region of interest times ``multipath_to_los_db``. The paper leaves the scale open; that both
-    powers are equal by default is the reading of this package. The profile is even in azimuth and
-    elevation, so the covariance is real. The covariance of two elements depends only on their
-    lattice offset. A gain pattern of the elements weights the profile. Returns V_i,
-    complex128 [N_B, N_E, N_E], read-only.
+    The power-angle profile is a product of two Laplacians of `angular_spread_deg` about
+    `multipath_direction_deg`, normalised over the half space in front of the surface and scaled by
+    the mean line-of-sight power in the region of interest times ``multipath_to_los_db``. The paper
+    leaves the scale open; that both powers are equal by default is the reading of this package. A
+    gain pattern of the elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E].
+    `declared_covariance` needs less memory for many elements.
     """
-    side = scenario.elements_per_side
-    azimuth, weights = _profile_quadrature(scenario)
-    offsets = np.arange(side) * element_interval_m(scenario)
-    row, column = np.divmod(np.arange(side**2), side)
-    rows, columns = np.abs(row[:, None] - row), np.abs(column[:, None] - column)
-    covariance = np.empty((scenario.n_bands, side**2, side**2), complex)
-    for band, frequency in enumerate(scenario.center_frequencies_hz):
-        wavenumber = 2 * np.pi * frequency / SPEED_OF_LIGHT_MPS
-        # Direction (cos el cos az, cos el sin az, sin el); nodes are shared by both angles.
-        across = np.cos(azimuth)[:, None] * np.sin(azimuth)
-        along_y = np.cos(wavenumber * across[..., None] * offsets)
+    return _matrix(_lattice(scenario), scenario)
+
+
+class SpatialCovariance:
+    """V_i of Eq. (2) for products with it, in one band or in several with a leading axis.
+
+    The declared covariance of two elements depends only on their lattice offset, so that a product
+    is a convolution. For few elements, a matrix is as fast. A measured covariance adds a term of
+    low rank.
+
+    Attributes
+    ----------
+    power
+        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
+    is_real
+        Whether V_i is real, as for an even profile that is not measured.
+    matrix
+        V_i [..., N_E, N_E]; None for many elements.
+    """
+
+    def __init__(self, shape: tuple[int, int], is_real: bool, power: np.ndarray,
+                 matrix: np.ndarray | None, spectrum: np.ndarray | None,
+                 excess: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        self._shape, self.is_real, self.power = shape, is_real, power
+        self.matrix, self._spectrum, self._excess = matrix, spectrum, excess
+
+    @property
+    def n_elements(self) -> int:
+        """Number of elements N_E."""
+        return math.prod(self._shape)
+
+    def __getitem__(self, bands: int | slice | list[int]) -> 'SpatialCovariance':
+        """Return V_i of some bands."""
+        return SpatialCovariance(
+            self._shape, self.is_real, self.power[bands],
+            None if self.matrix is None else self.matrix[bands],
+            None if self._spectrum is None else self._spectrum[bands],
+            self._excess and (self._excess[0][bands], self._excess[1][bands]))
+
+    def plus(self, weights: np.ndarray, factor: np.ndarray) -> 'SpatialCovariance':
+        """Return the sum with F^H W F, of W [N_B, R, R] and F [N_B, R, N_E]; W is Hermitian."""
+        through = np.matmul(weights, factor)
+        power = self.power + np.sum(np.conj(factor) * through, axis=-2).real
+        if self.matrix is None:
+            return SpatialCovariance(
+                self._shape, False, power, None, self._spectrum, (through, factor))
+        matrix = self.matrix + np.matmul(np.conj(np.swapaxes(factor, -2, -1)), through)
+        matrix.flags.writeable = False
+        return SpatialCovariance(self._shape, False, power, matrix, None)
+
+    def scatter(self, weights: np.ndarray) -> np.ndarray:
+        """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
+        rows = weights.reshape(*self.power.shape[:-1], -1, weights.shape[-1])
+        result = np.empty(rows.shape, complex)
+        if self.matrix is None:
+            self._convolve(rows, result)
+        elif not self.is_real:
+            np.matmul(rows, self.matrix, out=result)
+        else:
+            # A real product takes half the time of a complex one.
+            parts = np.concatenate([rows.real, rows.imag], axis=-2) @ self.matrix
+            result.real, result.imag = np.split(parts, 2, axis=-2)
+        return result.reshape(weights.shape)
+
+    def _convolve(self, rows: np.ndarray, result: np.ndarray) -> None:
+        from scipy import fft
+
+        assert self._spectrum is not None
+        lattice = rows.reshape(*rows.shape[:-1], *self._shape)
+        (n_rows, n_columns), sizes = self._shape, self._spectrum.shape[-2:]
+        block = max(_BLOCK_NUMBERS // math.prod(sizes), 1)
+        for start in range(0, rows.shape[-2], block):
+            part = slice(start, start + block)
+            waves = fft.fft2(lattice[..., part, :, :], sizes)
+            waves *= self._spectrum[..., None, :, :]
+            found = fft.ifft2(waves, overwrite_x=True)[..., :n_rows, :n_columns]
+            result[..., part, :] = found.reshape(result[..., part, :].shape)
+        if self._excess:
+            through, factor = self._excess
+            result += np.matmul(rows @ np.conj(np.swapaxes(factor, -2, -1)), through)
+
+
+@functools.lru_cache(maxsize=16)
+def spatial_covariance(scenario: Scenario) -> SpatialCovariance:
+    """Return V_i of all bands; a measured covariance is averaged over the measurements."""
+    declared = declared_covariance(scenario)
+    if not (measured := scenario.multipath):
+        return declared
+    correlation = measurement_correlation(scenario)
+    weights = measured.excess * np.matmul(
+        np.swapaxes(correlation, 1, 2), np.conj(correlation)) / correlation.shape[1]
+    return declared.plus(weights, declared.scatter(measured.radiation))
+
+
+@functools.lru_cache(maxsize=16)
+def declared_covariance(scenario: Scenario) -> SpatialCovariance:
+    """Return V_i of all bands as fields declare it, the same in all measurements."""
+    lattice, shape = _lattice(scenario), (scenario.n_rows, scenario.n_columns)
+    is_real = not lattice.imag.any()
+    power = np.repeat(lattice[:, shape[0] - 1, shape[1] - 1, None].real, scenario.n_elements, 1)
+    if scenario.n_elements <= _MAX_MATRIX:
+        matrix = _matrix(lattice.real if is_real else lattice, scenario)
+        return SpatialCovariance(shape, is_real, power, matrix, None)
+    from scipy import fft
+
+    # A circle long enough that nothing wraps around; the offset 0 comes first.
+    kernel = np.zeros((len(lattice), *(fft.next_fast_len(2 * n - 1) for n in shape)), complex)
+    kernel[:, :2 * shape[0] - 1, :2 * shape[1] - 1] = np.conj(lattice)
+    kernel = np.roll(kernel, (1 - shape[0], 1 - shape[1]), axis=(1, 2))
+    return SpatialCovariance(shape, is_real, power, None, fft.fft2(kernel).real)
+
+
+def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:
+    row, column = np.divmod(np.arange(scenario.n_elements), scenario.n_columns)
+    matrix: np.ndarray = lattice[:, row[:, None] - row + scenario.n_rows - 1,
+                                 column[:, None] - column + scenario.n_columns - 1]
+    matrix.flags.writeable = False
+    return matrix
+
+
+@functools.lru_cache(maxsize=16)
+def _lattice(scenario: Scenario) -> np.ndarray:
+    """Compute V_i by the offset of the elements, complex128 [N_B, 2 rows - 1, 2 columns - 1].
+
+    The offset 0 is in the middle.
+    """
+    is_even = [not angle for angle in scenario.multipath_direction_deg]
+    lattice = np.empty((scenario.n_bands, 2 * scenario.n_rows - 1, 2 * scenario.n_columns - 1),
+                       complex)
+    for band in range(scenario.n_bands):
+        total = np.zeros((1, 1, 1))
+        for waves in _plane_waves(scenario, band, is_even):
+            along_y = np.einsum('a,eay->ey', waves.azimuth_weights,
+                                waves.along_y * np.square(waves.gain)[..., None])
+            # Offsets of either sign along z, and not negative ones along y.
+            along_z = [waves.along_z]
+            if not is_even[1]:
+                along_z.append(np.conj(waves.along_z))
+            total = total + np.stack([
+                np.einsum('e,ey,ez->zy', waves.elevation_weights, along_y, one)
+                for one in along_z])
+        half = np.concatenate([total[-1][:0:-1], total[0]])
+        half = half * _mean_power(scenario, band)
+        lattice[band] = np.concatenate([np.conj(half[::-1, :0:-1]), half], axis=1)
+    return lattice
+
+
+class _PlaneWaves(NamedTuple):
+    """Plane waves from E elevations and A azimuths.
+
+    Attributes
+    ----------
+    elevation_weights, azimuth_weights
+        Shares of the power, float64 [E] and [A].
+    gain
+        Gain of an element in their directions, a number or float64 [E, A].
+    along_z, along_y
+        Phasors at the rows [E, rows] and at the columns [E, A, columns]; their real parts alone
+        if the profile is even.
+    """
+
+    elevation_weights: np.ndarray
+    azimuth_weights: np.ndarray
+    gain: float | np.ndarray
+    along_z: np.ndarray
+    along_y: np.ndarray
+
+
+def _plane_waves(
+        scenario: Scenario, band: int, is_even: Sequence[bool], n_draws: int = 1
+) -> Iterator[_PlaneWaves]:
+    """Yield the waves of a quadrature over the profile, some elevations at a time.
+
+    Of an even profile in azimuth or elevation, only the positive angles are needed. The number of
+    elevations leaves memory for `n_draws` amplitudes of each wave.
+    """
+    wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
+    columns, rows = (np.arange(n) * element_interval_m(scenario)
+                     for n in (scenario.n_columns, scenario.n_rows))
+    # The elevation affects the phases along both axes.
+    lengths = columns[-1], math.hypot(columns[-1], rows[-1])
+    (azimuth, azimuth_weights), (elevations, elevation_weights) = (
+        _profile_quadrature(
+            _fields(scenario).angular_spread_deg, mean, even, wavenumber * length)
+        for mean, even, length in zip(
+            scenario.multipath_direction_deg, is_even, lengths, strict=True))
+    phasors = [np.cos if even else lambda phase: np.exp(1j * phase) for even in is_even]
+    step = max(_BLOCK_NUMBERS // (len(azimuth) * max(len(columns), n_draws)), 1)
+    for start in range(0, len(elevations), step):
+        elevation = elevations[start:start + step]
+        # Direction (cos el cos az, cos el sin az, sin el).
+        across = np.cos(elevation)[:, None] * np.sin(azimuth)
+        gain: float | np.ndarray
         if isinstance(scenario.element_gain, GainPattern):
             # The cosine of the angle from the boresight is cos el cos az.
-            angles = np.arccos(np.cos(azimuth)[:, None] * np.cos(azimuth))
-            along_y *= scenario.element_gain.amplitude(angles)[..., None]**2
-        along_y = np.einsum('a,eay->ey', weights, along_y)
-        along_z = np.cos(wavenumber * np.sin(azimuth)[:, None] * offsets)
-        lattice = np.einsum('e,ey,ez->zy', weights, along_y, along_z)
-        scale = mean_los_power(scenario, band) * 10 ** (_fields(scenario).multipath_to_los_db / 10)
-        if not isinstance(scenario.element_gain, GainPattern):
-            scale *= scenario.element_gain**2
-        covariance[band] = scale * lattice[rows, columns]
-    covariance.flags.writeable = False
-    return covariance
+            gain = scenario.element_gain.amplitude(
+                np.arccos(np.cos(elevation)[:, None] * np.cos(azimuth)))
+        else:
+            gain = np.full((1, 1), scenario.element_gain)
+        yield _PlaneWaves(
+            elevation_weights[start:start + step], azimuth_weights, gain,
+            phasors[1](wavenumber * np.sin(elevation)[:, None] * rows),
+            phasors[0](wavenumber * across[..., None] * columns))
+
+
+def _mean_power(scenario: Scenario, band: int) -> float:
+    level_db = _fields(scenario).multipath_to_los_db
+    return mean_los_power(scenario, band) * float(10 ** (level_db / 10))
 
 
 def mean_los_power(scenario: Scenario, band: int) -> float:
@@ -131,7 +322,7 @@ def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np
 
     Returns complex128 [N_B, N_SB F, N_SB F] for matrices T_i, complex128 [N_B, N_SB F, N_E].
     """
-    scattered = np.matmul(radiation @ multipath_covariance(scenario),
+    scattered = np.matmul(declared_covariance(scenario).scatter(radiation),
                           np.conj(np.swapaxes(other, 1, 2)))
     covariance: np.ndarray = measurement_correlation(scenario) * scattered
     return covariance
@@ -148,69 +339,72 @@ def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarra
 
 
 @functools.lru_cache(maxsize=16)
-def spatial_covariance(scenario: Scenario) -> np.ndarray:
-    """Compute the covariance of the gains of the elements, averaged over the measurements.
-
-    Returns complex128 [N_B, N_E, N_E], read-only. A declared covariance is real and the same in
-    all measurements.
-    """
-    declared = multipath_covariance(scenario)
-    if not (measured := scenario.multipath):
-        return declared
-    correlation = measurement_correlation(scenario)
-    weights = measured.excess * np.matmul(
-        np.swapaxes(correlation, 1, 2), correlation.conj()) / correlation.shape[1]
-    across = np.matmul(declared, np.conj(np.swapaxes(measured.radiation, 1, 2)))
-    covariance: np.ndarray = declared + np.matmul(
-        across @ weights, np.conj(np.swapaxes(across, 1, 2)))
-    covariance.flags.writeable = False
-    return covariance
-
-
-@functools.lru_cache(maxsize=16)
-def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray | None, np.ndarray], ...]:
     """Compute the factors with which `draw_multipath` correlates the gains.
 
-    For each band, these are G [N_E, r] with G G^H = V_i, and L [N_SB F, s] with L L^H = K_ft;
-    r and s are the numerical ranks.
+    For each band, these are G [N_E, r] with G G^H = V_i as declared, or None for many elements,
+    and L [N_SB F, s] with L L^H = K_ft; r and s are the numerical ranks.
     """
-    pairs = zip(multipath_covariance(scenario), measurement_correlation(scenario), strict=True)
-    return tuple((square_root(spatial), square_root(correlation))
-                 for spatial, correlation in pairs)
+    has_matrix = declared_covariance(scenario).matrix is not None
+    matrices = multipath_covariance(scenario) if has_matrix else [None] * scenario.n_bands
+    return tuple(
+        (None if spatial is None else square_root(spatial), square_root(correlation))
+        for spatial, correlation in zip(
+            matrices, measurement_correlation(scenario), strict=True))
 
 
 def draw_multipath(
         scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw multipath gains h^MP of n independent phases, complex128 [n, N_SB F, N_E]."""
     spatial, over_rows = multipath_factors(scenario)[band]
-    white = complex_normal((n, over_rows.shape[1], spatial.shape[1]), rng)
-    if scenario.multipath:
-        basis, stretch = _stretches(scenario)[band]
-        flat = white.reshape(n, -1)
-        white = white + (flat @ basis.conj() @ stretch.T @ basis.T).reshape(white.shape)
-    gains: np.ndarray = over_rows @ (white @ spatial.T)
+    n_draws = over_rows.shape[1]
+    if spatial is None:
+        drawn = _draw_plane_waves(scenario, band, n * n_draws, rng).reshape(n, n_draws, -1)
+    else:
+        drawn = complex_normal((n, n_draws, spatial.shape[1]), rng) @ spatial.T
+    gains: np.ndarray = over_rows @ drawn
+    if measured := scenario.multipath:
+        stretch, factor = _stretches(scenario)[band]
+        signals = np.sum(gains * measured.radiation[band], axis=-1) @ stretch.T
+        gains += (measurement_correlation(scenario)[band] * signals[:, None]) @ np.conj(factor)
+    return gains
+
+
+def _draw_plane_waves(
+        scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw n vectors of gains from independent plane waves, which need no factor of V_i."""
+    drawn = np.zeros((1, 1, 1))
+    for waves in _plane_waves(scenario, band, (False, False), n):
+        amplitudes = complex_normal(
+            (len(waves.elevation_weights), n, len(waves.azimuth_weights)), rng)
+        amplitudes *= (waves.gain * np.sqrt(
+            waves.elevation_weights[:, None] * waves.azimuth_weights))[:, None]
+        drawn = drawn + np.einsum(
+            'ez,eny->nzy', waves.along_z, np.matmul(amplitudes, waves.along_y), optimize=True)
+    gains: np.ndarray = np.sqrt(_mean_power(scenario, band)) * drawn
     return gains
 
 
 @functools.lru_cache(maxsize=16)
 def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Compute how a measured covariance changes the white numbers of `draw_multipath`.
+    """Compute how a measured covariance changes gains with the declared one.
 
-    For each band, these are Q with orthonormal columns and D, so that white numbers z become
-    z + Q D Q^H z.
+    For each band, these are A and T V_0, so that gains g become g + C_0 T^H A T g. With the
+    covariance S of the signals T g, and R = S^(1/2), it follows from `multipath_estimate` that
+    R A R = (1 + R M R)^(1/2) - 1.
     """
     assert scenario.multipath
-    stretches = []
-    for (spatial, over_rows), radiation, excess in zip(
-            multipath_factors(scenario), scenario.multipath.radiation, scenario.multipath.excess,
-            strict=True):
-        # The signals of the survey are linear in the white numbers.
-        signals = (over_rows[:, :, None] * (radiation @ spatial)[:, None]).reshape(
-            len(radiation), -1)
-        basis, triangle = np.linalg.qr(np.conj(signals.T))
-        values, vectors = np.linalg.eigh(triangle @ excess @ np.conj(triangle.T))
+    radiation, stretches = scenario.multipath.radiation, []
+    for declared, excess, factor in zip(
+            coupling(scenario, radiation, radiation), scenario.multipath.excess,
+            declared_covariance(scenario).scatter(radiation), strict=True):
+        root = square_root(declared)
+        values, vectors = np.linalg.eigh(np.conj(root.T) @ excess @ root)
         growth = np.sqrt(np.maximum(1 + values, 0.0)) - 1
-        stretches.append((basis, vectors * growth @ np.conj(vectors.T)))
+        # Columns of the root are orthogonal.
+        inverse = root / np.sum(np.abs(root)**2, axis=0)
+        whitened = inverse @ vectors
+        stretches.append((whitened * growth @ np.conj(whitened.T), factor))
     return tuple(stretches)
 
 
@@ -225,16 +419,28 @@ def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
     return scenario.multipath or scenario
 
 
-def _profile_quadrature(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes on [0, pi/2] and weights of the Laplacian profile, normalised to a sum of one."""
+def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
+                        ) -> tuple[np.ndarray, np.ndarray]:
+    """Angles [n] and weights [n] of the Laplacian profile, normalised to a sum of one.
+
+    The phase [rad] over the elements determines the number. Of an even profile, only the positive
+    angles are included.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
-    angles = (nodes + 1) * np.pi / 4
-    spread = np.deg2rad(_fields(scenario).angular_spread_deg)
-    # The interval begins at the cusp, zero, and ends earlier for a narrow profile.
-    reach = min(1.0, 30 * spread / (np.pi / 2))
-    angles = angles * reach
-    density = weights * np.exp(-np.sqrt(2) * angles / spread)
-    return angles, density / density.sum()
+    mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
+    angles, density = [], []
+    signs = (1,) if is_even else (-1, 1)
+    # An interval begins at the cusp, the mean, and ends earlier for a narrow profile.
+    reaches = [min(1 - sign * mean / (np.pi / 2), 30 * spread / (np.pi / 2)) for sign in signs]
+    for sign, reach in zip(signs, reaches, strict=True):
+        panels = math.ceil(phase * reach / _PANEL_PHASE_RAD) or 1
+        for panel in range(panels):
+            distance = (nodes + 1 + 2 * panel) * (np.pi / 4) * (reach / panels)
+            share = reach / panels / sum(reaches)
+            angles.append(mean + sign * distance)
+            density.append(share * weights * np.exp(-np.sqrt(2) * distance / spread))
+    whole = np.concatenate(density)
+    return np.concatenate(angles), whole / whole.sum()
 
 
 def square_root(matrix: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ FIELDS = ('multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg')
 # Fields on which it depends; they are written to the file.
 CONDITIONS = (
     'center_frequencies_hz', 'n_subbands', 'subband_width_hz', 'n_frames', 'elements_per_side',
-    'element_interval_wavelengths', 'roi_center_m', 'roi_size_m')
+    'element_interval_wavelengths', 'multipath_direction_deg', 'roi_center_m', 'roi_size_m')
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

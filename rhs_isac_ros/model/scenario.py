@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
 import math
 import numbers
@@ -20,6 +21,8 @@ from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.plugins import PluginError
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
+# Relative rounding of differences between frequencies.
+_ROUNDING = 1e-9
 
 
 class ScenarioError(ValueError):
@@ -54,8 +57,9 @@ class Table1:
     n_frames: int = declare(4, 1, 4096, 'Frames F of each band.', label='frames $F$')
     frame_duration_s: float = declare(
         4e-6, 1e-12, 1.0, 'Duration of a frame.', 's', label=r'frame duration $\Delta_t$')
-    elements_per_side: int = declare(
-        10, 1, 128, 'Elements along one side of the square surface.',
+    elements_per_side: int | tuple[int, int] = declare(
+        10, 1, 128, 'Elements along a side of the square surface, or two numbers for a rectangle: '
+        'elements along y and along z.',
         label=r'elements along a side $\sqrt{N_\mathrm{E}}$')
     element_interval_wavelengths: float = declare(
         0.3, 1e-3, 10.0, 'Spacing of the elements, in mean wavelengths.',
@@ -91,7 +95,8 @@ class Table1:
         (10.0, 0.0, 0.0), -1e6, 1e6, 'Centre of the region of interest.', 'm',
         label='centre of the region')
     roi_size_m: tuple[float, float, float] = declare(
-        (10.0, 10.0, 2.0), 1e-6, 1e6, 'Side lengths of the region of interest.', 'm',
+        (10.0, 10.0, 2.0), 0.0, 1e6,
+        'Side lengths of the region of interest; 0 for no extent along an axis.', 'm',
         label='size of the region')
 
 
@@ -113,6 +118,10 @@ class Extensions:
         'the region. The paper does not normalise the profile of Eq. (2); 0 dB is the reading '
         'of this package.', 'dB',
         'inverse Rice factor, 3GPP TR 38.901, section 7.5', label='multipath / direct path')
+    multipath_direction_deg: tuple[float, float] = declare(
+        (0.0, 0.0), -90.0, 90.0,
+        'Mean direction of the multipath, azimuth and elevation; in the paper the boresight.',
+        'deg', label='mean direction of the multipath')
     user_gain_std_db: float = declare(
         0.0, 0.0, 60.0,
         "Standard deviation of the gain of a user, log-normal, in addition to user_gain: "
@@ -217,11 +226,20 @@ class Scenario(Extensions, Table1):
             raise ScenarioError(
                 f'roi_center_m: {self.roi_center_m} with roi_size_m {self.roi_size_m} reaches '
                 'behind the surface, expected x > 0 in the whole region')
+        if not any(self.roi_size_m):
+            raise ScenarioError(
+                f'roi_size_m: {self.roi_size_m}, expected at least one length above 0')
         span_hz = self.n_subbands * self.subband_width_hz
-        if span_hz >= 2 * min(self.center_frequencies_hz):
+        frequencies_hz = sorted(self.center_frequencies_hz)
+        if span_hz >= 2 * frequencies_hz[0]:
             raise ScenarioError(
                 f'subband_width_hz: {self.n_subbands} sub-bands span {span_hz:g} Hz, expected '
                 'less than twice the lowest centre frequency')
+        for low, high in itertools.pairwise(frequencies_hz):
+            if high - low < span_hz * (1 - _ROUNDING):
+                raise ScenarioError(
+                    f'center_frequencies_hz: {low:g} and {high:g} Hz, expected at least '
+                    f'{span_hz:g} Hz apart, the width of a band of {self.n_subbands} sub-bands')
         if self.amplitude_levels == 1:
             raise ScenarioError(
                 'amplitude_levels: 1, expected 0 for continuous amplitudes, or at least 2')
@@ -279,14 +297,14 @@ class Scenario(Extensions, Table1):
     @functools.cached_property
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
-        fields = self.fields()
-        # Identifiers in existing files precede these fields.
-        if not self.impairments:
-            del fields['impairments']
-        for name in _FILES:
-            if (arrays := fields.pop(name)) is not None:
+        changes, fields = self.changes(), self.fields()
+        for name in ('impairments', 'multipath_direction_deg', *_FILES):
+            # Identifiers in existing files precede these fields.
+            if name not in changes:
+                del fields[name]
+            elif name in _FILES:
                 # The same file has the same identifier on every host.
-                fields[name] = arrays.rpartition('@')[2]
+                fields[name] = fields[name].rpartition('@')[2]
         return f'sc{hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:16]}'
 
     @property
@@ -295,9 +313,21 @@ class Scenario(Extensions, Table1):
         return len(self.center_frequencies_hz)
 
     @property
+    def n_columns(self) -> int:
+        """Number of elements along y."""
+        sides = self.elements_per_side
+        return sides if isinstance(sides, int) else sides[0]
+
+    @property
+    def n_rows(self) -> int:
+        """Number of elements along z."""
+        sides = self.elements_per_side
+        return sides if isinstance(sides, int) else sides[1]
+
+    @property
     def n_elements(self) -> int:
         """Number of elements N_E."""
-        return self.elements_per_side**2
+        return self.n_columns * self.n_rows
 
     @property
     def noise_power_w(self) -> float:
@@ -367,15 +397,25 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
         return _strengths(field, value)
     if name in _FILES:
         return _arrays(field, value)
-    if field.type is int or isinstance(field.default, int):
-        if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-            raise ScenarioError(f'{name}: {value!r}, expected an integer')
-        _check_range(field, int(value))
-        return int(value)
+    if name == 'elements_per_side' and isinstance(value, list | tuple | np.ndarray):
+        if len(value) != 2:
+            raise ScenarioError(f'{name}: {value!r}, expected an integer or two')
+        along_y, along_z = (_integer(field, entry) for entry in value)
+        # A square is the same scenario in either notation.
+        return along_y if along_y == along_z else (along_y, along_z)
+    if isinstance(field.default, int):
+        return _integer(field, value)
     if isinstance(field.default, tuple):
-        length = None if name == 'center_frequencies_hz' else 3
+        length = None if name == 'center_frequencies_hz' else len(field.default)
         return _numbers(field, value, length)
     return _number(field, value)
+
+
+def _integer(field: dataclasses.Field[Any], value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise ScenarioError(f'{field.name}: {value!r}, expected an integer')
+    _check_range(field, int(value))
+    return int(value)
 
 
 def _gain(field: dataclasses.Field[Any], value: Any) -> float | GainPattern:

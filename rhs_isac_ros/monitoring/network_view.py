@@ -132,11 +132,13 @@ class NetworkView:
             case m.RhsConfiguration():
                 yield f'{WORLD}/board', scene.board(self._scenario, message.analog)
                 if message.mode is m.Mode.TRANSMISSION:
-                    yield TRANSMISSION, scene.configurations([message.analog])
+                    yield TRANSMISSION, scene.configurations(
+                        self._scenario, [message.analog])
                 else:
                     self._configurations[message.band] = message.analog
+                    bands = sorted(self._configurations)
                     yield POSITIONING, scene.configurations(
-                        self._configurations[band] for band in sorted(self._configurations))
+                        self._scenario, [self._configurations[band] for band in bands])
             case m.Beam():
                 yield f'{WORLD}/beam', scene.lobe(self._scenario, message)
             case m.GroundTruth():

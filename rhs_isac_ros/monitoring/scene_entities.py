@@ -62,7 +62,8 @@ def board(scenario: Scenario, configuration: np.ndarray) -> Boxes:
         Applied configuration, float64 [F, N_E] in [0, 1], of which the mean over the frames is
         shown.
     """
-    interval_m = _BOARD_SIZE * math.hypot(*scenario.roi_center_m) / scenario.elements_per_side
+    interval_m = (_BOARD_SIZE * math.hypot(*scenario.roi_center_m)
+                  / max(scenario.n_columns, scenario.n_rows))
     positions = interval_m / element_interval_m(scenario) * element_positions(scenario)
     half_m = 0.45 * interval_m
     half_sizes = np.tile([_MIN_HALF_SIZE_M, half_m, half_m], (len(positions), 1))
@@ -71,7 +72,7 @@ def board(scenario: Scenario, configuration: np.ndarray) -> Boxes:
                  solid=True)
 
 
-def configurations(bands: Iterable[np.ndarray]) -> Picture:
+def configurations(scenario: Scenario, bands: Iterable[np.ndarray]) -> Picture:
     """Return configurations as a picture from the front: y to the right, z up.
 
     Parameters
@@ -82,8 +83,8 @@ def configurations(bands: Iterable[np.ndarray]) -> Picture:
     """
     rows = []
     for analog in bands:
-        side = math.isqrt(analog.shape[1])
-        tiles = np.rint(_MAX_GREY * analog).astype(np.uint8).reshape(-1, side, side)[:, ::-1]
+        tiles = np.rint(_MAX_GREY * analog).astype(np.uint8).reshape(
+            -1, scenario.n_rows, scenario.n_columns)[:, ::-1]
         rows.append(np.hstack([np.pad(tile, ((0, 1), (0, 1))) for tile in tiles]))
     return Picture(np.vstack(rows)[:-1, :-1])
 

@@ -12,11 +12,11 @@ from rhs_isac_ros.model import Scenario
 # Far above any received amplitude [sqrt(W)]; after whitening, its square is still finite in single
 # precision.
 _MAX_MAGNITUDE = 1e3
-# Mean [3], covariance [3, 3], reason, and optionally the energy of the residual, and the expected
-# energy.
+# Mean [3], covariance [3, 3], reason, and optionally the energy of the residual, the expected
+# energy, and the probability that the user is outside of the region.
 Located: TypeAlias = (
     tuple[np.ndarray, np.ndarray, str] | tuple[np.ndarray, np.ndarray, str, float]
-    | tuple[np.ndarray, np.ndarray, str, float, float])
+    | tuple[np.ndarray, np.ndarray, str, float, float, float])
 
 
 class SignalError(ValueError):
@@ -41,6 +41,9 @@ class Estimate:
     expected_residual
         Its mean for signals that match the model, given the modes of the posterior, float64 [] or
         [N]; NaN without a residual, and if the user may be outside of the region.
+    outside_probability
+        Probability that the user is outside of the region, float64 [] or [N]; NaN from estimators
+        that assume a user inside. Mean and covariance are those of a user inside.
     """
 
     mean: np.ndarray
@@ -48,6 +51,7 @@ class Estimate:
     reason: str | tuple[str, ...] = ''
     residual: float | np.ndarray = np.nan
     expected_residual: float | np.ndarray = np.nan
+    outside_probability: float | np.ndarray = np.nan
 
     @property
     def fix(self) -> np.ndarray:
@@ -82,8 +86,8 @@ def estimate_each(
         Complex128 [N_B, N_SB F] or [N, N_B, N_SB F]; the codebook determines the sizes.
     locate
         Callable that takes checked signals [N, N_B, N_SB F] and yields mean [3], covariance
-        [3, 3] and reason for each phase, and optionally the energy of the residual, and then the
-        expected energy. If the reason is not empty, mean and covariance are ignored.
+        [3, 3] and reason for each phase, and optionally the further values of `Located`. If the
+        reason is not empty, mean and covariance are ignored.
 
     Raises
     ------
@@ -92,7 +96,7 @@ def estimate_each(
     """
     batch = checked_received(scenario, codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
-    reasons, residuals = [], np.full((2, len(batch)), np.nan)
+    reasons, residuals = [], np.full((3, len(batch)), np.nan)
     for row, (position, spread, reason, *energy) in enumerate(locate(batch)):
         residuals[:len(energy), row] = energy
         reasons.append(reason)

@@ -38,7 +38,6 @@ from rhs_isac_ros.positioning.likelihood import (
 from rhs_isac_ros.positioning.outside import Outside
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
-    Doubt,
     Posterior,
     Samples,
     WeightedSamples,
@@ -46,11 +45,9 @@ from rhs_isac_ros.positioning.posterior import (
     draw_samples,
 )
 from rhs_isac_ros.positioning.search import (
-    LONG_SEARCH_STEPS,
     Modes,
     ascend,
     find_modes,
-    first_of_each,
 )
 from rhs_isac_ros.positioning.store import load_table
 
@@ -77,14 +74,14 @@ class _Search(NamedTuple):
     whitened
         Whitened signals without the parameters that they reveal, complex128 [N, N_B, N_SB F].
     outside
-        Logarithm of the evidence for a user outside of the region, and the most probable factor
-        of the signals there, for each phase.
+        Logarithm of the evidence for a user outside of the region, for each phase; empty if users
+        are assumed to be inside.
     """
 
     modes: Modes
     samples: Samples
     whitened: np.ndarray
-    outside: list[tuple[float, float]]
+    outside: list[float]
 
 
 class SearchEstimator(abc.ABC):
@@ -97,9 +94,8 @@ class SearchEstimator(abc.ABC):
     ----------
     reject_outside
         Whether the user may also be outside of the region; see `outside`. If this is almost
-        certain (`fit.OUTSIDE_LIMIT`), there is no fix either. If it is merely possible
-        (`fit.DOUBT_LIMIT`), the covariance includes the positions outside, while the position
-        remains that of a user inside.
+        certain (`fit.OUTSIDE_LIMIT`), there is no fix either. Otherwise the estimate contains its
+        probability, while position and covariance remain those of a user inside.
     surface
         What is known of the surface, as in `MeasurementModel`; for example a calibration.
 
@@ -123,7 +119,7 @@ class SearchEstimator(abc.ABC):
         self._test = FitTest(n_measurements, float(arrays['energy'].min()))
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
-        self._alignment = Alignment(likelihood, self._grid.filters)
+        self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
         self._failures = (FailedElements(likelihood, self._grid)
                           if surface is None and can_enumerate(scenario) else None)
@@ -153,14 +149,8 @@ class SearchEstimator(abc.ABC):
         """
         batch = checked_received(self.scenario, self._likelihood.codebook, received)
         signals = self._likelihood.signals(batch)
-        ((located, modes, doubt),) = self._locate_block(signals)
-        return Posterior(Estimate(*located), modes, signals, doubt)
-
-    def with_outside(
-            self, mean: np.ndarray, covariance: np.ndarray, doubt: Doubt) -> np.ndarray:
-        """Add positions outside of the region to a covariance about a mean inside, [3, 3]."""
-        moment = self._outside.second_moment(doubt.whitened, mean, doubt.scale)
-        return (1 - doubt.probability) * covariance + doubt.probability * moment
+        ((located, modes),) = self._locate_block(signals)
+        return Posterior(Estimate(*located), modes, signals)
 
     @property
     def normal(self) -> np.ndarray:
@@ -194,15 +184,14 @@ class SearchEstimator(abc.ABC):
             lambda start: self._locate_block(
                 signals.take(np.arange(start, min(start + _BLOCK, len(batch))))),
             range(0, len(batch), _BLOCK))
-        return (located for located, _, _ in itertools.chain.from_iterable(blocks))
+        return (located for located, _ in itertools.chain.from_iterable(blocks))
 
-    def _locate_block(
-            self, signals: Signals) -> list[tuple[Located, Modes | None, Doubt | None]]:
-        """Locate phases together: position or reason, modes if there is a position, and doubt."""
+    def _locate_block(self, signals: Signals) -> list[tuple[Located, Modes | None]]:
+        """Locate phases together: position or reason, and modes if there is a position."""
         energies = np.sum(np.abs(signals.whitened)**2, axis=(1, 2)) * self._max_power
         reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
-        results: list[tuple[Located, Modes | None, Doubt | None]] = [
-            ((*_no_fix(), reason, np.nan, np.nan), None, None) for reason in reasons]
+        results: list[tuple[Located, Modes | None]] = [
+            ((*_no_fix(), reason), None) for reason in reasons]
         (usable,) = np.nonzero([not reason for reason in reasons])
         if len(usable):
             found = self._search(signals.take(usable))
@@ -216,8 +205,6 @@ class SearchEstimator(abc.ABC):
         aligned = self._alignment.values_of_each(signals.received)
         extra = self._failures.search_margin if self._failures else 0.0
         modes = find_modes(likelihood, self._grid, signals, aligned, extra_margin=extra)
-        if not self._failures and not self._dispersed:
-            modes = self._continued(modes, signals, aligned)
         conditionals: list[Sequence[Conditional]] = [[likelihood]] * len(aligned)
         if self._dispersed:
             starts = Starts(modes.phases, modes.roi_points, modes.values)
@@ -235,30 +222,14 @@ class SearchEstimator(abc.ABC):
         else:
             samples = draw_samples(modes, self._normal, self._bounds)
         whitened = likelihood.whitened(aligned, signals)
-        outside = [(-np.inf, 1.0)] * len(aligned)
+        outside: list[float] = []
         if self._rejects_outside:
             outside = [self._outside.log_evidence_of(*phase, likelihood.nuisance)
                        for phase in zip(whitened, aligned, strict=True)]
         return _Search(modes, samples, whitened, outside)
 
-    def _continued(self, modes: Modes, signals: Signals, aligned: np.ndarray) -> Modes:
-        """Search longer in phases whose signals are not explained.
-
-        Strong signals may need more steps to reach the maximum.
-        """
-        starts = first_of_each(modes.phases)
-        best = np.minimum.reduceat(modes.residual, starts)
-        again = np.flatnonzero([self._test.residual_test(energy) for energy in best.tolist()])
-        if not len(again):
-            return modes
-        longer = find_modes(self._likelihood, self._grid, signals.take(again), aligned[again],
-                            LONG_SEARCH_STEPS)
-        return _joined([
-            longer.of_phase(int(np.searchsorted(again, phase))) if phase in again
-            else modes.of_phase(phase) for phase in range(len(aligned))])
-
-    def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None, Doubt | None]]:
-        """Yield the position of each phase, or why there is none, its modes and the doubt."""
+    def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None]]:
+        """Yield the position of each phase, or why there is none, and its modes."""
         modes = found.modes
         samples = WeightedSamples.of(found.samples, modes)
         evidence = samples.log_evidence(self._volume_m3)
@@ -271,27 +242,15 @@ class SearchEstimator(abc.ABC):
         ends = [*samples.starts[1:].tolist(), len(modes.phases)]
         for row, (start, end) in enumerate(zip(samples.starts.tolist(), ends, strict=True)):
             residual = float(modes.residual[start + np.argmax(likelihood[start:end])])
-            outside = outside_probability(evidence[row] - found.outside[row][0])
-            located, doubt = self._conclude(
-                found, row, residual, expected[row] + residual, outside,
-                (means[row], covariances[row]))
-            yield located, None if located[2] else modes.select(slice(start, end)), doubt
-
-    def _conclude(
-            self, found: _Search, row: int, residual: float, expected: float, outside: float,
-            moments: tuple[np.ndarray, np.ndarray]) -> tuple[Located, Doubt | None]:
-        """Return a position, or why there is none, and the doubt."""
-        whitened, scale = found.whitened[row], found.outside[row][1]
-        reason = self._reason(whitened, residual, outside)
-        if reason:
-            moments = _no_fix()
-        doubt = None
-        if outside > DOUBT_LIMIT and not self._test.residual_test(residual) == reason != '':
-            expected = np.nan
-            if not reason:
-                doubt = Doubt(outside, whitened, scale)
-                moments = moments[0], self.with_outside(*moments, doubt)
-        return (*moments, reason, residual, expected), doubt
+            outside = np.nan
+            if self._rejects_outside:
+                outside = outside_probability(evidence[row] - found.outside[row])
+            reason = self._reason(found.whitened[row], residual, outside)
+            moments = _no_fix() if reason else (means[row], covariances[row])
+            is_certain = (not outside > DOUBT_LIMIT
+                          or self._test.residual_test(residual) == reason != '')
+            yield ((*moments, reason, residual, expected[row] + residual if is_certain else np.nan,
+                    outside), None if reason else modes.select(slice(start, end)))
 
     def _reason(self, whitened: np.ndarray, residual: float, outside: float) -> str:
         """Return why there is no fix, empty if there is one.

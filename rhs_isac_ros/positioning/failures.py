@@ -32,6 +32,7 @@ from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
     Local,
+    Means,
     NuisancePrior,
     Signals,
     assemble,
@@ -142,8 +143,8 @@ class FailedElements:
             aligned = self._aligned(search.sites[index].values)
             found = self._grid.starts_under(
                 self._likelihood.whitened(aligned, signals)[0], self._likelihood.nuisance,
-                self._model.search_factor(failed), _N_PEAKS)
-            keys = search.add(found.points, found.values + aligned, failed)
+                self._model.search_factor(failed), _POINT_MARGIN)
+            keys = search.add(found.points[:_N_PEAKS], found.values[:_N_PEAKS] + aligned, failed)
             search.grow(keys[:_N_GROWN])
             if search.best[0] == failed:
                 break
@@ -257,8 +258,8 @@ class FailedSet:
         self._failed = list(surface.failed)
         stuck = np.full(scenario.n_elements, np.nan)
         stuck[self._failed] = 0.5
-        self._model = MeasurementModel(
-            scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck))
+        self._means = Means(MeasurementModel(
+            scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck)))
         whitening = surface.whitening(likelihood.nuisance)
         self._whitener, self._information = whitening.whitener[:, 0], whitening.information
         self._offset = log_prior + likelihood.log_volume - whitening.log_volume[0]
@@ -267,7 +268,7 @@ class FailedSet:
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
         prior, positions, n = self._likelihood.nuisance, to_positions(points), len(points)
-        mean, slopes = self._model.mean_and_jacobian(positions, jacobian(points))
+        mean, slopes = self._means(points)
         divided = prior.divide(signals.received, values)
         gains = np.stack([
             np.repeat(los_gain(self._likelihood.scenario, positions, band)[:, :, self._failed],

@@ -1,68 +1,142 @@
-"""The search for modes of the likelihood on a polar grid of templates over the region of interest.
+"""The search for modes of the likelihood on a grid of templates over the region of interest.
 
-A template is a whitened mean without its carrier: exp(i k_i r) t_i(p) changes slowly with the
-range, so that a coarse grid suffices. The log-likelihood at range steps that resolve the carrier
-follows from one complex number per band and grid point: the fine range steps rotate the phase of
-the matched filter's output.
+A template is a mean signal times the range, without the carriers of its sub-bands:
+exp(i k_n r) r mu_n(p). It changes with the direction, as the aperture resolves it, and with the
+range only by the curvature of the wavefront, so that many ranges share one template. The search
+descends through three levels: the outputs of the matched filters at every template, for each
+sub-band; their sum at range cells, within which delays and amplitudes hardly change; and range
+steps that resolve the carriers, along which one output per band rotates.
+
+All lengths of the grid follow from the scenario; see `Resolution`.
 """
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeAlias
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.bounds.fisher import quadratic_form
-from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.threads import map_blocks
 from rhs_isac_ros.positioning.coordinates import (
+    PHASE_ERROR,
+    Resolution,
     carrier_wavenumbers,
     is_inside,
-    jacobian,
     likelihood_loss,
     offset_to_roi,
-    to_polar,
+    subband_wavenumbers,
     to_positions,
 )
-from rhs_isac_ros.positioning.likelihood import MIN_CURVATURE, NuisancePrior
+from rhs_isac_ros.positioning.likelihood import Expansion, NuisancePrior
 
-# Cells of the grid in range and direction cosines.
-RANGE_CELL_M = 0.5
-DIRECTION_STEP = 0.025
 # Number of points that represent a standard Gaussian.
 _N_NORMAL = 128
-# Number of grid points to compute at a time.
-_BLOCK = 256
-# Largest sine of the angle from boresight on the grid.
+# Number of templates to compute at a time.
+_BLOCK = 128
+# Largest sine of the angle from boresight on the grid: directions have no derivative at the rim.
 _MAX_SINE = 0.995
-# Number of positions along each edge of the region that determine the extent of the grid.
-_N_EDGE = 33
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
 STEPS_PER_WAVELENGTH = 8
-# Number of phases to search at a time.
-_N_PHASES = 32
-# Peaks closer than an ellipsoid of these radii in (r in wavelengths, u, v) are one mode; in metres
-# of range if the phases of the bands carry no information.
-_MIN_SEPARATION = (0.37, 0.062, 0.062)
-_MIN_COARSE_SEPARATION_M = 0.75
-# Number of points to compare with each other at a time.
-_N_COMPARED = 64
-_EARLIER = np.tri(_N_COMPARED, k=-1, dtype=bool)
-# Error of a mode's log-likelihood due to the grid, as a share of the template's energy.
-_GRID_ERROR = 0.05
-# The linear model does not hold for longer steps.
-_STEP_LIMITS = np.array([0.02, 0.03, 0.03])
+# Number of outputs to compute at a time, which limits the number of phases.
+_N_OUTPUTS = 1 << 18
+# Cells of a phase that are examined first. They show how likely others have to be.
+_N_FIRST = 48
+# Largest number of range steps of a phase that are examined further, which limits memory.
+_MAX_PEAKS = 8192
+# Squared Mahalanobis distance below which points belong to the same mode.
+_SAME_MODE = 2.0
+# Largest distance of points to compare, in radii of the ellipsoid.
+_MAX_REACH = 3.0
+# Error of the likelihood that a step with the slopes predicts, relative to the loss that it makes
+# up for.
+_STEP_ERROR = 0.5
 
 
-class Effort(NamedTuple):
-    """Numbers of grid points and of peaks along their range that a search examines closely."""
+class Grid(NamedTuple):
+    """Templates and range cells that cover ranges and directions.
 
-    cells: int
-    peaks: int
-    modes: int
+    Attributes
+    ----------
+    nodes
+        Points (r [m], u, v) of the templates, float64 [G, 3].
+    ranges_m, widths_m
+        Centres and widths of the range cells, float64 [R].
+    node, cell
+        Template and range cell of each pair that belongs to the grid, int [C].
+    segments
+        Successive templates, range cells and pairs of one range of templates: a segment's pairs
+        are some of all pairs of its range cells and templates.
+    """
+
+    nodes: np.ndarray
+    ranges_m: np.ndarray
+    widths_m: np.ndarray
+    node: np.ndarray
+    cell: np.ndarray
+    segments: list[tuple[slice, slice, slice]]
+
+    @property
+    def points(self) -> np.ndarray:
+        """Centres of all pairs, (r [m], u, v), float64 [C, 3]."""
+        points: np.ndarray = self.nodes[self.node]
+        points[:, 0] = self.ranges_m[self.cell]
+        return points
 
 
-# Nuisance parameters lower all peaks towards each other.
-_EFFORTS = {False: Effort(256, 256, 32), True: Effort(1024, 768, 96)}
+def lay_grid(scenario: Scenario) -> Grid:
+    """Cover the region of interest with a grid."""
+    resolution = Resolution.of(scenario)
+    # Modes slightly outside of the region extend into it.
+    beyond_m = resolution.wavelength_m / 2
+    edges = [max(resolution.nearest_m - beyond_m, resolution.nearest_m / 2)]
+    while edges[-1] < resolution.farthest_m + beyond_m:
+        edges.append(edges[-1] + resolution.cell_width_m(edges[-1]))
+    edges_m = np.array(edges)
+    ranges_m, widths_m = (edges_m[1:] + edges_m[:-1]) / 2, np.diff(edges_m)
+    steps = 2 * PHASE_ERROR * resolution.direction
+    low, high = scenario.roi_bounds_m
+    lines = []
+    for axis in range(2):
+        limit = resolution.directions[axis]
+        lines.append(np.arange(np.floor(limit[0] / steps[axis]),
+                               np.ceil(limit[1] / steps[axis]) + 1) * steps[axis])
+    directions = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
+    # Directions slightly beyond the rim of the half space are moved onto it.
+    excess = np.maximum(np.hypot(*directions.T) / _MAX_SINE, 1.0)
+    directions = (directions / excess[:, None])[excess < 1 + 2 * steps.max()]
+    halves = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing='ij'), axis=-1).reshape(-1, 3)
+    nodes, node, cell, segments, n_nodes, n_pairs = [], [], [], [], 0, 0
+    for first, last in _shared_ranges(edges_m, 2 * PHASE_ERROR / resolution.curvature_m):
+        inside = []
+        for index in range(first, last):
+            centres = np.insert(directions, 0, ranges_m[index], axis=1)
+            # A cell belongs to the grid if the bounding box of its vertices meets the region.
+            vertices = to_positions(
+                centres[:, None] + halves * np.array([widths_m[index], *steps]))
+            inside.append(((vertices.max(axis=1) >= low) & (vertices.min(axis=1) <= high)
+                           ).all(axis=1))
+        used = np.flatnonzero(np.any(inside, axis=0))
+        range_m = 2 / (1 / edges_m[first] + 1 / edges_m[last])
+        nodes.append(np.insert(directions[used], 0, range_m, axis=1))
+        which, direction = np.nonzero(np.array(inside)[:, used])
+        node.append(direction + n_nodes)
+        cell.append(which + first)
+        segments.append((slice(n_nodes, n_nodes + len(used)), slice(first, last),
+                         slice(n_pairs, n_pairs + len(which))))
+        n_nodes, n_pairs = n_nodes + len(used), n_pairs + len(which)
+    return Grid(np.concatenate(nodes), ranges_m, widths_m, np.concatenate(node),
+                np.concatenate(cell), segments)
+
+
+def _shared_ranges(edges_m: np.ndarray, inverse_step: float) -> list[tuple[int, int]]:
+    """Group successive cells whose inverse ranges differ by at most a step."""
+    groups, first = [], 0
+    for last in range(1, len(edges_m)):
+        if last + 1 == len(edges_m) or 1 / edges_m[first] - 1 / edges_m[last + 1] > inverse_step:
+            groups.append((first, last))
+            first = last
+    return groups
 
 
 def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
@@ -71,41 +145,59 @@ def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
     Returns
     -------
     dict of numpy.ndarray
-        By name, for G grid points: ``points`` (r [m], u, v), float64 [G, 3]; ``filters``, the
-        conjugate templates, complex64 [N_B, G, N_SB F]; ``slope_filters``, the conjugate
-        derivatives of the templates with respect to the point, complex64 [N_B, G, 3, N_SB F];
-        ``energy`` of the templates, float32 [G]; ``energy_slope``, its derivative, float64
-        [G, 3]; ``curvature`` of the log-likelihood, float64 [G, 3, 3]; and, independent of the
-        codebook, ``normal``, points that represent a standard Gaussian, float64 [128, 3].
+        By name, for G templates and C pairs of a template and a range cell: ``filters``, the
+        conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``, the conjugate
+        derivatives of the templates with respect to (r [m], u, v), complex64
+        [N_B, N_SB, G, 3, F]; ``energy`` of the whitened means, float32 [C]; ``energy_slope``, its
+        derivative, float32 [C, 3]; ``curvature`` of the log-likelihood, float64 [C, 3, 3];
+        ``spread``, the mean of the outer products of the whitened means, complex128
+        [N_B, N_SB F, N_SB F]; ``whitener``, inverse Cholesky factors of the covariance, of the
+        same shape; and, independent of the codebook, ``normal``, points that represent a standard
+        Gaussian, float64 [128, 3].
     """
-    points = polar_grid(model.scenario)
-    n, (n_bands, n_rows) = len(points), model.shape
+    grid, (n_bands, n_rows) = lay_grid(model.scenario), model.shape
+    points = grid.points
+    n_subbands = subband_wavenumbers(model.scenario).shape[1]
+    shape = n_bands, n_subbands, len(grid.nodes)
+    n_frames, n_cells = n_rows // n_subbands, len(grid.cell)
     table = {
-        'points': points,
-        'filters': np.empty((n_bands, n, n_rows), np.complex64),
-        'slope_filters': np.empty((n_bands, n, 3, n_rows), np.complex64),
-        'energy': np.empty(n, np.float32),
-        'energy_slope': np.empty((n, 3)),
-        'curvature': np.empty((n, 3, 3)),
+        'filters': np.empty((*shape, n_frames), np.complex64),
+        'slope_filters': np.empty((*shape, 3, n_frames), np.complex64),
+        'energy': np.empty(n_cells, np.float32),
+        'energy_slope': np.empty((n_cells, 3), np.float32),
+        'curvature': np.empty((n_cells, 3, 3)),
+        'whitener': np.array(model.whitener),
         'normal': standard_normal(_N_NORMAL),
     }
-    wavenumbers = carrier_wavenumbers(model.scenario)
+    order = np.argsort(grid.node, kind='stable')
+    bounds = np.searchsorted(grid.node[order], np.arange(len(grid.nodes) + 1))
 
-    def fill(start: int) -> None:
-        block = slice(start, start + _BLOCK)
-        mean, by_position = model.mean_and_jacobian(to_positions(points[block]), whitened=True)
-        by_point = np.matmul(
-            np.swapaxes(jacobian(points[block]), 1, 2), by_position.reshape(len(mean), 3, -1))
-        carrier = np.exp(1j * wavenumbers * points[block, :1])[..., None]
-        table['filters'][:, block] = np.swapaxes(mean * carrier, 0, 1).conj()
-        slopes = by_point.reshape(by_position.shape) * carrier[:, None]
-        table['slope_filters'][:, block] = np.moveaxis(slopes, 2, 0).conj()
-        flat = mean.reshape(len(mean), -1)
-        table['energy'][block] = np.sum(np.abs(flat)**2, axis=1)
-        table['energy_slope'][block] = 2 * np.matmul(by_point.conj(), flat[..., None])[..., 0].real
-        table['curvature'][block] = quadratic_form(by_point)
+    def fill(start: int) -> np.ndarray:
+        nodes = slice(start, min(start + _BLOCK, len(grid.nodes)))
+        expansion = Expansion.of(model, grid.nodes[nodes])
+        by_frame = expansion.mean.conj().reshape(-1, n_bands, n_subbands, n_frames)
+        table['filters'][:, :, nodes] = np.moveaxis(by_frame, 0, 2)
+        by_frame = expansion.slopes.conj().reshape(-1, 3, n_bands, n_subbands, n_frames)
+        table['slope_filters'][:, :, nodes] = np.moveaxis(by_frame, (0, 1), (2, 3))
+        spread = np.zeros((n_bands, n_rows, n_rows), complex)
+        cells = order[bounds[nodes.start]:bounds[nodes.stop]]
+        for part in np.array_split(cells, -(-len(cells) // _BLOCK)):
+            mean, slopes = expansion.at(grid.node[part] - nodes.start, points[part])
+            columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
+            white = np.matmul(columns.reshape(n_bands, -1, n_rows),
+                              np.swapaxes(model.whitener, 1, 2))
+            white = white.reshape(n_bands, len(part), 4, n_rows)
+            spread += np.einsum('icr,ics->irs', white[:, :, 0], white[:, :, 0].conj(),
+                                optimize=True)
+            flat = np.moveaxis(white, 0, 2).reshape(len(part), 4, -1)
+            form = quadratic_form(flat)
+            table['energy'][part] = form[:, 0, 0] / 2
+            table['energy_slope'][part] = form[:, 0, 1:]
+            table['curvature'][part] = form[:, 1:, 1:]
+        return spread
 
-    map_blocks(fill, range(0, n, _BLOCK))
+    blocks = map_blocks(fill, range(0, len(grid.nodes), _BLOCK))
+    table['spread'] = np.sum(blocks, axis=0) / n_cells
     return table
 
 
@@ -119,30 +211,6 @@ def standard_normal(n: int) -> np.ndarray:
     return result
 
 
-def polar_grid(scenario: Scenario) -> np.ndarray:
-    """Return a grid whose cells cover the region of interest, (r [m], u, v), float64 [G, 3]."""
-    low, high = scenario.roi_bounds_m
-    edges = [np.linspace(low[u], high[u], _N_EDGE) for u in range(3)]
-    extent = to_polar(np.stack(np.meshgrid(*edges, indexing='ij'), axis=-1).reshape(-1, 3))
-    steps = (RANGE_CELL_M, DIRECTION_STEP, DIRECTION_STEP)
-    lines = [np.arange(np.floor(extent[:, a].min() / steps[a]),
-                       np.ceil(extent[:, a].max() / steps[a]) + 1) * steps[a] for a in range(3)]
-    # The direction is undefined at range 0; the first cell is centred a quarter cell further out.
-    lines[0] = np.where(lines[0] > 0, lines[0], RANGE_CELL_M / 4)
-    points = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 3)
-    # Directions slightly beyond the rim of the half space are moved onto it.
-    excess = np.maximum(np.hypot(points[:, 1], points[:, 2]) / _MAX_SINE, 1.0)
-    near = excess < 1 + 2 * DIRECTION_STEP
-    points = points[near]
-    points[:, 1:] /= excess[near, None]
-    # A cell belongs to the grid if the bounding box of its corners intersects the region.
-    halves = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing='ij'), axis=-1).reshape(-1, 3)
-    corners = to_positions(points[:, None] + halves * steps)
-    intersects = (corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)
-    result: np.ndarray = points[intersects.all(axis=1)]
-    return result
-
-
 class TemplateTable:
     """Fast evaluation of the log-likelihood over the whole region of interest.
 
@@ -153,46 +221,53 @@ class TemplateTable:
 
     Attributes
     ----------
-    points
-        Grid (r [m], u, v), float64 [G, 3].
-    range_offsets_m
-        Fine range steps, relative to the range of a grid point, float64 [D] [m].
     normal
         Points that represent a standard Gaussian, float64 [128, 3].
-    wavelength_m
-        Shortest wavelength of the bands' centres [m].
-    filters
-        Conjugate templates without their carrier, complex64 [N_B, G, N_SB F].
+    spread
+        Mean of the outer products of the whitened means, complex128 [N_B, N_SB F, N_SB F].
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
-        self.points, self.normal = arrays['points'], arrays['normal']
-        self.filters, self._slope_filters = arrays['filters'], arrays['slope_filters']
+        self.normal, self.spread = arrays['normal'], arrays['spread']
+        self._grid = grid = lay_grid(scenario)
+        self._resolution = Resolution.of(scenario)
+        self._filters, self._slope_filters = arrays['filters'], arrays['slope_filters']
+        self._whitener = arrays['whitener']
         self._energy, self._energy_slope = arrays['energy'], arrays['energy_slope']
-        self._curvature = arrays['curvature'] + np.diag(MIN_CURVATURE)
-        self._inverse = np.linalg.inv(self._curvature)
+        self._curvature = arrays['curvature'] + np.diag(self._resolution.curvature_floor)
+        self._inverse = np.linalg.inv(self._curvature).astype(np.float32)
+        # Largest loss of log-likelihood between the directions of the grid.
+        half = PHASE_ERROR * self._resolution.direction
+        across = np.abs(arrays['curvature'][:, 1:, 1:])
+        self._loss = np.einsum('a,cab,b->c', half, across, half) / 2
         self._bounds = scenario.roi_bounds_m
-        self.wavelength_m = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-        n_fine = int(np.ceil(RANGE_CELL_M / self.wavelength_m * STEPS_PER_WAVELENGTH))
-        self.range_offsets_m = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) * RANGE_CELL_M
-        wavenumbers = carrier_wavenumbers(scenario)
-        self._carrier = np.exp(
-            1j * wavenumbers[:, None] * self.points[:, 0]).astype(np.complex64)
-        phase = np.exp(1j * wavenumbers * self.range_offsets_m[:, None])
+        self._wavenumbers = subband_wavenumbers(scenario)
+        self._cell_turns = self._turns(grid.ranges_m).astype(np.complex64)
+        self._set_windows(scenario)
+
+    def _set_windows(self, scenario: Scenario) -> None:
+        """Divide range cells into windows of one width, with the same fine steps."""
+        grid, wavelength_m = self._grid, self._resolution.wavelength_m
+        counts = np.ceil(grid.widths_m / grid.widths_m.min() - 1e-9).astype(int)
+        self._first_window, self._n_windows = np.cumsum(counts) - counts, counts
+        place = np.arange(counts.sum()) - np.repeat(self._first_window, counts)
+        width_m = np.repeat(grid.widths_m / counts, counts)
+        low_m = np.repeat(grid.ranges_m - grid.widths_m / 2, counts)
+        self._window_ranges_m = low_m + (place + 0.5) * width_m
+        self._window_turns = self._turns(self._window_ranges_m).astype(np.complex64)
+        n_fine = int(np.ceil(width_m.max() / wavelength_m * STEPS_PER_WAVELENGTH))
+        # One step more at either end, so that a maximum is within some window.
+        self._step_m = width_m.max() / n_fine
+        self._offsets_m = (np.arange(n_fine + 2) - (n_fine + 1) / 2) * self._step_m
+        phase = np.exp(1j * carrier_wavenumbers(scenario) * self._offsets_m[:, None])
         self._rotation = (2 * np.hstack([phase.real, -phase.imag])).astype(np.float32)
         self._fine = np.ascontiguousarray(phase.T.astype(np.complex64))
 
-    def log_likelihood(self, whitened: np.ndarray) -> np.ndarray:
-        """Compute the log-likelihood on the fine grid, up to a constant, float32 [G, D].
-
-        The whitened signals are those of one positioning phase, complex128 [N_B, N_SB F], without
-        nuisance parameters.
-        """
-        signals = whitened.astype(np.complex64)
-        outputs = np.matmul(self.filters, signals[..., None])[..., 0] * self._carrier
-        result: np.ndarray = (self._rotation @ np.concatenate([outputs.real, outputs.imag])).T \
-            - self._energy[:, None]
-        return result
+    def _turns(self, ranges_m: np.ndarray) -> np.ndarray:
+        """Factors of the templates' conjugates at ranges [R], complex128 [N_B, N_SB, R]."""
+        turns: np.ndarray = np.exp(
+            1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
+        return turns
 
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Starts':
         """Find the most likely separate points, to the accuracy of one Gauss-Newton step.
@@ -207,194 +282,242 @@ class TemplateTable:
         prior
             The nuisance parameters.
         margin
-            The log-likelihood of a point may be lower than the best by up to this plus the error
-            of the grid.
+            Negative logarithm of the share of the posterior that points may leave out.
         """
+        weighted = np.swapaxes(
+            np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
+        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
+        n = max(1, _N_OUTPUTS // (len(self._energy) * len(self._wavenumbers)))
         parts = []
-        for start in range(0, len(whitened), _N_PHASES):
-            part = self._starts(whitened[start:start + _N_PHASES], prior, margin)
-            parts.append(part._replace(phases=part.phases + start))
+        for first in range(0, len(whitened), n):
+            block = slice(first, first + n)
+            part = self._starts(weighted[block], energies[block], prior, margin, self._energy)
+            parts.append(part._replace(phases=part.phases + first))
         return parts[0] if len(parts) == 1 else Starts(
             *(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
     def starts_under(self, whitened: np.ndarray, prior: NuisancePrior, factor: np.ndarray,
-                     max_points: int) -> 'Starts':
-        """Find the highest separate points of the grid for another covariance of the signals.
+                     margin: float) -> 'Starts':
+        """Find the most likely separate points for another covariance of the signals.
 
         Parameters
         ----------
         whitened
-            Signals of one phase, whitened as the templates, complex128 [N_B, N_SB F].
+            Signals of one phase, complex128 [N_B, N_SB F].
         factor
             F of the inverse F F^H of the other covariance after this whitening, complex128
             [N_B, N_SB F, N_SB F].
         """
-        turned = np.matmul(self.filters, factor.astype(np.complex64))
-        energy = np.sum(turned.real**2 + turned.imag**2, axis=(0, 2))
-        signals = np.einsum('bsr,bs->br', factor.conj(), whitened).astype(np.complex64)
-        outputs = np.matmul(turned, signals[..., None])[..., 0] * self._carrier
-        effort = _EFFORTS[len(prior) > 0]
-        cells = _highest(2 * np.abs(outputs).sum(axis=0)[None] - energy, effort.cells)
-        peaks = self._peaks(
-            outputs[:, cells[0]][None], energy[cells], np.array([np.sum(np.abs(signals)**2)]),
-            prior, effort.peaks)
-        points, values = self._at(cells, peaks, prior)
-        order = np.argsort(-peaks.value, axis=1)[:, :np.isfinite(peaks.value).sum()]
-        points, values = points[0, order], values[0, order[0]]
-        chosen = suppress(_closer_than_one(points / self._separation(prior)),
-                          np.ones(order.shape, bool), max_points)[0]
-        return Starts(np.zeros(chosen.sum(), int), points[0, chosen], values[chosen])
+        root = np.matmul(np.conj(np.swapaxes(self._whitener, 1, 2)), factor)
+        signals = np.einsum('isr,is->ir', factor.conj(), whitened)
+        weighted = np.einsum('isr,ir->is', root, signals)
+        grid = self._grid
+        turns = np.repeat(self._cell_turns, self._filters.shape[3], axis=1)
+        energy = np.zeros(len(grid.node), np.float32)
+        for band, filters in enumerate(self._filters):
+            templates = np.swapaxes(filters, 0, 1).reshape(len(grid.nodes), -1)
+            means = templates[grid.node] * turns[band].T[grid.cell]
+            turned = means @ root[band].astype(np.complex64)
+            energy += np.sum(turned.real**2 + turned.imag**2, axis=1)
+        return self._starts(weighted[None], np.array([np.sum(np.abs(signals)**2)]), prior, margin,
+                            energy, steps=False)
 
-    def _starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Starts':
-        effort = _EFFORTS[len(prior) > 0]
-        signals = whitened.astype(np.complex64)
-        cells, outputs = self._best_cells(signals, effort.cells)
-        peaks = self._peaks(outputs, self._energy[cells], np.sum(np.abs(whitened)**2, axis=(1, 2)),
-                            prior, effort.peaks)
-        cell, value = np.take_along_axis(cells, peaks.cell, axis=1), peaks.value
-        points, values = self._at(cells, peaks, prior)
-        if not prior.is_coarse:
-            step, rise = self._step(cells, cell, signals, peaks, prior, values)
-            points, value = points + step, value + rise
-        value = value - self._loss_outside(points, cell, value, margin)
-        order = np.argsort(-value, axis=1)
-        value = np.take_along_axis(value, order, axis=1)
-        best = np.take_along_axis(cell, order[:, :1], axis=1)
-        valid = value >= value[:, :1] - margin - _GRID_ERROR * self._energy[best]
-        order, rows = order[:, :valid.sum(axis=1).max()], np.arange(len(cell))[:, None]
-        points, values = points[rows, order], values[rows, order]
-        chosen = suppress(_closer_than_one(points / self._separation(prior)),
-                          valid[:, :order.shape[1]], effort.modes)
-        return Starts(np.nonzero(chosen)[0], points[chosen], values[chosen])
-
-    def _at(self, cells: np.ndarray, peaks: '_Peaks', prior: NuisancePrior
-            ) -> tuple[np.ndarray, np.ndarray]:
-        """Points of peaks, float64 [N, P, 3], and nuisance parameters there, [N, P, Q]."""
-        points = self.points[np.take_along_axis(cells, peaks.cell, axis=1)]
-        points[..., 0] += self._offsets(prior)[peaks.fine]
-        values = np.zeros((*peaks.cell.shape, len(prior)))
+    def _starts(self, weighted: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
+                margin: float, template_energy: np.ndarray, steps: bool = True) -> 'Starts':
+        """Find points for N phases, [N, N_B, N_SB F], weighted with the inverse covariance."""
+        n, n_bands = weighted.shape[:2]
+        signals = weighted.reshape(n, n_bands, -1, self._filters.shape[3]).astype(np.complex64)
+        # By sub-band and template, complex64 [N, N_B, N_SB, G].
+        outputs = np.ascontiguousarray(np.moveaxis(np.matmul(
+            self._filters, np.moveaxis(signals, 0, 3)), 3, 0))
+        peaks = self._peaks(outputs, energies, prior, margin, template_energy)
+        points = self._points(peaks)
+        values = np.zeros((len(points), len(prior)))
         if len(prior):
-            outputs = np.moveaxis(peaks.outputs, 1, 0)
-            values = prior.start(
-                outputs.reshape(len(outputs), -1), peaks.gain.ravel()).reshape(values.shape)
-        return points, values
+            values = prior.start(peaks.outputs.T, peaks.gain)
+        value = peaks.value
+        if steps and not prior.is_coarse:
+            step, value = self._step(outputs, signals, peaks, points, values, prior)
+            points = points + step
+        error = _STEP_ERROR * self._loss[peaks.cell]
+        value = value - self._loss_outside(
+            peaks.phases, points, peaks.cell, value, margin + error)
+        order = np.lexsort((-value, peaks.phases))
+        order = order[np.isfinite(value[order])]
+        firsts = first_of_each(peaks.phases[order])
+        slack = error[order] + np.repeat(
+            error[order[firsts]], np.diff(firsts, append=len(order)))
+        order = order[heaviest(peaks.phases[order], value[order], margin + slack)]
+        phases, points, values = peaks.phases[order], points[order], values[order]
+        chosen = separate(phases, points, self._resolution.separation(prior.is_coarse),
+                          self._curvature[peaks.cell[order]])
+        return Starts(phases[chosen], points[chosen], values[chosen])
 
-    def _step(self, cells: np.ndarray, cell: np.ndarray, signals: np.ndarray, peaks: '_Peaks',
-              prior: NuisancePrior, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss-Newton steps [n, P, 3] from peaks, and the predicted rise of the likelihood.
+    def _peaks(self, outputs: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
+               margin: float, template_energy: np.ndarray) -> '_Peaks':
+        """Find the probable peaks along the range for all phases."""
+        bound = self._bound(outputs, energies, prior, template_energy)
+        n, n_first = len(bound), min(_N_FIRST, bound.shape[1])
+        first = np.sort(np.argpartition(bound, -n_first, axis=1)[:, -n_first:], axis=1)
+        rows = np.repeat(np.arange(n), n_first)
+        peaks = self._peaks_of(rows, first.ravel(), outputs, energies, prior, template_energy)
+        best = np.full(n, -np.inf)
+        np.maximum.at(best, peaks.phases, peaks.value)
+        limit = best - margin
+        bound[rows, first.ravel()] = -np.inf
+        rows, others = np.nonzero(bound + self._loss >= limit[:, None])
+        parts = [peaks]
+        if len(rows):
+            parts.append(self._peaks_of(rows, others, outputs, energies, prior, template_energy))
+        peaks = _Peaks(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+        likely = np.flatnonzero(
+            peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
+        likely = likely[np.lexsort((-peaks.value[likely], peaks.phases[likely]))]
+        phases = peaks.phases[likely]
+        place = np.arange(len(likely)) - np.searchsorted(phases, phases)
+        likely = likely[place < _MAX_PEAKS]
+        peaks = _Peaks(*(field[likely] for field in peaks))
+        points = self._points(peaks)
+        chosen = separate(peaks.phases, points, self._resolution.separation(prior.is_coarse))
+        return _Peaks(*(field[chosen] for field in peaks))
+
+    def _points(self, peaks: '_Peaks') -> np.ndarray:
+        """Points (r [m], u, v) of peaks, float64 [P, 3]."""
+        points: np.ndarray = self._grid.nodes[self._grid.node[peaks.cell]]
+        points[:, 0] = peaks.range_m
+        return points
+
+    def _bound(self, outputs: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
+               template_energy: np.ndarray) -> np.ndarray:
+        """Bound the log-likelihood in all cells: that of outputs in phase, float32 [N, C]."""
+        grid = self._grid
+        amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
+        turns = np.swapaxes(self._cell_turns, 1, 2)
+        for nodes, cells, pairs in grid.segments:
+            by_range = np.abs(np.matmul(turns[:, cells], outputs[..., nodes])).sum(axis=1)
+            dense = ((grid.cell[pairs] - cells.start) * by_range.shape[2]
+                     + grid.node[pairs] - nodes.start)
+            amplitude[:, pairs] = by_range.reshape(len(outputs), -1)[:, dense]
+        if not prior.gain_std:
+            amplitude *= 2
+            amplitude -= template_energy
+            return amplitude
+        bounds = [self._over_gain(one, energy, prior)[0]
+                  for one, energy in zip(amplitude, energies.tolist(), strict=True)]
+        over_gain: np.ndarray = np.stack(bounds) - template_energy
+        return over_gain
+
+    def _over_gain(self, amplitude: np.ndarray, energy: float, prior: NuisancePrior
+                   ) -> tuple[np.ndarray, np.ndarray]:
+        return prior.over_gain(amplitude, energy, int(np.prod(self._whitener.shape[:2])))
+
+    def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, outputs: np.ndarray,
+                  energies: np.ndarray, prior: NuisancePrior, template_energy: np.ndarray
+                  ) -> '_Peaks':
+        """Find all peaks along the range in pairs [K] of the grid, for a phase each, ascending."""
+        grid = self._grid
+        counts = self._n_windows[grid.cell[cells]]
+        pair = np.repeat(np.arange(len(cells)), counts)
+        place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
+        window = self._first_window[grid.cell[cells]][pair] + place
+        phases, cells = phases[pair], cells[pair]
+        # Complex64 [W, N_B, N_SB], then the outputs of the bands, [N_B, W].
+        by_subband = outputs[phases, :, :, grid.node[cells]]
+        of_band = np.einsum('wis,isw->iw', by_subband, self._window_turns[:, :, window])
+        scale = self._cell_ranges(cells) / self._window_ranges_m[window]
+        energy = template_energy[cells] * (scale**2).astype(np.float32)
+        fine = np.ones_like(self._fine[:, :1]) if prior.is_coarse else self._fine
+        if prior.phase_covariance.any():
+            likelihood = 2 * prior.amplitude(fine[..., None] * of_band[:, None])
+        else:
+            likelihood = self._rotation @ np.concatenate([of_band.real, of_band.imag])
+        gain = np.zeros_like(likelihood) if prior.gain_std else None
+        if gain is not None:
+            ends = np.searchsorted(phases, np.arange(len(outputs) + 1))
+            for first, last, of_phase in zip(ends, ends[1:], energies.tolist(), strict=False):
+                if last > first:
+                    part = np.s_[:, first:last]
+                    likelihood[part], gain[part] = self._over_gain(
+                        likelihood[part] / 2, of_phase, prior)
+        likelihood -= energy
+        step, column = np.nonzero(np.ones_like(likelihood, bool) if prior.is_coarse
+                                  else _are_maxima(likelihood))
+        value, range_m = likelihood[step, column], self._window_ranges_m[window[column]]
+        if not prior.is_coarse:
+            # The vertex of a parabola through a maximum and the steps beside it.
+            slope = (likelihood[step + 1, column] - likelihood[step - 1, column]) / 2
+            bend = 2 * value - likelihood[step + 1, column] - likelihood[step - 1, column]
+            offset = slope / np.maximum(bend, np.abs(slope) + 1e-9)
+            value = value + slope * offset / 2
+            # Within a window, amplitudes decrease with the range.
+            centre_m = range_m
+            range_m = centre_m + self._offsets_m[step] + offset * self._step_m
+            scale, of_template = centre_m / range_m, energy[column]
+            value = scale * (value + of_template) - scale**2 * of_template
+        at_peak = (of_band[:, column] * fine[:, step]).T
+        return _Peaks(
+            phases[column], cells[column], range_m, value,
+            np.zeros(len(step)) if gain is None else gain[step, column], at_peak)
+
+    def _step(self, outputs: np.ndarray, signals: np.ndarray, peaks: '_Peaks',
+              points: np.ndarray, values: np.ndarray, prior: NuisancePrior
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss-Newton steps from peaks, [P, 3], and the likelihood that they predict, [P].
 
         Between grid points, a sharp mode is much higher.
         """
-        slopes = self._products(self._slope_filters, cells, signals)
-        slopes = np.take_along_axis(slopes, peaks.cell[:, None, :, None], axis=2)
-        phase = np.moveaxis(self._carrier[:, cell] * self._fine[:, peaks.fine], 0, 1)
+        grid, node = self._grid, self._grid.node[peaks.cell]
+        pairs, index = np.unique(peaks.phases * len(grid.nodes) + node, return_inverse=True)
+        phase, its_node = np.divmod(pairs, len(grid.nodes))
+        # By band, sub-band, pair and coordinate.
+        slopes = np.einsum('iskqf,kisf->kisq', self._slope_filters[:, :, its_node],
+                           signals[phase])[index]
+        node_m = grid.nodes[node, 0]
+        ratio = node_m / points[:, 0]
+        change = (node_m * (1 - ratio))[:, None, None] * slopes[..., 0]
+        value = outputs[peaks.phases, :, :, node] + change
+        slopes[..., 0] *= (ratio**2)[:, None, None]
+        turns = np.moveaxis(self._turns(points[:, 0]), 2, 0)
         if len(prior):
-            phase = phase * np.moveaxis(np.exp(
-                -1j * (values @ prior.phases.T) - peaks.gain[..., None]), 2, 1)
-        gradient = 2 * np.sum(slopes * phase[..., None], axis=1).real - self._energy_slope[cell]
-        step = np.einsum('npij,npj->npi', self._inverse[cell], gradient)
-        return (np.clip(step, -_STEP_LIMITS, _STEP_LIMITS),
-                np.sum(gradient * step, axis=2) / 2)
+            turns = turns * np.exp(
+                -1j * (values @ prior.phases.T) - peaks.gain[:, None])[..., None]
+        rate = 1j * self._wavenumbers - 1 / points[:, 0, None, None]
+        changes = 2 * np.einsum('pis,pis->p', turns, change).real
+        along = np.einsum('pis,pis->p', turns * rate, value).real
+        gradient = np.einsum('pis,pisq->pq', turns, slopes).real
+        gradient[:, 0] += along
+        gradient *= 2
+        # Apart from its decrease with the squared range, the energy is linear within a cell.
+        cell_m, slope = self._cell_ranges(peaks.cell), self._energy_slope[peaks.cell]
+        scale = ((cell_m / points[:, 0])**2)[:, None]
+        changes -= scale[:, 0] * (points[:, 0] - cell_m) * (
+            slope[:, 0] + 2 * self._energy[peaks.cell] / cell_m)
+        gradient -= scale * slope
+        step = np.einsum('pij,pj->pi', self._inverse[peaks.cell], gradient) / scale
+        limits = self._resolution.step_limits(prior.is_coarse)
+        rise = np.sum(gradient * step, axis=1) / 2
+        return np.clip(step, -limits, limits), peaks.value + changes + rise
 
-    def _best_cells(self, signals: np.ndarray, n_cells: int) -> tuple[np.ndarray, np.ndarray]:
-        """Grid points with the highest bounds of the log-likelihood, and the outputs there.
+    def _cell_ranges(self, cells: np.ndarray) -> np.ndarray:
+        """Ranges of the cells of pairs [K], float64 [K] [m]."""
+        ranges_m: np.ndarray = self._grid.ranges_m[self._grid.cell[cells]]
+        return ranges_m
 
-        Takes complex64 [N, N_B, N_SB F]; returns int [N, C] and complex64 [N, N_B, C].
-        """
-        outputs = np.matmul(np.swapaxes(signals, 0, 1), np.swapaxes(self.filters, 1, 2))
-        # Along the range, the log-likelihood is at most that of outputs in phase.
-        highest = np.abs(outputs).sum(axis=0)
-        highest *= 2
-        highest -= self._energy
-        cells = _highest(highest, n_cells)
-        # Products of equal sizes round the same, whatever the number of phases.
-        products = self._products(self.filters[:, :, None], cells, signals)[..., 0]
-        return cells, products * np.moveaxis(self._carrier[:, cells], 0, 1)
-
-    def _products(
-            self, filters: np.ndarray, cells: np.ndarray, signals: np.ndarray) -> np.ndarray:
-        """Products of filters [N_B, G, Q, N_SB F] with signals, complex64 [N, N_B, C, Q]."""
-        (n, n_cells), (n_bands, _, *shape) = cells.shape, filters.shape
-        products = np.empty((n, n_bands, n_cells * shape[0], 1), np.complex64)
-        # One buffer for all phases remains in the cache.
-        gathered = np.empty((n_bands, n_cells, *shape), np.complex64)
-        rows = gathered.reshape(n_bands, -1, shape[1])
-        for chosen, phase, result in zip(cells, signals[..., None], products, strict=True):
-            for band, target in enumerate(gathered):
-                # The mode without checks needs no copy of the result.
-                filters[band].take(chosen, axis=0, out=target, mode='clip')
-            np.matmul(rows, phase, out=result)
-        return products.reshape(n, n_bands, n_cells, -1)
-
-    def _peaks(self, outputs: np.ndarray, energy: np.ndarray, signal_energy: np.ndarray,
-               prior: NuisancePrior, n_peaks: int) -> '_Peaks':
-        """Find the highest peaks along the range among the grid points of each phase.
-
-        Takes outputs [N, N_B, C], energies of the templates [N, C] and of the signals [N].
-        """
-        fine = np.ones_like(self._fine[:, :1]) if prior.is_coarse else self._fine
-        if prior.phase_covariance.any():
-            doubled = 2 * np.stack([
-                prior.amplitude(fine[..., None] * one[:, None])
-                for one in outputs])
-        else:
-            doubled = np.matmul(
-                self._rotation, np.concatenate([outputs.real, outputs.imag], axis=1))
-        gain = np.zeros(doubled.shape) if prior.gain_std else None
-        if gain is not None:
-            n_rows = self.filters.shape[0] * self.filters.shape[2]
-            for one, its_gain, its_energy in zip(doubled, gain, signal_energy, strict=True):
-                one[...], its_gain[...] = prior.over_gain(one / 2, float(its_energy), n_rows)
-        likelihood = doubled - energy[:, None]
-        rising = likelihood[:, 1:] >= likelihood[:, :-1]
-        falling = likelihood[:, 1:] <= likelihood[:, :-1]
-        peak = np.ones(likelihood.shape, bool)
-        peak[:, 1:] &= rising
-        peak[:, :-1] &= falling
-        place = np.zeros((len(outputs), n_peaks), int)
-        value = np.full(place.shape, -np.inf, np.float32)
-        for row, (are_peaks, flat) in enumerate(zip(
-                peak.reshape(len(peak), -1), likelihood.reshape(len(peak), -1), strict=True)):
-            found = np.flatnonzero(are_peaks)
-            if len(found) > n_peaks:
-                found = found[np.sort(np.argpartition(flat[found], -n_peaks)[-n_peaks:])]
-            place[row, :len(found)] = found
-            value[row, :len(found)] = flat[found]
-        fine_index, index = np.divmod(place, outputs.shape[2])
-        at_peak = outputs[:, :, :0]
-        if len(prior):
-            at_peak = np.take_along_axis(outputs, index[:, None], axis=2)
-            at_peak = at_peak * np.moveaxis(fine[:, fine_index], 0, 1)
-        at_gain = (np.zeros(place.shape) if gain is None else
-                   np.take_along_axis(gain.reshape(len(gain), -1), place, axis=1))
-        return _Peaks(index, fine_index, value, at_gain, at_peak)
-
-    def _offsets(self, prior: NuisancePrior) -> np.ndarray:
-        """Range steps [m]: a single one if the phases carry no information about the range."""
-        return np.zeros(1) if prior.is_coarse else self.range_offsets_m
-
-    def _separation(self, prior: NuisancePrior) -> np.ndarray:
-        """Radii of the ellipsoid in (r [m], u, v) that contains one mode."""
-        separation = np.array(_MIN_SEPARATION) * (self.wavelength_m, 1, 1)
-        if prior.is_coarse:
-            separation[0] = _MIN_COARSE_SEPARATION_M
-        return separation
-
-    def _loss_outside(self, points: np.ndarray, cell: np.ndarray, value: np.ndarray,
-                      margin: float) -> np.ndarray:
-        """Loss of log-likelihood from points to the region, [N, P]: 0 inside.
+    def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
+                      value: np.ndarray, margin: np.ndarray) -> np.ndarray:
+        """Loss of log-likelihood from points to the region, [P]: 0 inside.
 
         The loss is infinite for points that are too unlikely even without it.
         """
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
-        values = np.where(inside, value, -np.inf)
-        best, rows = values.argmax(axis=1)[:, None], np.arange(len(cell))[:, None]
-        limit = values[rows, best] - margin - _GRID_ERROR * self._energy[cell[rows, best]]
-        outside = ~inside & (value >= limit)
-        if outside.any():
-            curvature = self._curvature[cell[outside]]
-            offset = offset_to_roi(points[outside], curvature, self._bounds)
+        best = np.full(phases.max(initial=0) + 1, -np.inf)
+        np.maximum.at(best, phases[inside], value[inside])
+        outside = np.flatnonzero(~inside & (value >= best[phases] - margin))
+        if len(outside):
+            curvature = self._curvature[cells[outside]]
+            offset = offset_to_roi(
+                points[outside], curvature, self._bounds, self._resolution.tolerance_m)
             result[outside] = likelihood_loss(offset, curvature)
         return result
 
@@ -418,86 +541,108 @@ class Starts(NamedTuple):
 
 
 class _Peaks(NamedTuple):
-    """P peaks along the range for each of N phases.
+    """P peaks along the range.
 
     Attributes
     ----------
-    cell, fine
-        Index of the grid point among those examined, and of the range step, int [N, P].
+    phases
+        Phase of each, int [P].
+    cell
+        Index of the pair of the grid, int [P].
+    range_m
+        Float64 [P] [m].
     value
-        Log-likelihood, float32 [N, P]; -inf where there is no further peak.
+        Log-likelihood, float32 [P].
     gain
-        Most likely gain [nepers], float64 [N, P].
+        Most likely gain [nepers], float64 [P].
     outputs
-        Outputs of the bands' matched filters, complex64 [N, N_B, P]; none without nuisance
-        parameters.
+        Outputs of the bands' matched filters, complex64 [P, N_B].
     """
 
+    phases: np.ndarray
     cell: np.ndarray
-    fine: np.ndarray
+    range_m: np.ndarray
     value: np.ndarray
     gain: np.ndarray
     outputs: np.ndarray
 
 
-# Whether points of some index are close to others: takes int [L, A] and [L, B], returns bool
-# [L, A, B].
-Closeness: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
+def first_of_each(phases: np.ndarray) -> np.ndarray:
+    """Return the index of the first point of each phase, for phases [M] in ascending order."""
+    changes = np.ones(len(phases), bool)
+    np.not_equal(phases[1:], phases[:-1], out=changes[1:])
+    return np.flatnonzero(changes)
 
 
-def suppress(are_close: Closeness, valid: np.ndarray, max_points: int) -> np.ndarray:
-    """Suppress points that are close to a better one which remains, bool [L, N].
+def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) -> np.ndarray:
+    """Return which points contain almost all of the weight of their phase, bool [M].
 
     Parameters
     ----------
-    are_close
-        Closeness of points, in L lists of N points, the best first. Indices of one list apply to
-        all lists.
-    valid
-        Which points belong to the lists, bool [L, N].
-    max_points
-        Largest number of points that remain of a list.
+    phases
+        Phase of each point, int [M], ascending.
+    value
+        Log-likelihoods, float64 [M], descending for each phase.
+    margin
+        Negative logarithm of the share of the weight that may be left out, a number or [M].
     """
-    n_lists, n = valid.shape
-    rows, every = np.arange(n_lists)[:, None], np.arange(n)[None]
-    chosen, kept = np.zeros(valid.shape, bool), np.zeros((n_lists, 0), int)
-    for start in range(0, n, _N_COMPARED):
-        end = min(start + _N_COMPARED, n)
-        block, free = every[:, start:end], valid[:, start:end]
-        if start:
-            free = free & ~(are_close(block, kept) & chosen[rows, kept][:, None]).any(axis=2)
-        before = are_close(block, block) & _EARLIER[:end - start, :end - start]
-        # Each round settles at least one more point, because only earlier ones matter; a few
-        # suffice.
-        remaining, previous = free, np.zeros_like(free)
-        while (remaining != previous).any():
-            remaining, previous = free & ~(before & remaining[:, None]).any(axis=2), remaining
-        chosen[:, start:end] = remaining
-        counts = chosen.sum(axis=1)
-        if end == n or (counts >= max_points).all():
-            break
-        kept = np.argsort(~chosen[:, :end], axis=1, kind='stable')[:, :counts.max()]
-    return chosen & (np.cumsum(chosen, axis=1) <= max_points)
+    firsts = first_of_each(phases)
+    counts = np.diff(firsts, append=len(phases))
+    relative = value - np.repeat(value[firsts], counts)
+    total = np.add.reduceat(np.exp(relative), firsts)
+    # No point after one is heavier.
+    n_left = np.repeat(firsts + counts, counts) - np.arange(len(phases))
+    kept: np.ndarray = relative + np.log(n_left) > np.repeat(np.log(total), counts) - margin
+    return kept
 
 
-def _closer_than_one(points: np.ndarray) -> Closeness:
-    """Return whether points [L, N, 3] are closer than 1."""
-    rows = np.arange(len(points))[:, None]
-    # Small coordinates leave more digits to single precision.
-    points = (points - points.mean(axis=(0, 1))).astype(np.float32)
-    squares = np.einsum('lnu,lnu->ln', points, points)
-
-    def are_close(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        distance = np.matmul(points[rows, first], np.swapaxes(-2 * points[rows, second], 1, 2))
-        distance += squares[rows, first][:, :, None]
-        distance += squares[rows, second][:, None]
-        close: np.ndarray = distance < 1
-        return close
-
-    return are_close
+def _are_maxima(values: np.ndarray) -> np.ndarray:
+    """Return which values [D, W] are local maxima along the first axis, but not at its ends."""
+    result = np.zeros(values.shape, bool)
+    np.greater_equal(values[1:-1], values[:-2], out=result[1:-1])
+    result[1:-1] &= values[1:-1] > values[2:]
+    return result
 
 
-def _highest(bounds: np.ndarray, n_cells: int) -> np.ndarray:
-    """Indices of the cells with the highest bounds [N, G], ascending, int [N, C]."""
-    n_cells = min(n_cells, bounds.shape[1])
-    return np.sort(np.argpartition(bounds, -n_cells, axis=1)[:, -n_cells:], axis=1)
+def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
+             curvature: np.ndarray | None = None) -> np.ndarray:
+    """Choose the points that are not in the mode of a better one: non-maximum suppression.
+
+    Parameters
+    ----------
+    phases
+        Phase of each point, int [M], ascending; those of a phase start with the best.
+    points
+        (r [m], u, v), float64 [M, 3].
+    radii
+        Radii of an ellipsoid around a mode that contains no other, float64 [3].
+    curvature
+        Curvature of the log-likelihood at the points, float64 [M, 3, 3], if broad modes shall
+        extend beyond the ellipsoid.
+
+    Returns
+    -------
+    numpy.ndarray
+        Bool [M].
+    """
+    from scipy.spatial import cKDTree
+
+    scaled, chosen, reach = points / radii, np.ones(len(points), bool), 1.0
+    if curvature is not None:
+        variance = np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2) / radii**2
+        reach = float(np.clip(np.sqrt(_SAME_MODE * variance.max()), 1.0, _MAX_REACH))
+    # Different phases are far from each other.
+    scaled[:, 0] += phases * (2 * reach + np.ptp(scaled[:, 0]))
+    better, worse = cKDTree(scaled).query_pairs(reach, output_type='ndarray').T
+    if curvature is not None:
+        offset = points[worse] - points[better]
+        close = np.sum((offset / radii)**2, axis=1) < 1
+        close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _SAME_MODE
+        worse, better = worse[close], better[close]
+    previous = ~chosen
+    # Each round settles at least one more point, because only better ones matter; a few suffice.
+    while (chosen != previous).any():
+        previous = chosen
+        chosen = np.ones(len(points), bool)
+        chosen[worse[previous[better]]] = False
+    return chosen

@@ -23,12 +23,13 @@ from rhs_isac_ros.model.gaussian import eliminate, marginalise
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
+from rhs_isac_ros.positioning.coordinates import (
+    Resolution,
+    jacobian,
+    subband_wavenumbers,
+    to_positions,
+)
 
-# Curvature of the log-likelihood in (r, u, v) [1/m^2, 1, 1] to add everywhere. It keeps matrices
-# regular where the signals carry no information, and is weaker than the prior on any usual region
-# of interest.
-MIN_CURVATURE = (1e-3, 1e-1, 1e-1)
 # Standard deviation of a Gaussian whose density at its centre is that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # Standard deviation from which the search treats the phases of the bands as uniform. Their joint
@@ -49,6 +50,8 @@ _MIN_GAIN_STD = 1e-9
 # Numbers of failures whose probability is relevant.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
+# Phase at the edge of the aperture over which points share an expansion [rad].
+_SHARED_RAD = 0.05
 # Share of the errors of an estimate in the whitened signals from which their position matters.
 _MIN_ERROR_SHARE = 0.05
 
@@ -97,6 +100,82 @@ class Conditional(Protocol):
         ...
 
 
+class Expansion(NamedTuple):
+    """Mean signals around n points, to first order apart from distance and carriers.
+
+    The factor exp(-i k_n r) / r of a sub-band's mean is exact. The rest changes with the
+    direction, as the aperture resolves it, and with the curvature of the wavefront, 1 / r.
+
+    Attributes
+    ----------
+    points
+        (r [m], u, v), float64 [n, 3].
+    wavenumbers
+        Of the carrier of each measurement, float64 [N_B, N_SB F] [1/m].
+    mean
+        Mean signals over the factor, complex128 [n, N_B, N_SB F].
+    slopes
+        Derivatives of these with respect to the points, complex128 [n, 3, N_B, N_SB F].
+    """
+
+    points: np.ndarray
+    wavenumbers: np.ndarray
+    mean: np.ndarray
+    slopes: np.ndarray
+
+    @classmethod
+    def of(cls, model: MeasurementModel, points: np.ndarray) -> 'Expansion':
+        """Evaluate a model at points."""
+        wavenumbers = subband_wavenumbers(model.scenario)
+        wavenumbers = np.repeat(wavenumbers, model.shape[1] // wavenumbers.shape[1], axis=1)
+        mean, slopes = model.mean_and_jacobian(to_positions(points), jacobian(points))
+        range_m = points[:, :1, None]
+        factor = range_m * np.exp(1j * wavenumbers * range_m)
+        mean, slopes = mean * factor, slopes * factor[:, None]
+        slopes[:, 0] += (1j * wavenumbers + 1 / range_m) * mean
+        return cls(points, wavenumbers, mean, slopes)
+
+    def at(self, index: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate points [M, 3], each near the point of the expansion with an index, int [M].
+
+        Returns means, complex128 [M, N_B, N_SB F], and derivatives, [M, 3, N_B, N_SB F].
+        """
+        offset, range_m = points - self.points[index], points[:, :1, None]
+        ratio = self.points[index, 0] / points[:, 0]
+        offset[:, 0] *= ratio
+        slopes = self.slopes[index]
+        mean = self.mean[index] + np.matmul(
+            offset[:, None], slopes.reshape(len(index), 3, -1)).reshape(-1, *self.mean.shape[1:])
+        factor = np.exp(-1j * self.wavenumbers * range_m) / range_m
+        mean *= factor
+        slopes *= factor[:, None]
+        slopes[:, 0] *= ratio[:, None, None]**2
+        slopes[:, 0] -= (1j * self.wavenumbers + 1 / range_m) * mean
+        return mean, slopes
+
+
+class Means:
+    """Mean signals and their derivatives, of which neighbouring points share one expansion.
+
+    Modes of the posterior stand in rows along the range, in nearly the same direction.
+    """
+
+    def __init__(self, model: MeasurementModel) -> None:
+        self._model, resolution = model, Resolution.of(model.scenario)
+        self._per_cell = np.array(
+            [resolution.curvature_m, *1 / resolution.direction]) / _SHARED_RAD
+
+    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate points (r [m], u, v), [M, 3], as `Expansion.at` does."""
+        cells = points * self._per_cell
+        cells[:, 0] = self._per_cell[0] / points[:, 0]
+        keys = np.rint(cells).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
+        _, first, index = np.unique(keys, return_index=True, return_inverse=True)
+        if len(first) == len(points):
+            return self._model.mean_and_jacobian(to_positions(points), jacobian(points))
+        return Expansion.of(self._model, points[first]).at(index, points)
+
+
 class NuisancePrior:
     """Prior and effect of the nuisance parameters, in units in which they are standard normal.
 
@@ -120,6 +199,8 @@ class NuisancePrior:
         Fisher information from the covariance of the signals, see `information_of`.
     is_coarse
         Whether every band has a uniform phase.
+    floor
+        Curvature of the log-likelihood in (r, u, v) that is added everywhere, float64 [3].
     phase_covariance
         Covariance of the phases of the bands that the scenario declares, float64 [N_B, N_B].
     """
@@ -153,6 +234,7 @@ class NuisancePrior:
         self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
+        self.floor = Resolution.of(model.scenario).curvature_floor
 
     def __len__(self) -> int:
         """Return the number Q of parameters."""
@@ -277,6 +359,8 @@ class Likelihood:
         Mean and covariance of the signals.
     nuisance
         Prior of the nuisance parameters.
+    resolution
+        Lengths over which the signals change.
 
     Raises
     ------
@@ -291,6 +375,7 @@ class Likelihood:
         # Estimators are built between cycles; their first estimate should be as fast as any.
         self.model = MeasurementModel(scenario, codebook, surface).prepare(jacobian=True)
         self.nuisance = NuisancePrior(self.model)
+        self.resolution, self._means = Resolution.of(scenario), Means(self.model)
 
     def signals(self, received: np.ndarray) -> Signals:
         """Whiten signals [N, N_B, N_SB F]."""
@@ -305,9 +390,13 @@ class Likelihood:
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
         n = len(points)
-        mean, slopes = self.model.mean_and_jacobian(
-            to_positions(points), jacobian(points), whitened=True)
-        derivative = slopes.reshape(n, 3, -1)
+        means, slopes = self._means(points)
+        columns = np.moveaxis(np.concatenate([means[:, None], slopes], axis=1), 2, 0)
+        shape = self.model.shape
+        white = np.matmul(columns.reshape(shape[0], -1, shape[1]),
+                          np.swapaxes(self.model.whitener, 1, 2))
+        white = np.moveaxis(white.reshape(shape[0], n, 4, shape[1]), 0, 2)
+        mean, derivative = white[:, 0], white[:, 1:].reshape(n, 3, -1)
         whitened = self.whitened(values, signals)
         residual = (whitened - mean).reshape(n, -1)
         if len(self.nuisance):
@@ -318,7 +407,7 @@ class Likelihood:
                             np.concatenate([derivative, expected], axis=1), observed)
         # Re(a^H b) is the inner product of real and imaginary parts.
         parts = residual.view(float)
-        information = quadratic_form(derivative) + np.diag(MIN_CURVATURE)
+        information = quadratic_form(derivative) + np.diag(self.nuisance.floor)
         gradient = 2 * np.matmul(derivative.view(float), parts[..., None])[..., 0]
         energy = np.sum(parts**2, axis=1)
         return Local(-energy, gradient, information, energy)
@@ -370,7 +459,7 @@ def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
     n = 3 + len(prior)
     parts = np.ascontiguousarray(residual).view(float)
     information = quadratic_form(expected)
-    information += np.diag(np.concatenate([MIN_CURVATURE, prior.precision, np.ones(n_linear)]))
+    information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
     # The derivatives of parameters that move the multipath include it.
     still = ~prior.moves_multipath
     information[:, 3:n, 3:n] += np.outer(still, still) * (
@@ -413,6 +502,7 @@ class DispersedLikelihood:
             dataclasses.replace(scenario, failed_element_share=share), likelihood.codebook,
             likelihood.surface).prepare(jacobian=True)
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
+        self._means = Means(self._average)
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
         self._offsets = log_weights + likelihood.log_volume
         self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
@@ -439,7 +529,7 @@ class DispersedLikelihood:
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
         prior, n = self._base.nuisance, len(points)
-        mean, slopes = self._average.mean_and_jacobian(to_positions(points), jacobian(points))
+        mean, slopes = self._means(points)
         divided = prior.divide(signals.received, values)
         columns = np.concatenate([
             (divided - mean)[:, None], slopes, prior.patterns * prior.sources(mean, divided),
@@ -522,12 +612,10 @@ class Alignment:
     mean signals over the region.
     """
 
-    def __init__(self, likelihood: Likelihood, filters: np.ndarray) -> None:
+    def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
+        """Take the `spread` of `tabulate`."""
         self._model, self._prior = likelihood.model, likelihood.nuisance
-        n_points, n_rows = filters.shape[1:]
-        templates = filters.astype(complex).conj()
-        spread = np.matmul(np.swapaxes(templates, 1, 2), templates.conj()) / n_points
-        self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(n_rows)))
+        self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(spread.shape[1])))
 
     def values_of_each(self, received: np.ndarray) -> np.ndarray:
         """Return parameters [N, Q] for signals [N, N_B, N_SB F]; those that move nothing are 0."""

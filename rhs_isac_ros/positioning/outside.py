@@ -16,17 +16,23 @@ import numpy as np
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, to_positions
+from rhs_isac_ros.positioning.coordinates import (
+    Resolution,
+    carrier_wavenumbers,
+    to_positions,
+)
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
 
-# Distance from the region up to which a user may be located at its border.
-BORDER_M = 0.5
-# Nearest range, and the farthest one in units of the farthest range of the region.
-MIN_RANGE_M = 0.5
-MAX_RANGE_FACTOR = 3.0
-# Ratio of successive ranges, and step of the direction cosines.
-RANGE_RATIO = 1.15
-DIRECTION_STEP = 0.05
+# Relative to the nearest range of the region: distance from it up to which a user may be located
+# at its border, and nearest range outside.
+_BORDER = 0.1
+# The nearest range is at least this multiple of the radius of the aperture.
+_MIN_APERTURES = 4.0
+# Farthest range in units of the farthest range of the region, and ratio of successive ranges.
+_MAX_RANGE_FACTOR = 3.0
+_RANGE_RATIO = 1.15
+# Phase error of a template at the edge of the aperture from which another direction takes over.
+_DIRECTION_RAD = 0.25
 # Quadrature over the gain: spacing [nepers], and reach in standard deviations.
 _GAIN_STEP = 0.04
 _GAIN_REACH = 4.0
@@ -36,6 +42,8 @@ _MAX_PHASE_ERROR = 0.5
 _GRID_ERROR = 0.25
 # Largest sine of the angle from boresight on the grid.
 _MAX_SINE = 0.998
+# Directions in which the log-likelihood is lower by more at all ranges do not matter.
+_MARGIN = 30.0
 
 
 def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
@@ -53,12 +61,14 @@ def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
         the prior probability of ranges and directions, 0 inside the region, float64 [R, V].
     """
     scenario = model.scenario
-    ranges, directions = _ranges(scenario), _directions()
+    ranges, directions = _ranges(scenario), _directions(scenario)
     nodes, index = _template_ranges(scenario, ranges)
     weights = _prior(scenario, ranges, directions)
     points = _points(nodes, directions).reshape(-1, 3)
     carrier = np.exp(1j * carrier_wavenumbers(scenario) * points[:, :1]) * points[:, :1]
-    templates = model.whiten(model.mean(to_positions(points))) * carrier[..., None]
+    # With its derivative, the mean takes less time than without.
+    templates = model.whiten(model.mean_and_jacobian(to_positions(points))[0])
+    templates *= carrier[..., None]
     energy = np.sum(np.abs(templates)**2, axis=(1, 2)).reshape(len(nodes), -1)
     return {
         'outer_filters': np.swapaxes(templates, 0, 1).conj().astype(np.complex64),
@@ -81,9 +91,9 @@ class Outside:
         self._filters, index = arrays['outer_filters'], arrays['outer_index']
         self._index = index
         self._ranges = _ranges(scenario)
-        self._units = to_positions(_points(np.ones(1), _directions()))[0]
         ranges = self._ranges[:, None]
         self._scale = (2 / ranges).astype(np.float32)
+        self._node_energy = np.maximum(arrays['outer_energy'], np.finfo(np.float32).tiny)
         self._energy = (arrays['outer_energy'][index] / ranges**2).astype(np.float32)
         self._possible = arrays['outer_weights'] > 0
         log_prior = np.log(arrays['outer_weights'], where=self._possible,
@@ -91,8 +101,8 @@ class Outside:
         self._offset = (log_prior - self._energy).astype(np.float32)
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
-                        ) -> tuple[float, float]:
-        """Compute the evidence with the nuisance parameters integrated out.
+                        ) -> float:
+        """Compute the logarithm of the evidence with the nuisance parameters integrated out.
 
         Parameters that move the multipath are integrated by Laplace's method, and the gain
         numerically. Phases have no effect.
@@ -104,11 +114,6 @@ class Outside:
             [N_B, N_SB F].
         aligned
             Parameters that the signals alone reveal, float64 [Q]; 0 for the others.
-
-        Returns
-        -------
-        evidence, scale
-            Logarithm of the evidence, and the most probable factor of the signals.
         """
         gain = np.zeros(1)
         if prior.gain_std:
@@ -116,14 +121,12 @@ class Outside:
             gain = prior.gain_std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
         evidence = self.log_evidence(whitened, np.exp(-gain)) - 2 * whitened.size * gain
         weights = -gain**2 / (2 * (prior.gain_std or 1.0)**2)
-        evidence += weights - np.log(np.sum(np.exp(weights)))
-        best = int(np.argmax(evidence))
-        total = evidence[best] + np.log(np.sum(np.exp(evidence - evidence[best])))
+        total = _log_sum(evidence + weights) - _log_sum(weights)
         (moves,) = np.nonzero(prior.moves_multipath)
         if len(moves):
             curvature = prior.information[np.ix_(moves, moves)] + np.diag(prior.precision[moves])
             total -= prior.precision @ aligned**2 / 2 + np.linalg.slogdet(curvature)[1] / 2
-        return float(total), float(np.exp(-gain[best]))
+        return float(total)
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
         """Compute the logarithm of the likelihood averaged over the prior, for each scale.
@@ -138,67 +141,42 @@ class Outside:
         scales
             Factors of the signals.
         """
-        argument = self._filter(whitened) * self._scale
-        energy = float(np.sum(np.abs(whitened)**2))
-        return np.array([self._log_average(argument * np.float32(scale)) - scale**2 * energy
-                         for scale in scales])
-
-    def _log_average(self, argument: np.ndarray) -> float:
-        log_likelihood = self._log_likelihood(argument)
-        highest = float(log_likelihood.max())
-        if np.isneginf(highest):
-            return highest
-        return highest + float(np.log(np.sum(np.exp(log_likelihood - highest))))
-
-    def _log_likelihood(self, argument: np.ndarray) -> np.ndarray:
-        """Log-likelihood plus log-prior on the grid, up to the signals' energy, [R, V]."""
-        result: np.ndarray = np.sum(_log_bessel(argument), axis=0) + self._offset
-        return result
-
-    def second_moment(
-            self, whitened: np.ndarray, centre: np.ndarray, scale: float = 1.0) -> np.ndarray:
-        """Compute the posterior second moment of a position outside about a point.
-
-        Parameters
-        ----------
-        whitened
-            Whitened signals of one positioning phase, complex128 [N_B, N_SB F].
-        centre
-            The point, float64 [3] [m].
-        scale
-            Factor of the signals.
-
-        Returns
-        -------
-        numpy.ndarray
-            Float64 [3, 3] [m^2].
-        """
-        log_likelihood = self._log_likelihood(
-            self._filter(whitened) * (self._scale * np.float32(scale)))
-        weights = np.exp(log_likelihood - log_likelihood.max()).astype(float)
-        weights /= weights.sum()
-        mean = self._ranges @ weights @ self._units
-        square = (self._units.T * (self._ranges**2 @ weights)) @ self._units
-        cross = np.outer(mean, centre)
-        result: np.ndarray = square - cross - cross.T + np.outer(centre, centre)
-        return result
+        filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
+        # Whatever the range, the log-likelihood is at most that of outputs in phase.
+        bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
+        chosen = np.flatnonzero(bound >= bound.max() - _MARGIN)
+        filtered, offset = filtered[:, :, chosen], self._offset[:, chosen]
+        values = []
+        for scale in scales:
+            argument = filtered[:, self._index] * (np.float32(scale) * self._scale)
+            log_likelihood = np.sum(_log_bessel(argument), axis=0) + offset
+            values.append(_log_sum(log_likelihood) - scale**2 * energy)
+        return np.array(values)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position outside leaves a residual with at most this energy.
 
         The signals are those of one positioning phase, complex128 [N_B, N_SB F].
         """
-        amplitude = np.sum(self._filter(whitened), axis=0) * self._scale
+        amplitude = np.sum(self._filter(whitened), axis=0)[self._index] * self._scale
         residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
         tolerated = max_residual + _GRID_ERROR * self._energy
         return bool((self._possible & (residual <= tolerated)).any())
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
-        """Magnitude of the filtered signals for every range and direction, [N_B, R, V] [m]."""
+        """Magnitude of the filtered signals for templates and directions, [N_B, T, V] [m]."""
         signals = whitened.astype(np.complex64)[..., None]
         filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
         by_node: np.ndarray = filtered.reshape(len(filtered), -1, self._energy.shape[1])
-        return by_node[:, self._index]
+        return by_node
+
+
+def _log_sum(values: np.ndarray) -> float:
+    """Logarithm of the sum of exponentials."""
+    highest = float(values.max())
+    if np.isneginf(highest):
+        return highest
+    return highest + float(np.log(np.sum(np.exp(values - highest))))
 
 
 def _log_bessel(argument: np.ndarray) -> np.ndarray:
@@ -210,16 +188,20 @@ def _log_bessel(argument: np.ndarray) -> np.ndarray:
 
 def _ranges(scenario: Scenario) -> np.ndarray:
     """Ranges of the grid in geometric progression, float64 [R] [m]."""
-    low, high = scenario.roi_bounds_m
-    farthest = MAX_RANGE_FACTOR * np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
-    n_ranges = 1 + max(1, int(np.ceil(np.log(farthest / MIN_RANGE_M) / np.log(RANGE_RATIO))))
-    return MIN_RANGE_M * RANGE_RATIO**np.arange(n_ranges)
+    resolution = Resolution.of(scenario)
+    aperture_m = np.linalg.norm(element_positions(scenario), axis=1).max()
+    nearest_m = max(_BORDER * resolution.nearest_m, _MIN_APERTURES * aperture_m)
+    ratio = _MAX_RANGE_FACTOR * resolution.farthest_m / nearest_m
+    n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(_RANGE_RATIO))))
+    ranges: np.ndarray = nearest_m * _RANGE_RATIO**np.arange(n_ranges)
+    return ranges
 
 
-def _directions() -> np.ndarray:
+def _directions(scenario: Scenario) -> np.ndarray:
     """Direction cosines (u, v) over the half space, float64 [V, 2]."""
-    line = (np.arange(round(2 / DIRECTION_STEP)) + 0.5) * DIRECTION_STEP - 1
-    grid = np.stack(np.meshgrid(line, line, indexing='ij'), axis=-1).reshape(-1, 2)
+    counts = np.ceil(0.5 / (_DIRECTION_RAD * Resolution.of(scenario).direction)).astype(int)
+    lines = [(np.arange(2 * n) + 0.5) / n - 1 for n in counts.tolist()]
+    grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
     result: np.ndarray = grid[np.hypot(*grid.T) < _MAX_SINE]
     return result
 
@@ -236,7 +218,8 @@ def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np
     positions = to_positions(_points(ranges, directions))
     distance = np.linalg.norm(positions - np.clip(positions, *scenario.roi_bounds_m), axis=-1)
     solid_angle = 1 / np.sqrt(1 - np.sum(directions**2, axis=1))
-    weights = np.where(distance > BORDER_M, ranges[:, None] * solid_angle, 0.0)
+    border_m = _BORDER * Resolution.of(scenario).nearest_m
+    weights = np.where(distance > border_m, ranges[:, None] * solid_angle, 0.0)
     total = weights.sum()
     return weights / total if total > 0 else weights
 

@@ -94,7 +94,7 @@ class _Posterior:
         self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
         self._dispersed = DispersedLikelihood.of(likelihood)
         self._signals, self._phases = likelihood.signals(received), BandPhases(likelihood)
-        alignment = Alignment(likelihood, tabulate(likelihood.model)['filters'])
+        alignment = Alignment(likelihood, tabulate(likelihood.model)['spread'])
         self._aligned = alignment.values_of_each(received)
         self._whitened = likelihood.whitened(self._aligned, self._signals)
         self._rng = np.random.default_rng(0)

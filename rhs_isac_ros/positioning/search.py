@@ -11,27 +11,26 @@ import numpy as np
 
 from rhs_isac_ros.model.gaussian import Marginal, marginalise
 from rhs_isac_ros.positioning.coordinates import likelihood_loss, offset_to_roi
-from rhs_isac_ros.positioning.grid import Starts, TemplateTable, suppress
+from rhs_isac_ros.positioning.grid import (
+    Starts,
+    TemplateTable,
+    first_of_each,
+    heaviest,
+    separate,
+)
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, Signals
 
-# Largest number of modes of a phase.
-MAX_MODES = 32
-# Maximum difference between the best log-likelihood and that of a mode: on the grid, which is
+# Negative logarithms of the share of the posterior that modes may leave out: on the grid, which is
 # accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 10.0
 EXACT_MARGIN = 8.0
 # Squared Mahalanobis distance below which two modes have converged to the same maximum.
 _SAME_MODE = 2.0
-# The linear model of a step in (r [m], u, v) does not hold beyond these; nor beyond the last
-# in range if the phases of the bands carry no information about it.
-_STEP_LIMITS = np.array([0.02, 0.05, 0.05])
-_COARSE_STEP_M = 0.7
 # A mode has converged when its last step gained less log-likelihood than this.
-_MIN_GAIN = 0.02
-# Maximum number of exact steps: usually, with nuisance parameters, and for strong signals.
-_N_STEPS = 2
-_N_NUISANCE_STEPS = 5
-LONG_SEARCH_STEPS = 12
+_MIN_GAIN = 0.05
+# Maximum number of exact steps. Few modes need more than two, unless signals are strong.
+MAX_STEPS = 8
+_N_USUAL_STEPS = 4
 
 
 class Modes(NamedTuple):
@@ -83,13 +82,18 @@ class Modes(NamedTuple):
         """Return the modes with the given indices or mask."""
         return Modes(*(field[chosen] for field in self))
 
+    def replace(self, rows: np.ndarray, others: 'Modes') -> None:
+        """Replace modes by others."""
+        for field, new in zip(self, others, strict=True):
+            field[rows] = new
+
     def of_phase(self, phase: int) -> 'Modes':
         """Return the modes of one phase."""
         return self.select(slice(*np.searchsorted(self.phases, (phase, phase + 1))))
 
 
 def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
-               aligned: np.ndarray, n_steps: int = 0, extra_margin: float = 0.0) -> Modes:
+               aligned: np.ndarray, extra_margin: float = 0.0) -> Modes:
     """Find the modes of each of N phases with a substantial weight in the posterior.
 
     Each phase has at least one mode, and its most likely one comes first.
@@ -98,17 +102,13 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
     ----------
     aligned
         Parameters that the signals alone reveal, float64 [N, Q]; 0 for the others.
-    n_steps
-        Maximum number of exact steps, at least 1; by default as many as usually needed.
     extra_margin
         Modes may be less likely than the best by this more than usual.
     """
     starts = grid.starts(
         likelihood.whitened(aligned, signals), likelihood.nuisance, GRID_MARGIN + extra_margin)
     starts = starts._replace(values=starts.values + aligned[starts.phases])
-    default = _N_NUISANCE_STEPS if len(likelihood.nuisance) else _N_STEPS
-    return ascend(likelihood, likelihood, starts, signals, n_steps or default,
-                  EXACT_MARGIN + extra_margin)
+    return ascend(likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra_margin)
 
 
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
@@ -124,27 +124,26 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     margin
         Modes that are less likely than the best of a phase by more are dropped.
     """
-    rows = starts.phases
-    modes, gain = _step(conditional, likelihood, starts, signals.take(rows), state)
-    for _ in range(n_steps - 1):
-        chosen = _prune(modes, gain, margin)
+    modes, gain = _step(conditional, likelihood, starts, signals.take(starts.phases), state)
+    for number in range(n_steps):
+        chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = modes.select(chosen), gain[chosen]
-        (moving,) = np.nonzero(gain > _MIN_GAIN)
-        if not len(moving):
+        # At the border of the region, small gains may alternate without end.
+        (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
+        if not len(moving) or number == n_steps - 1:
             break
         again = Starts(modes.phases[moving], modes.roi_points[moving], modes.values[moving])
         moved, gain[moving] = _step(
             conditional, likelihood, again, signals.take(again.phases), state)
-        for field, new in zip(modes, moved, strict=True):
-            field[moving] = new
-    chosen = _prune(modes, gain, margin)
-    modes = modes.select(chosen)
-    if len(likelihood.nuisance):
-        # A step that has not converged may predict any likelihood.
-        again = Starts(modes.phases, modes.points, modes.values)
-        modes, gain = _step(
-            conditional, likelihood, again, signals.take(modes.phases), state, moves=False)
-        modes = modes.select(_prune(modes, gain, margin))
+        modes.replace(moving, moved)
+    # A step that has not converged may predict any likelihood.
+    (moving,) = np.nonzero((gain > _MIN_GAIN) | (len(likelihood.nuisance) > 0))
+    if len(moving):
+        again = Starts(modes.phases[moving], modes.points[moving], modes.values[moving])
+        modes.replace(moving, _step(conditional, likelihood, again, signals.take(again.phases),
+                                    state, moves=False)[0])
+        gain[moving] = 0.0
+        modes = modes.select(_prune(likelihood, modes, gain, margin))
     return modes
 
 
@@ -155,7 +154,7 @@ def marginal_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     Takes approximate parameters, [M, Q], from which Newton steps start.
     """
     values = likelihood.settle(points, values, signals)
-    for _ in range(2):
+    for _ in range(2 if values.shape[1] else 1):
         local = conditional.local(points, values, signals)
         marginal = marginalise(local.information, local.gradient)
         values = values + marginal.offset
@@ -178,7 +177,8 @@ def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, sign
     step, values = whole[:, :3], values + whole[:, 3:]
     evidence = local.value + marginal.log_volume
     points = points + step
-    offset = offset_to_roi(points, marginal.information, likelihood.scenario.roi_bounds_m)
+    offset = offset_to_roi(points, marginal.information, likelihood.scenario.roi_bounds_m,
+                           likelihood.resolution.tolerance_m)
     gain = rise - likelihood_loss(offset, marginal.information)
     modes = Modes(
         starts.phases, points, marginal.information, evidence + rise, offset, values,
@@ -200,9 +200,7 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
                 else Marginal(local.information, local.gradient, np.zeros((n, 0, 3)),
                               np.zeros((n, 0)), np.zeros(n)))
     step = np.linalg.solve(marginal.information, marginal.gradient[..., None])[..., 0]
-    limits = _STEP_LIMITS.copy()
-    if likelihood.nuisance.is_coarse:
-        limits[0] = _COARSE_STEP_M
+    limits = likelihood.resolution.step_limits(likelihood.nuisance.is_coarse)
     whole = np.clip(step, -limits, limits)
     if n_values:
         whole = np.hstack([whole, marginal.offset + np.einsum(
@@ -211,40 +209,24 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
     return marginal, whole, rise
 
 
-def _prune(modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
+def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
+           ) -> np.ndarray:
     """Choose the probable and separate modes of each phase, the most likely first.
 
     The likelihood of a mode is a prediction. The best is at most the one before the last step,
     which is computed.
     """
-    value = modes.roi_log_likelihood
-    order = np.lexsort((-value, modes.phases))
-    phases, value, gain = modes.phases[order], value[order], gain[order]
+    # A step that has not converged may predict any likelihood.
+    value = modes.roi_log_likelihood + np.maximum(gain, 0)
+    order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
+    phases = modes.phases[order]
     firsts = first_of_each(phases)
-    best = np.minimum(value[firsts], np.maximum.reduceat(value - gain, firsts))
-    lists = np.searchsorted(phases[firsts], phases)
-    kept = value >= best[lists] - margin - np.maximum(gain, 0)
-    order, lists = order[kept], lists[kept]
-    # Lists of the modes of each phase, filled up to the same length.
-    place = np.arange(len(lists)) - first_of_each(lists)[lists]
-    index = np.zeros((len(firsts), place.max() + 1), int)
-    valid = np.zeros(index.shape, bool)
-    index[lists, place], valid[lists, place] = order, True
-    points, curvature = modes.roi_points[index], modes.curvature[index]
-    rows = np.arange(len(index))[:, None]
-
-    def are_close(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        offset = points[rows, first][:, :, None] - points[rows, second][:, None]
-        scaled = np.matmul(offset, curvature[rows, first])
-        close: np.ndarray = np.einsum('lnmp,lnmp->lnm', scaled, offset) < _SAME_MODE
-        return close
-
-    chosen: np.ndarray = index[suppress(are_close, valid, MAX_MODES)]
+    known = (modes.roi_log_likelihood - gain)[order]
+    best = np.minimum(modes.roi_log_likelihood[order[firsts]], np.maximum.reduceat(known, firsts))
+    relative = value[order] - np.repeat(best, np.diff(firsts, append=len(order)))
+    order = order[heaviest(phases, np.minimum(relative, 0.0), margin)]
+    phases = modes.phases[order]
+    radii = likelihood.resolution.separation(likelihood.nuisance.is_coarse)
+    chosen: np.ndarray = order[separate(
+        phases, modes.roi_points[order], radii, modes.curvature[order])]
     return chosen
-
-
-def first_of_each(phases: np.ndarray) -> np.ndarray:
-    """Return the index of the first mode of each phase, for phases [M] in ascending order."""
-    changes = np.ones(len(phases), bool)
-    np.not_equal(phases[1:], phases[:-1], out=changes[1:])
-    return np.flatnonzero(changes)

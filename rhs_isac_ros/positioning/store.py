@@ -18,7 +18,7 @@ from rhs_isac_ros.positioning import grid, outside
 _MAX_TABLES = 16
 _PREFIX = 'table-'
 # Version of the contents of a table; tables of another version are not used.
-_FORMAT = 4
+_FORMAT = 5
 
 
 def default_folder() -> Path:
@@ -62,7 +62,6 @@ def _tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
 def table_key(model: MeasurementModel, codebook_id: str) -> str:
     """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
     parts = (model.scenario.id, codebook_id, __version__, _FORMAT,
-             grid.RANGE_CELL_M, grid.DIRECTION_STEP, outside.RANGE_RATIO, outside.DIRECTION_STEP,
              *([model.surface.id] if model.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 

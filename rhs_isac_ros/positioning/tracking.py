@@ -73,8 +73,8 @@ class Tracker:
     `MAX_GAP_S`; signals without a position do not change it, and neither do those whose multipath
     is almost that of the phase before.
 
-    Positions of the track are inside the region of interest. If the signals of a phase may be from
-    outside, its covariance includes the positions there, as that of the estimator does.
+    Positions of the track are inside the region of interest. The probability of a user outside is
+    that of the estimator.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Tracker:
             found = posterior.estimate
             return TrackEstimate(
                 found.mean, found.covariance, found.reason, found.residual,
-                found.expected_residual)
+                found.expected_residual, found.outside_probability)
         if time_s <= self._latest_s:
             return _described(posterior.estimate, self._start(posterior.modes), 1)
         self._latest_s = time_s
@@ -131,13 +131,11 @@ class Tracker:
             mixture = self._updated(
                 mixture, posterior.modes, posterior.signals, share, elapsed_s)
         mixture, mean, covariance = self._inside(mixture)
-        if posterior.doubt:
-            covariance = self.estimator.with_outside(mean, covariance, posterior.doubt)
         if share >= _MIN_SHARE:
             self._mixture, self._time_s = mixture, time_s
             self._n_phases += 1
         found = posterior.estimate
-        estimate = Estimate(mean, covariance, '', found.residual, found.expected_residual)
+        estimate = dataclasses.replace(found, mean=mean, covariance=covariance)
         return _described(estimate, mixture, self._n_phases)
 
     def _start(self, modes: Modes, share: float = 1.0) -> Mixture:
@@ -184,7 +182,7 @@ def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEsti
     velocity, covariance = mixture.velocity()
     return TrackEstimate(
         estimate.mean, estimate.covariance, estimate.reason, estimate.residual,
-        estimate.expected_residual, velocity, covariance, n_phases)
+        estimate.expected_residual, estimate.outside_probability, velocity, covariance, n_phases)
 
 
 def independent_share(scenario: Scenario, elapsed_s: float) -> float:

@@ -45,7 +45,7 @@ def region(scenario: Scenario, stamp: Time) -> Marker:
     """Return the region of interest as a translucent cuboid."""
     marker = _marker('region', 0, Marker.CUBE, stamp)
     marker.pose.position = _point(np.array(scenario.roi_center_m))
-    marker.scale = _vector(np.array(scenario.roi_size_m))
+    marker.scale = _vector(np.maximum(scenario.roi_size_m, _MIN_EXTENT_M))
     marker.color = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.15)
     return marker
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.link import Beam, BeamPattern, beam_pattern
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_interval_m, element_positions, feed_positions
+from rhs_isac_ros.model.geometry import element_interval_m, feed_positions
 from rhs_isac_ros.model.pictures import PAGE_IN, look, new_figure, paper_style, write_picture
 from rhs_isac_ros.monitoring.entities import MIN_LEVEL_DB, lobe_m
 from rhs_isac_ros.monitoring.scene_state import SceneState, UserState
@@ -111,7 +111,8 @@ def _draw_view(
         colour = look(scene.shown_beam.user - 1).colour
         axes.fill(*cut[:, plane].T, facecolor=colour, alpha=0.13, zorder=1)
         axes.plot(*cut[:, plane].T, color=colour, alpha=0.5, linewidth=0.8, zorder=1)
-    half_m = element_interval_m(scenario) * scenario.elements_per_side / 2
+    sides = scenario.n_columns, scenario.n_rows
+    half_m = element_interval_m(scenario) * sides[plane[1] - 1] / 2
     axes.plot([0, 0], [-half_m, half_m], color='black', linewidth=_SURFACE_WIDTH_POINTS,
               solid_capstyle='butt', zorder=4)
     axes.annotate('surface', (0, half_m), xytext=(0, 8), textcoords='offset points', ha='center')
@@ -145,13 +146,12 @@ def _draw_user(axes: Any, plane: list[int], user: UserState) -> None:
 
 def _draw_surface(axes: Any, scene: SceneState, scenario: Scenario) -> None:
     """Draw the configuration of the surface from the front: y to the right, z up."""
-    side, n_elements = scenario.elements_per_side, len(element_positions(scenario))
-    half_cm = 50 * element_interval_m(scenario) * side
-    message = scene.configuration
-    amplitudes = np.full(n_elements, np.nan) if message is None else message.analog.mean(axis=0)
+    shape, message = (scenario.n_rows, scenario.n_columns), scene.configuration
+    half_z_cm, half_y_cm = (50 * element_interval_m(scenario) * n for n in shape)
+    amplitudes = np.full(shape, np.nan) if message is None else message.analog.mean(axis=0)
     image = axes.imshow(
-        amplitudes.reshape(side, side), origin='lower', vmin=0, vmax=1,
-        extent=(-half_cm, half_cm, -half_cm, half_cm))
+        amplitudes.reshape(shape), origin='lower', vmin=0, vmax=1,
+        extent=(-half_y_cm, half_y_cm, -half_z_cm, half_z_cm))
     axes.plot(*(100 * feed_positions(scenario)[:, 1:]).T, 'D', color='white',
               markeredgecolor='black', markersize=4)
     axes.figure.colorbar(image, ax=axes, location='bottom', label='amplitude', shrink=0.8,

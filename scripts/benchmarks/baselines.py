@@ -53,9 +53,9 @@ def all_elements(scenario: Scenario) -> ArrayReceiver:
 
 def fully_digital(scenario: Scenario) -> ArrayReceiver:
     """Observe K elements in every frame, starting with three corners of the surface."""
-    side = scenario.elements_per_side
-    corners = [0, side - 1, side * (side - 1), side**2 - 1]
-    others = [m for m in range(side**2) if m not in corners]
+    last = scenario.n_elements - 1
+    corners = [0, scenario.n_columns - 1, last + 1 - scenario.n_columns, last]
+    others = [m for m in range(scenario.n_elements) if m not in corners]
     chosen = np.eye(scenario.n_elements, dtype=complex)[[*corners, *others][:scenario.n_feeds]]
     return ArrayReceiver(scenario, amplitude(scenario) * chosen, np.zeros(len(chosen), int),
                          scenario.n_frames)

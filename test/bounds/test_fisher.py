@@ -13,7 +13,7 @@ from rhs_isac_ros.bounds import (
     fisher_information_of,
 )
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario, measurement
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.multipath import multipath_covariance
 
@@ -69,7 +69,7 @@ def test_a_model_serves_all_positions(case, monkeypatch):
 
 
 def test_bound_does_not_depend_on_the_blocks(case, monkeypatch):
-    monkeypatch.setattr(fisher, '_BLOCK', 4)
+    monkeypatch.setattr(measurement, '_BLOCK', 4)
     bound = crlb(case.scenario, case.codebook, case.vectors['positions'])
     np.testing.assert_allclose(bound, case.vectors['crlb'], rtol=1e-8)
 
@@ -259,3 +259,13 @@ def test_equation_12_is_that_of_the_position_alone(table1):
     np.testing.assert_array_equal(
         fisher_information(declared, table1.codebook, table1.vectors['positions']),
         fisher_information(table1.scenario, table1.codebook, table1.vectors['positions']))
+
+
+def test_a_flat_region_determines_the_coordinate(table1):
+    """The bound is that of a user whose height is known."""
+    scenario = dataclasses.replace(table1.scenario, roi_size_m=(10.0, 10.0, 0.0))
+    positions = table1.scenario.sample_positions(5, np.random.default_rng(0))
+    found = crlb(scenario, table1.codebook, positions, region_prior=True)
+    information = fisher_information(scenario, table1.codebook, positions)[:, :2, :2]
+    expected = np.linalg.inv(information + np.eye(2) * 12 / 100).trace(axis1=1, axis2=2)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)

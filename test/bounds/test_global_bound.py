@@ -79,3 +79,13 @@ def test_the_amplitude_of_strong_signals_does_not_exclude_the_truth():
 def test_too_few_phases_are_an_error():
     with pytest.raises(ValueError, match='n_phases: 1, expected at least 2'):
         bound_and_codebook(1)
+
+
+@pytest.mark.parametrize('height', [0.0, 1.2])
+def test_a_flat_region_is_the_limit_of_thin_ones(height):
+    flat, thin = (bound_and_codebook(
+        1024, multipath_to_los_db=-20.0, roi_center_m=(5.0, 0.0, height),
+        roi_size_m=(2.0, 2.0, size))[2] for size in (0.0, 2e-2))
+    spread = np.hypot(flat.standard_error, thin.standard_error)
+    assert flat.value == pytest.approx(thin.value, abs=4 * spread + 0.05 * thin.value)
+    assert spread < 0.2 * thin.value

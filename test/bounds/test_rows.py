@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import rows
-from rhs_isac_ros.bounds.rows import CompressedRows, ExactRows
+from rhs_isac_ros.bounds import AverageCrlb, rows
+from rhs_isac_ros.bounds.rows import CompressedRows, ExactRows, rows_within
+from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import los_derivative, los_gain
 
@@ -383,3 +384,40 @@ def test_compressed_rows_do_not_use_their_source_again(wide, items, model):
     source.calls.clear()
     evaluate(compressed, model, items.shape[1])
     assert not source.calls
+
+
+@pytest.mark.parametrize('rank', [20, 400])
+def test_few_rows_that_need_a_large_basis_are_kept_in_single_precision(rank):
+    scenario = Scenario(n_subbands=40, n_frames=2, n_feeds=2, elements_per_side=6)
+    rng = np.random.default_rng(6)
+    items = (complex_array(rng, 400, rank) @ complex_array(rng, rank, 2 * 40 * 36)).reshape(
+        400, 1, 2, 40, 36)
+    found = rows_within(scenario, source_of(items), 400, 1, 1e-5)
+    assert isinstance(found, CompressedRows if rank == 20 else ExactRows)
+    exact = rows_within(scenario, source_of(items), 400, 1, 0.0)
+    assert isinstance(exact, ExactRows)
+    beams = SimpleNamespace(
+        radiation=complex_array(rng, 2, 80, 36),
+        whitener=np.stack([np.eye(80) + 0j] * 2))
+    own, expected = (evaluate(one, beams, 1) for one in (found, exact))
+    assert_same(own, expected, 1e-5)
+    if rank == 400:
+        assert max(one.dtype.itemsize for one in found._kept.values()) == 8
+        assert_same(own, expected, 1e-6)
+
+
+def test_the_rows_of_a_wide_surface_need_little_memory():
+    """64 sub-bands of 256 elements and 768 rows of 16384 numbers each, 200 MB in full."""
+    scenario = Scenario(center_frequencies_hz=(28e9,), n_subbands=64, subband_width_hz=6.25e6,
+                        elements_per_side=16)
+    positions = scenario.sample_positions(256, np.random.default_rng(0))
+    model = MeasurementModel(scenario, random_codebook(scenario, np.random.default_rng(0)))
+    model.prepare()
+    tracemalloc.start()
+    try:
+        average = AverageCrlb(scenario, positions, 3e-5)
+        average(model.beams)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 5e8

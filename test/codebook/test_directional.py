@@ -5,7 +5,7 @@ import pytest
 
 from rhs_isac_ros.codebook import directional_codebook
 from rhs_isac_ros.codebook.directional import SCANS, width_points
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
 
 SCENARIOS = [
     Scenario(max_power_w=0.3),
@@ -105,3 +105,19 @@ def test_no_other_weights_of_a_sub_band_receive_more_power(scenario, plain):
         for _ in range(20):
             other = rng.normal(size=(scenario.n_feeds, 2)) @ [1, 1j]
             assert abs(other @ feeds) * np.sqrt(share) / np.linalg.norm(other) <= best
+
+
+@pytest.mark.parametrize('sides', [(24, 6), (6, 24)])
+def test_the_beam_of_a_rectangle_is_narrow_along_its_long_side(sides):
+    """The first of two numbers of elements is along y."""
+    scenario = Scenario(center_frequencies_hz=(3e9,), n_frames=1, n_subbands=1,
+                        elements_per_side=sides)
+    model = MeasurementModel(scenario, directional_codebook(scenario))
+    slopes, focus = np.linspace(-0.5, 0.5, 1001), width_points(scenario)[0, 0]
+    widths = []
+    for axis in (1, 2):
+        points = np.tile(focus, (len(slopes), 1))
+        points[:, axis] += focus[0] * slopes
+        power = np.abs(model.mean(points)[:, 0, 0])**2
+        widths.append(np.mean(power > power.max() / 2))
+    assert widths[np.argmax(sides)] < 0.6 * widths[np.argmin(sides)]

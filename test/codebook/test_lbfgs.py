@@ -35,3 +35,20 @@ def test_begins_at_the_start(quadratic, search_of):
     start = np.linspace(0.2, 0.7, 20)
     minimize_lbfgs(search_of(problem, 3, start=start))
     np.testing.assert_array_equal(problem.points[0], start)
+
+
+@pytest.mark.parametrize('unit', [2.0**-40, 2.0**40])
+def test_does_not_depend_on_the_unit_of_the_objective(quadratic, search_of, unit):
+    """In nanometres or in kilometres, the steps are the same."""
+    class Scaled(quadratic):
+        def value(self, variables):
+            return unit * super().value(variables)
+
+        def value_and_gradient(self, variables):
+            value, gradient = super().value_and_gradient(variables)
+            return value, unit * gradient
+
+    plain, scaled = (make(2) for make in (quadratic, Scaled))
+    reasons = [minimize_lbfgs(search_of(problem, 200)) for problem in (plain, scaled)]
+    assert reasons[0] == reasons[1]
+    np.testing.assert_array_equal(scaled.points, plain.points)

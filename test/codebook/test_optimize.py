@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from rhs_isac_ros.bounds import crlb
+from rhs_isac_ros.bounds import crlb, rows
+from rhs_isac_ros.bounds.rows import MeasurementRows
 from rhs_isac_ros.codebook import (
     METHODS,
     OBJECTIVES,
@@ -21,7 +22,7 @@ from rhs_isac_ros.codebook import (
     optimize,
     random_codebook,
 )
-from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _PeriodicCall
+from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _PeriodicCall, _Report
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario, threads
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -252,6 +253,51 @@ def test_an_interrupt_in_the_progress_callback_returns_the_best_so_far(scenario,
         result.codebook.average_crlb_m2, result.history[-1].value_m2, rtol=ABOUT)
 
 
+@pytest.mark.parametrize('objective', OBJECTIVES)
+def test_progress_is_reported_while_the_objective_is_set_up(
+        scenario, positions, objective, monkeypatch):
+    monkeypatch.setattr(_Report, '_PERIOD_S', 0.0)
+    seen = []
+    result = optimize(scenario, positions, objective=objective, seed=3, max_steps=2,
+                      progress=seen.append)
+    (first, *_), steps = seen, len(result.history)
+    assert (first.step, first.evaluations, first.value_m2) == (0, 0, np.inf)
+    assert seen[-steps:] == list(result.history)
+    assert all(entry.value_m2 == np.inf for entry in seen[:-steps])
+    elapsed = [entry.elapsed_s for entry in seen[:-steps]]
+    assert elapsed == sorted(elapsed)
+
+
+@pytest.mark.parametrize('kept', [False, True])
+def test_an_interrupt_of_the_set_up_returns_the_start(scenario, positions, kept, monkeypatch):
+    """Rows that are kept are computed with the first evaluation."""
+    monkeypatch.setattr(_Report, '_PERIOD_S', 0.0)
+    if kept:
+        monkeypatch.setattr(rows, '_rank_of_some', lambda *_: 1 << 20)
+    start, calls = directional_codebook(scenario), []
+
+    def interrupt(entry):
+        calls.append(entry)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+
+    result = optimize(scenario, positions, seed=3, start=start, progress=interrupt)
+    assert result.reason == 'interrupted'
+    assert len(result.history) == 1
+    np.testing.assert_array_equal(result.codebook.analog, start.analog)
+    np.testing.assert_allclose(result.codebook.digital, start.digital, rtol=1e-12)
+
+
+def test_an_error_of_the_progress_callback_ends_the_set_up(scenario, positions, monkeypatch):
+    monkeypatch.setattr(_Report, '_PERIOD_S', 0.0)
+
+    def fail(entry):
+        raise TimeoutError
+
+    with pytest.raises(TimeoutError):
+        optimize(scenario, positions, seed=3, progress=fail)
+
+
 def test_keep_receives_the_results_so_far(scenario, positions, monkeypatch):
     monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
     kept, seen = [], []
@@ -319,19 +365,21 @@ def test_starts_from_the_given_codebook(small):
 
 @pytest.mark.parametrize('max_steps', [None, 5])
 @pytest.mark.parametrize('method', ['random', 'directional'])
-def test_methods_without_a_search_return_the_start(
-        scenario, positions, method, max_steps, small):
+def test_methods_without_a_search_return_the_start_and_set_up_no_objective(
+        scenario, positions, method, max_steps, small, monkeypatch):
+    first = optimize(scenario, positions, 'lbfgs', seed=2, max_steps=1).history[0]
+    monkeypatch.setattr(MeasurementRows, '__init__', None)
     result = optimize(scenario, positions, method, seed=2, max_steps=max_steps)
     assert result.reason == 'nothing to optimise'
     assert len(result.history) == 1
-    assert result.history[0].evaluations == 1
+    assert result.history[0].evaluations == 0
+    assert result.history[0].value_m2 == result.codebook.average_crlb_m2
     if method == 'directional':
         expected = directional_codebook(scenario)
     else:
         # Every method starts from it by default.
         expected = random_codebook(scenario, np.random.default_rng(0))
-        first = optimize(scenario, positions, 'lbfgs', seed=2, max_steps=1).history[0]
-        assert first.value_m2 == result.history[0].value_m2
+        assert result.history[0].value_m2 == pytest.approx(first.value_m2, rel=2 * ABOUT)
         analog = result.codebook.analog
         assert analog.min() < 0.2
         assert analog.max() > 0.8
@@ -479,6 +527,15 @@ def test_empty_positions_are_an_error(scenario):
         optimize(scenario, np.zeros((0, 3)), max_steps=1)
 
 
+def test_bounds_below_a_millimetre_are_minimised_as_well(scenario):
+    """With weak multipath, objectives are of the order of 1e-6 m^2."""
+    clear = dataclasses.replace(scenario, multipath_to_los_db=-60.0)
+    result = optimize(clear, n_positions=64, max_steps=STEPS)
+    assert len(result.history) == STEPS + 1
+    assert result.history[0].value_m2 < 1e-4
+    assert result.history[-1].value_m2 < 0.5 * result.history[0].value_m2
+
+
 def test_empty_positions_are_an_error_for_ambiguity(scenario):
     with pytest.raises(ValueError, match='^positions: .*, expected '):
         optimize(scenario, np.zeros((0, 3)), objective='ambiguity', max_steps=1)
@@ -489,6 +546,15 @@ def test_a_tiny_region_is_accepted(scenario, objective):
     tiny = dataclasses.replace(scenario, roi_size_m=(0.01, 0.01, 0.01))
     result = optimize(tiny, n_positions=4, objective=objective, max_steps=1)
     result.codebook.check(tiny)
+
+
+@pytest.mark.parametrize('objective', OBJECTIVES)
+def test_a_flat_region_and_a_rectangular_surface_are_accepted(scenario, objective):
+    flat = dataclasses.replace(scenario, roi_size_m=(*scenario.roi_size_m[:2], 0.0),
+                               elements_per_side=(6, 3))
+    result = optimize(flat, n_positions=16, objective=objective, max_steps=5)
+    result.codebook.check(flat)
+    assert result.history[-1].value_m2 < result.history[0].value_m2
 
 
 def test_a_negative_seed_is_an_error(scenario):

@@ -194,3 +194,18 @@ def test_volumes_are_relative_to_the_fifth_power_of_the_range():
         for position in (near, far))
     # The displaced volume itself grows with the square of the range.
     assert second / first == pytest.approx(2.0**(2 - 5))
+
+
+@pytest.mark.parametrize('height', [0.0, 1.5])
+def test_pairs_in_a_flat_region_keep_their_height_and_their_lags(height):
+    """Range lags are whole periods of the bands, as in a region with an extent."""
+    scenario = Scenario(roi_center_m=(50, 0, height), roi_size_m=(40, 40, 0))
+    positions = np.tile([50.0, 0, height], (4000, 1))
+    others = draw_confusable(scenario, positions, np.random.default_rng(0))
+    assert (others[:, 2] == height).all()
+    lags = np.abs(np.linalg.norm(others, axis=1) - np.linalg.norm(positions, axis=1))
+    lags = lags[(lags > 0.3) & (lags < 15)]
+    assert len(lags) > 1000
+    period = 0.5995849
+    away = np.abs((lags / period + 0.5) % 1 - 0.5) * period
+    assert np.mean(away < 0.0125) > 4 * np.mean((away > 0.0375) & (away < 0.05))

@@ -36,8 +36,8 @@ def test_scatter_multiplies_by_the_covariance(table1):
     rng = np.random.default_rng(0)
     weights = rng.normal(size=(2, 3, 100, 2)) @ [1, 1j]
     np.testing.assert_allclose(
-        link.scatter(weights), weights @ table1.vectors['V'][1], rtol=1e-5,
-        atol=1e-9 * np.abs(link.spatial).max())
+        link.spatial.scatter(weights), weights @ table1.vectors['V'][1], rtol=1e-5,
+        atol=1e-9 * link.spatial.power.max())
 
 
 def test_links_in_several_bands_are_those_of_each_band(table1):
@@ -54,7 +54,7 @@ def test_links_in_several_bands_are_those_of_each_band(table1):
 
 def test_shared_arrays_are_read_only(table1):
     link = BandLink.to(table1.scenario, POSITION, 0)
-    for array in (link.onboard, link.spatial, link.fixed):
+    for array in (link.onboard, link.spatial.matrix, link.fixed):
         with pytest.raises(ValueError, match='read-only'):
             array[0] = 0
 
@@ -69,7 +69,8 @@ def test_a_sub_band_has_its_share_of_the_power(table1):
 
 @pytest.mark.parametrize(('width_hz', 'expected'), [(1e5, [1]), (4e8, [0, 1, 2])])
 def test_sub_bands_that_differ_are_represented_separately(width_hz, expected):
-    scenario = Scenario(n_subbands=3, subband_width_hz=width_hz)
+    scenario = Scenario(center_frequencies_hz=(3e9, 5e9), n_subbands=3,
+                        subband_width_hz=width_hz)
     np.testing.assert_array_equal(representative_subbands(scenario, 0.5, 8), expected)
     assert len(representative_subbands(scenario, 0.5, 1)) == 1
 

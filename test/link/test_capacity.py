@@ -240,7 +240,7 @@ def test_a_measured_covariance_has_its_own_capacity(table1, reference_link, ship
     received = model.sample(places, rng) + gains[:, None, None] * (model.radiation @ wave)
     measured = dataclasses.replace(
         scenario, multipath=survey(scenario, shipped, places, received))
-    spatial = spatial_covariance(measured)
+    spatial = spatial_covariance(measured).matrix
     assert np.abs(spatial[0].imag).max() > 0.05 * np.abs(spatial[0]).max()
     link = reference_link(table1)
     link.spatial = spatial[0]

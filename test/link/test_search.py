@@ -5,10 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from rhs_isac_ros.link import Beam, capacity
+from rhs_isac_ros.link import search as search_module
 from rhs_isac_ros.link.ascent import ascend
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.search import candidate_configurations, tables
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, multipath
+from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.surface import matched_configuration
 
 POSITION = np.array([8.0, -2.0, 0.5])
@@ -80,7 +83,7 @@ def test_single_precision_suffices_at_all_powers(changes):
 
 def test_the_modes_contain_nearly_all_of_the_multipath_power(table1):
     found = tables(table1.scenario, None)
-    for band, spatial in enumerate(BandLink.to(table1.scenario, POSITION, range(2)).spatial):
+    for band, spatial in enumerate(multipath_covariance(table1.scenario).real):
         # The gain on the board has the amplitude 1.
         modes = found.paths[band, :, 0, 0, 1:] / found.onboard[band, :, 0, 0, None]
         assert modes.shape[1] < 20
@@ -90,3 +93,32 @@ def test_the_modes_contain_nearly_all_of_the_multipath_power(table1):
 
 def test_the_tables_are_computed_once(table1):
     assert tables(table1.scenario, None) is tables(Scenario(), None)
+
+
+@pytest.mark.parametrize('direction', [(0.0, 0.0), (40.0, -20.0)])
+def test_modes_of_many_elements_are_found_by_products_alone(monkeypatch, direction):
+    scenario = Scenario(elements_per_side=(9, 6), multipath_direction_deg=direction)
+    expected = search_module._modes(scenario)
+    multipath.spatial_covariance.cache_clear()
+    monkeypatch.setattr(multipath, '_MAX_MATRIX', 1)
+    monkeypatch.setattr(search_module, '_MAX_MODES', 30)
+    found = search_module._modes(scenario)
+    multipath.spatial_covariance.cache_clear()
+    assert np.isrealobj(found) == (direction == (0, 0))
+    assert found.shape == expected.shape
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one @ np.conj(one.T), other @ np.conj(other.T),
+                                   atol=0.01 * np.abs(other @ np.conj(other.T)).max())
+
+
+def test_multipath_from_a_side_is_used(small):
+    """With a weak line of sight, a good beam points to where the multipath comes from."""
+    scenario = dataclasses.replace(
+        small.scenario, multipath_to_los_db=20.0, multipath_direction_deg=(50.0, 0.0))
+    link, found = search(scenario, POSITION, 2)
+    corners = np.random.default_rng(0).integers(0, 2, (1, 3000, 16)).astype(float)
+    ends, rates = ascend(link, found)
+    assert rates.max() >= link.best_rate(corners).max()
+    beam = Beam(ends[0, rates[0].argmax()], link.best_digital(ends)[0, rates[0].argmax()])
+    rate = capacity(scenario, beam, POSITION[None])[0]
+    assert rate == pytest.approx(rates.max() * scenario.subband_width_hz / np.log(2), rel=1e-9)

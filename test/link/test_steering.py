@@ -244,9 +244,11 @@ def test_an_uncertain_position_may_change_the_band():
 
 
 def test_the_first_of_equal_bands_is_chosen(table1):
-    scenario = dataclasses.replace(
-        table1.scenario, center_frequencies_hz=(2.5e9, 2.5e9))
-    assert choose_beam(scenario, POSITION, np.eye(3)).beam.band == 0
+    silent = SurfaceEstimate(
+        np.zeros(100), np.zeros(100), np.ones(2), np.zeros((202, 0)), np.zeros(100))
+    for bands in ([0, 1], [1, 0]):
+        choice = choose_beam(table1.scenario, POSITION, np.eye(3), bands, silent)
+        assert (choice.beam.band, choice.expected_bps) == (bands[0], 0)
 
 
 @pytest.mark.parametrize('bands', [[2], [-1], [0, 5]])

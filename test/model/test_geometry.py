@@ -22,7 +22,8 @@ def test_positions_and_frequencies_match_the_vectors(case):
     Scenario(elements_per_side=1, n_feeds=1, n_subbands=1, center_frequencies_hz=(1e9,)),
     Scenario(elements_per_side=5, n_feeds=4, n_subbands=5, center_frequencies_hz=(1e9, 2e9, 9e9),
              element_interval_wavelengths=0.5),
-], ids=['one of each', 'odd'])
+    Scenario(elements_per_side=(5, 2), n_feeds=2),
+], ids=['one of each', 'odd', 'rectangle'])
 def test_positions_and_frequencies_match_the_definition(scenario, plain):
     p = plain(scenario)
     n_elements, n_feeds = scenario.n_elements, scenario.n_feeds

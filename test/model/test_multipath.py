@@ -8,6 +8,7 @@ from scipy.integrate import dblquad, tplquad
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import multipath as mp
+from rhs_isac_ros.model.geometry import element_positions
 
 
 def test_covariance_matches_the_vectors(case):
@@ -40,32 +41,112 @@ def test_mean_los_power_is_the_adaptive_integral(other, band):
 
 
 @pytest.mark.parametrize(('band', 'm', 'n'), [(0, 0, 8), (1, 0, 1), (1, 7, 3), (1, 2, 6)])
-def test_covariance_is_the_adaptive_integral(other, plain, band, m, n):
-    """Integrate each quadrant separately, because the profile has a cusp along both axes."""
+@pytest.mark.parametrize('direction', [(0.0, 0.0), (40.0, 0.0), (0.0, -25.0), (-60.0, 80.0)])
+def test_covariance_is_the_adaptive_integral(other, plain, direction, band, m, n):
+    """Integrate each quadrant separately, because the profile has a cusp at its mean."""
+    other = dataclasses.replace(other, multipath_direction_deg=direction)
     p = plain(other)
     wavenumber = 2 * np.pi * other.center_frequencies_hz[band] / 299_792_458
     offset = wavenumber * (p.element(m) - p.element(n))
     rate = np.sqrt(2) / np.deg2rad(25.0)
+    middle = np.deg2rad(direction)
 
     def density(elevation, azimuth):
-        return np.exp(-rate * (abs(azimuth) + abs(elevation)))
+        return np.exp(-rate * (abs(azimuth - middle[0]) + abs(elevation - middle[1])))
 
     def phase(elevation, azimuth):
         return offset @ (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
                          np.sin(elevation))
 
     def integral(function):
-        ends = ((-np.pi / 2, 0), (0, np.pi / 2))
-        return sum(dblquad(function, *azimuths, *elevations, epsrel=1e-8, epsabs=1e-10)[0]
-                   for azimuths in ends for elevations in ends)
+        azimuths, elevations = (((-np.pi / 2, one), (one, np.pi / 2)) for one in middle)
+        return sum(dblquad(function, *a, *e, epsrel=1e-8, epsabs=1e-10)[0]
+                   for a in azimuths for e in elevations)
 
-    total = (2 * -np.expm1(-rate * np.pi / 2) / rate)**2
+    total = np.prod([
+        (2 - np.exp(-rate * (np.pi / 2 - one)) - np.exp(-rate * (np.pi / 2 + one))) / rate
+        for one in middle])
     real = integral(lambda *angles: np.cos(phase(*angles)) * density(*angles)) / total
     imag = integral(lambda *angles: np.sin(phase(*angles)) * density(*angles)) / total
     power = (299_792_458 / (4 * np.pi * other.center_frequencies_hz[band]))**2
     power *= mean_inverse_square(other) * 2.0**2 * 0.5**2
     np.testing.assert_allclose(
         mp.multipath_covariance(other)[band, m, n], power * (real + 1j * imag), rtol=1e-6)
+
+
+@pytest.fixture(params=[(0.0, 0.0), (0.0, 40.0), (-60.0, 0.0), (30.0, -20.0)])
+def rectangle(request) -> Scenario:
+    """A rectangular surface, with the multipath from boresight and from elsewhere."""
+    return Scenario(elements_per_side=(4, 7), multipath_direction_deg=request.param,
+                    n_subbands=2, n_frames=1)
+
+
+@pytest.fixture
+def by_convolution(monkeypatch):
+    """Multiply by V as for a surface of many elements."""
+    for cache in (mp.spatial_covariance, mp.declared_covariance, mp.multipath_factors):
+        cache.cache_clear()
+    monkeypatch.setattr(mp, '_MAX_MATRIX', 1)
+    yield
+    for cache in (mp.spatial_covariance, mp.declared_covariance, mp.multipath_factors):
+        cache.cache_clear()
+
+
+def products(scenario: Scenario, weights: np.ndarray) -> list[np.ndarray]:
+    spatial = mp.spatial_covariance(scenario)
+    return [spatial.scatter(weights), spatial[1].scatter(weights[1])[None],
+            spatial[[1, 0]].scatter(weights[::-1])]
+
+
+def assert_products(scenario: Scenario) -> None:
+    weights = np.random.default_rng(0).normal(size=(2, 3, 5, 28, 2)) @ [1, 1j]
+    expected = np.einsum('bfkm,bmn->bfkn', weights, mp.multipath_covariance(scenario))
+    for found, wanted in zip(
+            products(scenario, weights), (expected, expected[1:], expected[::-1]), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-13 * np.abs(expected).max())
+
+
+def test_products_are_those_with_the_covariance(rectangle):
+    assert mp.spatial_covariance(rectangle).matrix is not None
+    assert_products(rectangle)
+
+
+def test_products_with_many_elements_are_convolutions(rectangle, by_convolution):
+    assert mp.spatial_covariance(rectangle).matrix is None
+    assert_products(rectangle)
+
+
+def test_many_gains_are_drawn_as_plane_waves(rectangle, by_convolution, monkeypatch):
+    monkeypatch.setattr(mp, '_ANGLE_NODES', 16)
+    n, v = 4000, mp.multipath_covariance(rectangle)[1]
+    gains = mp.draw_multipath(rectangle, 1, n, np.random.default_rng(2))
+    assert gains.shape == (n, 2, 28)
+    for row in (0, 1):
+        assert_sample_covariance(gains[:, row], gains[:, row], v, v[0, 0].real)
+        assert_sample_covariance(gains[:, row], gains[:, row].conj(), 0, v[0, 0].real * 2**0.5)
+    correlation = mp.measurement_correlation(rectangle)[1, 0, 1]
+    assert_sample_covariance(gains[:, 0], gains[:, 1], correlation * v, v[0, 0].real)
+
+
+def test_the_quadrature_resolves_large_surfaces(monkeypatch):
+    """Twice as many nodes change nothing, even at an aperture of a hundred wavelengths."""
+    scenario = Scenario(elements_per_side=(16, 1), element_interval_wavelengths=8.0,
+                        angular_spread_deg=30.0)
+    found = mp.multipath_covariance(scenario)
+    monkeypatch.setattr(mp, '_ANGLE_NODES', 320)
+    mp._lattice.cache_clear()
+    finer = mp.multipath_covariance(scenario)
+    mp._lattice.cache_clear()
+    np.testing.assert_allclose(found, finer, atol=1e-10 * finer[0, 0, 0].real)
+
+
+def test_the_multipath_from_a_side_is_coherent_with_a_wave_from_there(small):
+    aside = dataclasses.replace(
+        small.scenario, angular_spread_deg=0.05, multipath_direction_deg=(60.0, 0.0))
+    v = mp.multipath_covariance(aside)[0]
+    phases = (2 * np.pi * aside.center_frequencies_hz[0] / 299_792_458
+              * np.sin(np.deg2rad(60)) * element_positions(aside)[:, 1])
+    np.testing.assert_allclose(v[:, 0] / v[0, 0], np.exp(1j * (phases - phases[0])), atol=1e-3)
 
 
 def test_correlations_match_the_vectors(case):

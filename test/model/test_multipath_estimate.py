@@ -89,8 +89,47 @@ def test_gains_of_elements_have_the_covariance_of_other_beams(measured, random_b
         sample = signals.T @ signals.conj() / N
         assert relative(sample, expected[band]) < 0.03
         spatial = np.einsum('nrm,nrk->mk', gains, gains.conj()) / gains[..., 0].size
-        assert relative(spatial, mp.spatial_covariance(measured)[band]) < 0.03
+        assert relative(spatial, mp.spatial_covariance(measured).matrix[band]) < 0.03
         assert relative(mp.multipath_covariance(measured)[band], spatial) > 0.1
+
+
+@pytest.fixture
+def by_convolution(monkeypatch):
+    """Treat the surface as one of many elements."""
+    caches = (mp.spatial_covariance, mp.declared_covariance, mp.multipath_factors, mp._stretches)
+    for cache in caches:
+        cache.cache_clear()
+    monkeypatch.setattr(mp, '_MAX_MATRIX', 1)
+    monkeypatch.setattr(mp, '_ANGLE_NODES', 16)
+    yield
+    for cache in (*caches, mp._lattice):
+        cache.cache_clear()
+
+
+def test_many_elements_have_the_same_spatial_covariance(measured, request):
+    few = mp.spatial_covariance(measured)
+    request.getfixturevalue('by_convolution')
+    many = mp.spatial_covariance(measured)
+    assert many.matrix is None
+    np.testing.assert_allclose(many.power, few.power)
+    np.testing.assert_allclose(few.power, np.diagonal(few.matrix, axis1=1, axis2=2).real)
+    weights = np.random.default_rng(0).normal(size=(2, 4, 9, 2)) @ [1, 1j]
+    for found, expected, rows in ((many, few, weights), (many[1], few[1], weights[1]),
+                                  (many[[1, 0]], few[[1, 0]], weights)):
+        product = expected.scatter(rows)
+        np.testing.assert_allclose(product, rows @ expected.matrix)
+        np.testing.assert_allclose(
+            found.scatter(rows), product, atol=1e-12 * np.abs(product).max())
+
+
+def test_gains_of_many_elements_have_the_measured_covariance(
+        measured, beams, target, by_convolution):
+    radiation = MeasurementModel(measured, beams).radiation
+    noise = measured.noise_power_w * np.eye(6)
+    for band in range(2):
+        gains = mp.draw_multipath(measured, band, N // 4, np.random.default_rng(band))
+        signals = np.einsum('nrm,rm->nr', gains, radiation[band])
+        assert relative(signals.T @ signals.conj() / len(signals) + noise, target[band]) < 0.06
 
 
 def test_both_simulations_have_the_measured_covariance(measured, beams, target):
@@ -104,7 +143,9 @@ def test_both_simulations_have_the_measured_covariance(measured, beams, target):
 
 
 def test_a_declared_spatial_covariance_is_that_of_the_fields(declared):
-    assert mp.spatial_covariance(declared) is mp.multipath_covariance(declared)
+    assert mp.spatial_covariance(declared) is mp.declared_covariance(declared)
+    np.testing.assert_array_equal(
+        mp.spatial_covariance(declared).matrix, mp.multipath_covariance(declared))
 
 
 def test_a_file_holds_the_estimate_and_scenarios_name_it(declared, estimate, measured, tmp_path):

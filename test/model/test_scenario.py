@@ -32,7 +32,8 @@ def test_defaults_are_table_1_of_the_paper():
             ('multipath_to_los_db', 'user_gain_std_db', 'phase_std_rad', 'band_phase_std_rad',
              'timing_std_s', 'carrier_offset_std_hz', 'element_error_rms',
              'failed_element_share', 'amplitude_levels'), 0),
-        'impairments': (), 'multipath': None, 'channel': None}
+        'multipath_direction_deg': (0.0, 0.0), 'impairments': (),
+        'multipath': None, 'channel': None}
     assert dataclasses.asdict(Scenario()) == expected
 
 
@@ -72,6 +73,32 @@ def test_equal_scenarios_have_equal_hashes():
         one.n_feeds = 4
 
 
+def test_a_surface_has_one_or_two_numbers_of_elements():
+    """Along y and along z; a square in either notation is the same scenario."""
+    square, pair = Scenario(elements_per_side=6), Scenario(elements_per_side=[6, 6])
+    assert square == pair
+    assert square.id == pair.id
+    assert (square.n_columns, square.n_rows) == (6, 6)
+    wide = Scenario(elements_per_side=np.array([12, 3]))
+    assert (wide.n_columns, wide.n_rows, wide.n_elements) == (12, 3, 36)
+    assert wide.changes() == {'elements_per_side': [12, 3]}
+    assert wide == Scenario(**wide.changes())
+    assert len({wide.id, square.id, Scenario(elements_per_side=(3, 12)).id}) == 3
+
+
+def test_ids_precede_later_fields():
+    """Files hold the ids of scenarios that leave these fields at their defaults."""
+    assert Scenario().id == 'sc337b8b24c90a1923'
+    assert Scenario(multipath_direction_deg=(0, 0)).id == Scenario().id
+    assert Scenario(multipath_direction_deg=(60, 0)).id != Scenario().id
+
+
+def test_bands_may_touch_but_not_overlap():
+    Scenario(center_frequencies_hz=(28e9, 28.4e9), n_subbands=64, subband_width_hz=6.25e6)
+    with pytest.raises(ScenarioError, match='^center_frequencies_hz: .* expected at least 4e'):
+        Scenario(center_frequencies_hz=(28e9, 28.39e9), n_subbands=64, subband_width_hz=6.25e6)
+
+
 # Field, value, value and expectation in the message.
 BAD = [
     ('n_feeds', 2.5, '2.5', 'expected an integer'),
@@ -96,7 +123,15 @@ BAD = [
     ('roi_center_m', [1, 2], '2 values', 'expected a list of 3 numbers'),
     ('roi_size_m', [1, 2, 3, 4], '4 values', 'expected a list of 3 numbers'),
     ('roi_size_m', '123', "'123'", 'expected a list of 3 numbers'),
-    ('roi_size_m', [1, 0, 1], '0 m', 'expected 1e-06 to 1e+06 m'),
+    ('elements_per_side', [4, 5, 6], '[4, 5, 6]', 'expected an integer or two'),
+    ('elements_per_side', [4, 2.5], '2.5', 'expected an integer'),
+    ('elements_per_side', [4, 129], '129', 'expected 1 to 128'),
+    ('roi_size_m', [1, -1, 1], '-1 m', 'expected 0 to 1e+06 m'),
+    ('roi_size_m', [0, 0, 0], '(0.0, 0.0, 0.0)', 'expected at least one length above 0'),
+    ('multipath_direction_deg', [91, 0], '91 deg', 'expected -90 to 90 deg'),
+    ('multipath_direction_deg', [0, 0, 0], '3 values', 'expected a list of 2 numbers'),
+    ('center_frequencies_hz', [3e9, 2e9, 2.0005e9], '2e+09 and 2.0005e+09 Hz',
+     'expected at least 1e+06 Hz apart'),
     ('feed_positions_m', 1, '1', 'expected a list of [x, y, z]'),
     ('feed_positions_m', [], '[]', 'expected a list of [x, y, z]'),
     ('feed_positions_m', [[0, 0]] * 3, '2 values', 'expected a list of 3 numbers'),
@@ -140,7 +175,7 @@ def test_values_just_outside_the_bounds_are_errors(field, plugin):
         elif field.name == 'impairments':
             value = {plugin: value}
         elif isinstance(field.default, tuple):
-            value = [10, value, 1]
+            value = [10, value, 1][:len(field.default)]
         with pytest.raises(ScenarioError, match=f'^{field.name}: .*, expected .* to .*'):
             Scenario(**{field.name: value})
 

@@ -65,12 +65,12 @@ def test_the_region_includes_its_border():
 def test_offsets_inside_the_region_are_zero():
     points = to_polar(np.random.default_rng(0).uniform(*BOUNDS, (50, 3)))
     np.testing.assert_allclose(
-        offset_to_roi(points, curvatures(COUPLED, 50), BOUNDS), 0, atol=1e-12)
+        offset_to_roi(points, curvatures(COUPLED, 50), BOUNDS, 0.02), 0, atol=1e-12)
 
 
 def test_offsets_follow_the_sphere_to_the_border_of_the_region():
     points = to_polar(np.array([[10.0, 0.0, 1.5], [10.0, 4.5, 0.0], [9.0, -5.0, -1.2]]))
-    offset = offset_to_roi(points, curvatures(UNCOUPLED, 3), BOUNDS)
+    offset = offset_to_roi(points, curvatures(UNCOUPLED, 3), BOUNDS, 0.02)
     np.testing.assert_array_equal(offset[:, 0], 0)
     low, high = BOUNDS
     positions = to_positions(points + offset)
@@ -80,7 +80,7 @@ def test_offsets_follow_the_sphere_to_the_border_of_the_region():
 
 def test_ranges_that_do_not_reach_the_region_change():
     points = np.array([[5.0, 0.0, 0.0]])
-    offset = offset_to_roi(points, curvatures(UNCOUPLED, 1), BOUNDS)
+    offset = offset_to_roi(points, curvatures(UNCOUPLED, 1), BOUNDS, 0.02)
     # A range error of 2 cm is tolerated.
     np.testing.assert_allclose(offset, [[0.98, 0, 0]], atol=1e-12)
 
@@ -88,7 +88,7 @@ def test_ranges_that_do_not_reach_the_region_change():
 def test_the_range_changes_with_the_direction_so_that_the_loss_is_smallest():
     points = to_polar(np.array([[10.0, 0.0, 1.5], [10.0, 4.5, 0.0]]))
     curvature = curvatures(COUPLED, 2)
-    offset = offset_to_roi(points, curvature, BOUNDS)
+    offset = offset_to_roi(points, curvature, BOUNDS, 0.02)
     loss = likelihood_loss(offset, curvature)
     assert (offset[:, 0] != 0).all()
     for step_m in (-1e-5, 1e-5):

@@ -198,7 +198,7 @@ def test_estimates_are_inside_the_region(tracker, sample):
         assert (estimate.mean <= high + 1e-9).all()
 
 
-def test_covariances_include_the_positions_outside_as_those_of_single_phases(random_beams):
+def test_the_probability_of_a_user_outside_is_that_of_single_phases(random_beams):
     """Weak signals of a user inside may be those of one outside."""
     scenario = Scenario(n_subbands=2, n_frames=4, elements_per_side=5, roi_center_m=(3, 0, 0),
                         roi_size_m=(1, 1, 1), max_power_w=1e-6)
@@ -215,14 +215,10 @@ def test_covariances_include_the_positions_outside_as_those_of_single_phases(ran
             continue
         found, expected = (each.update(k * PERIOD_S, signals) for each in (tracker, certain))
         np.testing.assert_allclose(found.mean, expected.mean)
-        doubts.append(posterior.doubt is not None)
+        np.testing.assert_allclose(found.covariance, expected.covariance)
+        assert found.outside_probability == posterior.estimate.outside_probability
+        doubts.append(found.outside_probability > 0.05)
         assert np.isnan(found.expected_residual) == doubts[-1]
-        if doubts[-1]:
-            # Most of the half space is metres away.
-            added = np.trace(found.covariance - expected.covariance)
-            assert added > posterior.doubt.probability
-        else:
-            np.testing.assert_allclose(found.covariance, expected.covariance)
     assert 5 < sum(doubts) < len(doubts) - 5
 
 

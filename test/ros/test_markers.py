@@ -1,5 +1,7 @@
 """Markers, compared with their geometry."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
@@ -78,6 +80,13 @@ def test_the_board_shows_its_configuration(small):
     assert 0 < marker.scale.y == marker.scale.z < np.diff(places).min()
     unknown = markers.board(small.scenario, None, STAMP)
     assert len({color.r for color in unknown.colors}) == 1
+
+
+def test_a_flat_region_is_visible(small):
+    flat = dataclasses.replace(small.scenario, roi_size_m=(4.0, 3.0, 0.0))
+    scale = of(markers.region(flat, STAMP).scale)
+    assert scale[:2].tolist() == [4.0, 3.0]
+    assert 0 < scale[2] < 0.01
 
 
 def test_the_region_has_the_bounds_of_the_scenario(small):

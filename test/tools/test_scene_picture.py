@@ -168,3 +168,15 @@ def test_an_empty_scene_is_drawn(small, tmp_path):
     draw(SceneState(), small.scenario, tmp_path / 'scene.png')
     assert (tmp_path / 'scene.png').read_bytes().startswith(b'\x89PNG')
     assert [path.name for path in tmp_path.iterdir()] == ['scene.png']
+
+
+def test_a_rectangular_surface_has_its_shape_and_orientation():
+    """Twelve columns along y and three rows along z, over a flat region."""
+    scenario = Scenario(elements_per_side=(12, 3), roi_size_m=(10.0, 10.0, 0.0))
+    scene = make_scene(scenario, 1)
+    (axes,) = [axes for axes in compose(scene, scenario).axes if axes.images]
+    (image,) = axes.images
+    expected = scene.configuration.analog.mean(axis=0).reshape(3, 12)
+    np.testing.assert_array_equal(image.get_array(), expected)
+    left, right, bottom, top = image.get_extent()
+    assert (right - left) / (top - bottom) == pytest.approx(4)

@@ -24,7 +24,7 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     measurement_correlation,
-    multipath_covariance,
+    spatial_covariance,
 )
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
@@ -167,8 +167,8 @@ class DeclaredElements(SurfaceModel):
         # [N_B, N_SB F, T, N_E]
         radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
         n_bands, n_rows, n_terms, n_elements = radiation.shape
-        power = np.diagonal(multipath_covariance(scenario), axis1=1, axis2=2).real
-        flat = (radiation * np.sqrt(power)[:, None, None]).reshape(n_bands, n_rows, -1)
+        amplitude = np.sqrt(spatial_covariance(scenario).power)
+        flat = (radiation * amplitude[:, None, None]).reshape(n_bands, n_rows, -1)
         scattered = np.matmul(flat, np.conj(np.swapaxes(flat, 1, 2)))
 
         def direct(band: int, positions: np.ndarray) -> np.ndarray:
@@ -247,7 +247,7 @@ def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
         gains = los_gain(scenario, positions[block], band)
         direct += np.einsum('n,njm,nlm->jlm', shares[block], gains, np.conj(gains))
     correlation = np.repeat(np.repeat(direct, scenario.n_frames, 0), scenario.n_frames, 1)
-    power = np.diagonal(multipath_covariance(scenario)[band])
+    power = spatial_covariance(scenario).power[band]
     correlation += measurement_correlation(scenario)[band][..., None] * power
     correlation.flags.writeable = False
     return correlation

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rhs_isac_ros.bounds import AverageCrlb
-from rhs_isac_ros.codebook import optimize, random_codebook
+from rhs_isac_ros.codebook import Progress, optimize, random_codebook
 from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
 from rhs_isac_ros.codebook.sampling import monte_carlo
 from rhs_isac_ros.model import Scenario, streams
@@ -103,8 +103,13 @@ def optimize_surface(sizes: dict[str, int]) -> dict:
     scenario = scenario_of(sizes)
     times_s: list[float] = []
     begin = time.process_time()
-    optimize(scenario, max_steps=sizes['steps'],
-             progress=lambda entry: times_s.append(time.process_time() - begin))
+
+    def record(entry: Progress) -> None:
+        # The value is infinite during the set-up.
+        if np.isfinite(entry.value_m2):
+            times_s.append(time.process_time() - begin)
+
+    optimize(scenario, max_steps=sizes['steps'], progress=record)
     return {'setup_s': times_s[0], 'step_s': float(np.median(np.diff(times_s))),
             'peak_mib': peak_mib()}
 

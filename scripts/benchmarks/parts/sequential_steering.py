@@ -37,7 +37,7 @@ def steer_sequentially(scenario: Scenario, position: np.ndarray, band: int) -> B
 @functools.lru_cache(maxsize=16)
 def modes_of(scenario: Scenario, band: int) -> np.ndarray:
     """Return the strongest modes G of the multipath, float64 [N_E, r]."""
-    spatial = BandLink.to(scenario, np.array(scenario.roi_center_m), band).spatial
+    spatial = BandLink.to(scenario, np.array(scenario.roi_center_m), band).spatial.matrix
     powers, directions = np.linalg.eigh(spatial)
     powers, directions = np.maximum(powers[::-1], 0), directions[:, ::-1]
     rank = 1 + np.searchsorted(np.cumsum(powers), (1 - MAX_OMITTED) * powers.sum())
@@ -70,14 +70,14 @@ def candidates(link: BandLink, modes: np.ndarray) -> list[np.ndarray]:
 
 def ascend(link: BandLink, analog: np.ndarray) -> np.ndarray:
     """Increase the capacity by corners and single elements until neither increases it."""
-    spread = np.abs(link.los)**2 + np.diag(link.spatial)
+    spread = np.abs(link.los)**2 + link.spatial.power
     for _ in range(MAX_ROUNDS):
         digital = link.best_digital(analog) / np.sqrt(link.noise_power_w)
         weights = np.einsum('jk,jkm->jm', digital, link.onboard)
 
         def received(other: np.ndarray, weights: np.ndarray = weights) -> tuple:
             radiation = weights * other
-            direct, diffuse = np.sum(radiation * link.los, axis=1), link.scatter(radiation)
+            direct, diffuse = np.sum(radiation * link.los, axis=1), link.spatial.scatter(radiation)
             power = np.abs(direct)**2 + np.sum(np.conj(radiation) * diffuse, axis=1).real
             return power, direct, diffuse
 
