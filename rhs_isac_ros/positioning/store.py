@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import os
+import tokenize
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -93,7 +94,7 @@ def _read(path: Path, key: str) -> Mapping[str, np.ndarray] | None:
             return None
         # The time of the last use decides which tables are deleted.
         os.utime(path)
-    except (OSError, ValueError, EOFError, SyntaxError, TypeError):
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, tokenize.TokenError):
         return None
     return {name: record[name][0] for name in names[2:]}
 
