@@ -11,7 +11,8 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 
 CONFIG = Path(__file__).parents[1] / 'config'
-SCENARIOS = ('table1', 'quick', 'wideband', 'bandplan')
+SCENARIOS = ('table1', 'quick', 'wideband', 'bandplan', 'hall')
+FILES = ('multipath', 'channel')
 CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
 FIELDS = {field.name: field.metadata['unit'] for field in dataclasses.fields(Scenario)}
 
@@ -38,7 +39,10 @@ def test_every_line_states_its_unit(name):
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_yaml_reads_all_values_as_numbers(name):
     content = yaml.safe_load((CONFIG / f'{name}.yaml').read_text(encoding='utf-8'))
-    for value in content.values():
+    for field, value in content.items():
+        if field in FILES:
+            assert value is None or (CONFIG / value).is_file()
+            continue
         entries = value.values() if isinstance(value, dict) else value
         for number in entries if isinstance(value, dict | list) else [value]:
             assert isinstance(number, int | float | None)
@@ -51,6 +55,15 @@ def test_quick_is_smaller_and_wideband_has_four_bands():
                if symbol != 'N_B')
     assert wideband.n_bands == 4
     assert wideband.changes().keys() == {'center_frequencies_hz'}
+
+
+def test_the_hall_is_table1_on_traced_paths():
+    hall = Scenario.from_yaml(CONFIG / 'hall.yaml')
+    assert hall.changes().keys() == set(FILES)
+    assert hall.multipath.about['positions'] == 100
+    assert not hall.multipath.about['warnings']
+    low, high = hall.roi_bounds_m
+    assert ((low <= hall.channel.users) & (hall.channel.users <= high)).all()
 
 
 def test_the_band_plan_has_the_spectrum_and_the_pilots_of_table1():

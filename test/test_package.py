@@ -22,7 +22,8 @@ KEYS = {
 # Libraries without a key, by the name of the import: their requirement in an extra of setup.py.
 PIP_ONLY = {
     'distributed': 'distributed', 'jax': None, 'mcap': 'mcap', 'mcap_ros2': 'mcap-ros2-support',
-    'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1', 'rosbags': 'rosbags', 'stonesoup': None,
+    'pymoo': 'pymoo', 'rerun': 'rerun-sdk==0.22.1', 'rosbags': 'rosbags', 'sionna': None,
+    'stonesoup': None,
 }
 # Modules of the repository.
 OWN = {

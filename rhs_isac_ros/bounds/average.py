@@ -29,7 +29,11 @@ from rhs_isac_ros.model.impairments.elements import (
     error_terms,
 )
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
-from rhs_isac_ros.model.multipath import measurement_correlation, spatial_covariance
+from rhs_isac_ros.model.multipath import (
+    coupling,
+    declared_covariance,
+    measurement_correlation,
+)
 from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.model.threads import one_blas_thread
@@ -291,9 +295,15 @@ def quadratic_gradients(
     surface is taken as exact.
     """
     scenario = model.scenario
+    correlation = np.conj(measurement_correlation(scenario))
+    declared = declared_covariance(scenario)
     through_covariance = np.matmul(
-        np.conj(measurement_correlation(scenario)) * covariance_terms,
-        spatial_covariance(scenario).scatter(model.radiation))
+        correlation * covariance_terms, declared.scatter(model.radiation))
+    if measured := scenario.multipath:
+        to_survey = coupling(scenario, model.radiation, measured.radiation)
+        through_covariance += np.matmul(
+            correlation * (covariance_terms @ to_survey @ measured.excess),
+            declared.scatter(measured.radiation))
     by_radiation = 4 * (through_covariance - mean_terms) / n_items
     terms: list[tuple[np.ndarray | float, np.ndarray | float, np.ndarray]]
     if surface:

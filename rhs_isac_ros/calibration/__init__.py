@@ -1,4 +1,4 @@
-"""Calibration of a surface from signals of a user at known positions."""
+"""Calibration of a surface, and of a hall, from signals of users at known positions."""
 
 from rhs_isac_ros.calibration.calibration import (
     Calibration,
@@ -9,8 +9,9 @@ from rhs_isac_ros.calibration.calibration import (
 )
 from rhs_isac_ros.calibration.estimate import Pilots, estimate_surface, prior_of
 from rhs_isac_ros.calibration.mixture import SurfacePrior
+from rhs_isac_ros.calibration.survey import SurveyWarning, survey, survey_report
 
 __all__ = [
-    'Calibration', 'CalibrationError', 'Pilots', 'SurfacePrior', 'calibrate', 'estimate_surface',
-    'load_surface', 'prior_of', 'report',
+    'Calibration', 'CalibrationError', 'Pilots', 'SurfacePrior', 'SurveyWarning', 'calibrate',
+    'estimate_surface', 'load_surface', 'prior_of', 'report', 'survey', 'survey_report',
 ]

@@ -36,7 +36,7 @@ class Calibration:
     surface
         The estimate, which estimators, bounds and beams take.
     scenario_id
-        `Scenario.id` of the scenario for which it holds.
+        `Scenario.id` of the scenario for which it holds, without the files of a hall.
     about
         How it was made: ``pilots``, their number; ``codebooks``, their ids; ``prior``, that of
         the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
@@ -79,10 +79,11 @@ class Calibration:
 
     def check(self, scenario: Scenario) -> None:
         """Raise CalibrationError unless the calibration belongs to a scenario."""
-        if self.scenario_id != scenario.id:
+        expected_id = _without_hall(scenario).id
+        if self.scenario_id != expected_id:
             raise CalibrationError(
                 f'scenario_id: {self.scenario_id}, a calibration for the scenario '
-                f'{self.about.get("scenario")}, expected {scenario.id}')
+                f'{self.about.get("scenario")}, expected {expected_id}')
         sizes = len(self.surface.band_gains), len(self.surface.gains)
         expected = scenario.n_bands, scenario.n_elements
         if sizes != expected:
@@ -132,11 +133,16 @@ def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
     changes: list[float] = []
     surface = estimate_surface(scenario, pilots, prior, lambda _, change: changes.append(change))
     codebooks = sorted({str(getattr(group.beams, 'id', '')) for group in pilots} - {''})
-    return Calibration(surface, scenario.id, {
+    return Calibration(surface, _without_hall(scenario).id, {
         'pilots': sum(len(group.positions) for group in pilots), 'codebooks': codebooks,
         'prior': dataclasses.asdict(prior), 'scenario': scenario.changes(),
         'rounds': len(changes), 'converged': not changes or changes[-1] < TOLERANCE,
         'version': __version__})
+
+
+def _without_hall(scenario: Scenario) -> Scenario:
+    """Return a scenario without channels and multipath, which do not change a surface."""
+    return dataclasses.replace(scenario, multipath=None, channel=None)
 
 
 def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:

@@ -128,6 +128,20 @@ def estimate_surface(
     return _result(posterior, gains)
 
 
+def set_phases(values: np.ndarray, outputs: np.ndarray, phases: np.ndarray) -> None:
+    """Set the values that turn whole bands to the most likely ones, one after the other.
+
+    Takes nuisance parameters [N, Q], outputs of the bands' matched filters, complex128 [N, N_B],
+    and `Nuisance.phases` [N_B, Q].
+    """
+    for q in np.flatnonzero(phases.any(axis=0)):
+        turns = phases[:, q]
+        output = outputs[:, turns != 0].sum(axis=1)
+        turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
+        values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
+        outputs = outputs * np.exp(-1j * values[:, q, None] * turns)
+
+
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
     """RMS of real and imaginary parts of the bands' relative errors in a round [2, N_B].
 
@@ -238,12 +252,7 @@ class PilotStatistics:
     def _align(self, part: '_Block', signals: np.ndarray, values: np.ndarray) -> None:
         """Set the phases to those of the expected signals."""
         outputs = np.sum(np.conj(part.mean) * part.whiten(signals), axis=2)
-        for q in np.flatnonzero(self._phases.any(axis=0)):
-            turns = self._phases[:, q]
-            output = outputs[:, turns != 0].sum(axis=1)
-            turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
-            values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
-            outputs *= np.exp(-1j * values[:, q, None] * turns)
+        set_phases(values, outputs, self._phases)
 
     def _step(self, part: '_Block', signals: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:

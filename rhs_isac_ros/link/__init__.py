@@ -1,7 +1,7 @@
 """The transmission phase: capacity, beam steering and the choice of the band."""
 
 from rhs_isac_ros.link.beam_pattern import BeamPattern, beam_pattern
-from rhs_isac_ros.link.capacity import Beam, capacity, expected_capacity
+from rhs_isac_ros.link.capacity import Beam, actual_capacity, capacity, expected_capacity
 from rhs_isac_ros.link.quartiles import RunningQuartiles
 from rhs_isac_ros.link.steering import (
     CapacityReport,
@@ -14,6 +14,7 @@ from rhs_isac_ros.link.steering import (
 )
 
 __all__ = [
-    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'RunningQuartiles', 'applied_beam',
+    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'RunningQuartiles',
+    'actual_capacity', 'applied_beam',
     'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacity',
     'prepare_steering', 'steer']

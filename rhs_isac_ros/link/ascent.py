@@ -38,7 +38,7 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         [nat/symbol] summed over the sub-bands, float64 [N_B, n].
     """
     # Power received from each element for unit radiation, float64 [N_B, 1, N_SB, N_E].
-    spread = np.abs(link.los)**2 + link.spatial.power[:, None, None]
+    spread = np.abs(link.los)**2 + link.spatial.power[:, None]
     spread = spread[:, None]
     point = _Point.at(link, spread, analog)
     # Whether the corner remains to be tried.

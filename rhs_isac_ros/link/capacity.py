@@ -9,7 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.link.band_link import band_index
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.los import los_sums
+from rhs_isac_ros.model.los import direct_gain, los_sums
 from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
@@ -64,6 +64,21 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
     scattered = np.sum((through * np.conj(radiation)).real, axis=-1)[:, None]
     snr = (direct + scattered) / scenario.noise_power_w
     rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
+    return rates
+
+
+@one_blas_thread
+def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
+    """Compute the capacity on the paths of a channel file; without one, that of `capacity`.
+
+    Takes positions, float64 [N, 3] [m], and returns float64 [N] [bit/s]; errors are the same.
+    """
+    if not scenario.channel:
+        return capacity(scenario, beam, positions)
+    gains = direct_gain(scenario, positions, beam.band)
+    signals = np.einsum('njm,jm->nj', gains, _radiation(scenario, beam))
+    snr = np.abs(signals)**2 / scenario.noise_power_w
+    rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=1)
     return rates
 
 

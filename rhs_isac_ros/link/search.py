@@ -151,8 +151,7 @@ def _modes(scenario: Scenario) -> np.ndarray:
     powers, directions = (
         _strongest(spatial) if spatial.matrix is None else np.linalg.eigh(spatial.matrix))
     powers, directions = np.maximum(powers[:, ::-1], 0), directions[:, :, ::-1]
-    omitted = 1 - np.cumsum(powers, axis=1) / (
-        scenario.n_elements * spatial.power[:, None])
+    omitted = 1 - np.cumsum(powers, axis=1) / np.sum(spatial.power, axis=1, keepdims=True)
     n_modes = 1 + np.sum(omitted > _MAX_OMITTED, axis=1)
     powers[np.arange(powers.shape[1]) >= n_modes[:, None]] = 0
     modes: np.ndarray = directions * np.sqrt(powers)[:, None]

@@ -1,8 +1,12 @@
 """Atomic writing of files, and files of arrays with a description."""
 
+import abc
 import contextlib
+import functools
+import hashlib
 import json
 import os
+import re
 import secrets
 import tempfile
 import zipfile
@@ -15,6 +19,8 @@ import yaml
 
 # Maximum size of a YAML file [bytes], and depth of its lists and mappings.
 _MAX_YAML_BYTES, _MAX_YAML_DEPTH = 2**28, 16
+# Maximum size of the arrays of a file [bytes].
+_MAX_BYTES = 2**28
 # The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
@@ -109,6 +115,36 @@ def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
     write_whole(path, lambda stream: np.savez(stream, **content))
 
 
+def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays of a file of NumPy's format ``.npz``.
+
+    With names, the result is empty if the arrays apart from ``about`` have others, or if they are
+    compressed: they may then be far larger than the file.
+
+    Raises
+    ------
+    ArchiveError
+        If the file cannot be read, is damaged, or contains more than 256 MiB.
+    """
+    try:
+        with open(path, 'rb') as stream:
+            file = np.load(stream, allow_pickle=False)
+            found = getattr(file, 'files', ())
+            members = file.zip.infolist() if found else []
+            if names is not None and (set(found) - {'about'} != names or any(
+                    member.compress_type for member in members)):
+                return {}
+            if sum(member.file_size for member in members) > _MAX_BYTES:
+                raise ValueError('more than 256 MiB of arrays')
+            return {key: file[key] for key in found}
+    # Reading verifies the checksum that the format holds for every array. The shape of an array
+    # may be anything.
+    except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError, MemoryError,
+            OverflowError, RecursionError, zipfile.BadZipFile) as error:
+        reason = ' '.join(str(error).split())
+        raise ArchiveError(f'{path}: cannot be read: {reason}') from error
+
+
 def read_archive(path: str | Path, kind: str, version: int, names: set[str]
                  ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read arrays and their description.
@@ -127,22 +163,82 @@ def read_archive(path: str | Path, kind: str, version: int, names: set[str]
     ArchiveError
         If the file cannot be read, is damaged, or has another format or other arrays.
     """
+    arrays = read_arrays(path, names)
     try:
-        with open(path, 'rb') as stream:
-            file = np.load(stream, allow_pickle=False)
-            found = getattr(file, 'files', ())
-            # Compressed arrays may be far larger than the file. NumPy compresses on request only.
-            is_expected = set(found) - {'about'} == names and not any(
-                member.compress_type for member in file.zip.infolist())
-            arrays = {key: file[key] for key in found} if is_expected else {}
         about = json.loads(str(arrays.pop('about', '{}')))
-    # Reading verifies the checksum that the format holds for every array. The shape of an array
-    # may be anything.
-    except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError, MemoryError,
-            OverflowError, RecursionError, zipfile.BadZipFile) as error:
-        reason = ' '.join(str(error).split())
-        raise ArchiveError(f'{path}: cannot be read: {reason}') from error
+    except (ValueError, RecursionError) as error:
+        raise ArchiveError(f'{path}: cannot be read: {error}') from error
     if not isinstance(about, dict) or about.pop('format', 0) != version or set(arrays) != names:
         raise ArchiveError(
             f'{path}: not a {kind}, expected a {kind} file of format {version}')
     return arrays, about
+
+
+class ArrayFile(abc.ABC):
+    """Arrays of a file that take the place of a scenario field; equal if their contents are.
+
+    Attributes
+    ----------
+    path
+        File from which they were read; empty for others.
+    """
+
+    path: str
+
+    @abc.abstractmethod
+    def content(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays that the digest covers."""
+
+    @abc.abstractmethod
+    def misfit(self, scenario: Any) -> str:
+        """Return why the arrays do not fit a scenario, from the field on; empty if they do."""
+
+    @classmethod
+    @abc.abstractmethod
+    def load(cls, path: str | Path) -> 'ArrayFile':
+        """Read the arrays; raise ArchiveError if the file is invalid."""
+
+    @classmethod
+    def named(cls, text: str) -> 'ArrayFile':
+        """Read a file, given by its path, optionally with ``@`` and the digest that it must have.
+
+        Raises
+        ------
+        ArchiveError
+            If the file is invalid or the digest differs.
+        """
+        path, digest = re.fullmatch(  # type: ignore[union-attr]
+            r'(.*?)(?:@([0-9a-f]{16}))?', text, re.DOTALL).groups()
+        if not path:
+            raise ArchiveError(f'{text!r}: arrays without a file, expected the path of a file')
+        result = cls.load(path)
+        if digest and result.digest != digest:
+            raise ArchiveError(f'{path}: digest {result.digest}, expected {digest}: the file has '
+                               'changed')
+        return result
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """16 hexadecimal digits that identify the content."""
+        digest = hashlib.sha256()
+        for array in self.content():
+            little = np.ascontiguousarray(array, array.dtype.newbyteorder('<'))
+            digest.update(f'{array.dtype.kind}{array.shape}'.encode())
+            digest.update(little.tobytes())
+        return digest.hexdigest()[:16]
+
+    def __str__(self) -> str:
+        """Return path and digest in the form that `named` reads."""
+        return f'{self.path}@{self.digest}'
+
+    def __repr__(self) -> str:
+        """Return a description that is the same in all processes."""
+        return f'{type(self).__name__}({self.digest!r})'
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the contents are the same."""
+        return isinstance(other, type(self)) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        """Hash the content."""
+        return hash(self.digest)

@@ -24,6 +24,26 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
     return _gain(scenario, distances, band, _amplitude(scenario, offsets))
 
 
+def direct_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
+    """Compute the gains without random multipath in the shape of `los_gain`.
+
+    They are those of `los_gain`, or with a channel file the sums over the paths of the users
+    nearest to the positions.
+    """
+    channel = scenario.channel
+    if not channel:
+        return los_gain(scenario, positions, band)
+    total = np.zeros((len(positions), scenario.n_subbands, scenario.n_elements), complex)
+    for row, user in enumerate(channel.nearest(checked_positions(positions)).tolist()):
+        (present,) = np.nonzero(channel.coefficients[user])
+        weights = channel.coefficients[user, present, None]
+        if channel.gains is not None:
+            weights = weights * channel.gains[user, present]
+        paths = los_gain(scenario, channel.sources[user, present], band)
+        total[row] = np.sum(paths * weights[:, None], axis=0)
+    return total
+
+
 def los_gain_at(scenario: Scenario, position: np.ndarray, bands: Sequence[int]) -> np.ndarray:
     """Compute `los_gain` at one position, float64 [3] [m], in some bands.
 

@@ -17,14 +17,14 @@ from rhs_isac_ros.model.impairments.elements import DeclaredElements, ElementErr
 from rhs_isac_ros.model.impairments.factors import draw_impairments
 from rhs_isac_ros.model.los import (
     checked_positions,
+    direct_gain,
     los_derivative,
     los_derivative_terms,
     los_gain,
 )
 from rhs_isac_ros.model.multipath import (
     complex_normal,
-    measurement_correlation,
-    spatial_covariance,
+    scattered_covariance,
     square_root,
 )
 from rhs_isac_ros.model.receive import received_signal
@@ -55,14 +55,6 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
     """
     noise = scenario.noise_power_w * np.eye(radiation.shape[1])
     return scattered_covariance(scenario, radiation) + noise
-
-
-def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
-    """Compute the covariance of the multipath in the received signals, as `signal_covariance`."""
-    scattered = np.matmul(spatial_covariance(scenario).scatter(radiation),
-                          np.conj(np.swapaxes(radiation, 1, 2)))
-    correlated: np.ndarray = measurement_correlation(scenario) * scattered
-    return correlated
 
 
 def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
@@ -262,7 +254,7 @@ class MeasurementModel:
         Multipath and noise are drawn together, with the covariance Lambda_i. `simulate_received`
         draws the gain of every element instead; the distribution is the same, but the call takes
         a hundred times as long. Impairments that the scenario declares are drawn as described
-        there.
+        there, and so are the signals of a channel file.
         """
         surface, factors = draw_impairments(self.scenario, len(positions), rng)
         if surface is not None and self.surface is None:
@@ -272,6 +264,8 @@ class MeasurementModel:
 
     def _sample(self, positions: np.ndarray, rng: np.random.Generator,
                 factors: np.ndarray | None) -> np.ndarray:
+        if self.scenario.channel:
+            return self._traced(positions, rng, factors)
         signals = self.mean(positions)
         white = complex_normal(signals.shape, rng)
         if factors is None:
@@ -284,6 +278,14 @@ class MeasurementModel:
             root = square_root(scattered)
             signals[:, band] += white[:, band, :root.shape[1]] @ root.T
         received: np.ndarray = signals * factors + noise
+        return received
+
+    def _traced(self, positions: np.ndarray, rng: np.random.Generator,
+                factors: np.ndarray | None) -> np.ndarray:
+        signals = self._of_bands(positions, (), lambda block, band: received_signal(
+            direct_gain(self.scenario, block, band), 0.0, self.radiation[band], 0.0))
+        noise = np.sqrt(self.scenario.noise_power_w) * complex_normal(signals.shape, rng)
+        received: np.ndarray = signals * (1.0 if factors is None else factors) + noise
         return received
 
     @functools.cached_property

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from rhs_isac_ros.model import plugins
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.scenario import Scenario
 
 KINDS = ('static', 'waypoints', 'random_walk')
@@ -163,6 +164,21 @@ class RandomWalk(StraightMobility):
         length = float(np.linalg.norm(leg))
         self._velocity = leg / length * self._speed_mps
         self._duration_s = length / self._speed_mps if self._speed_mps else math.inf
+
+
+class Traced:
+    """User on traced positions: the one nearest to the position of another mobility.
+
+    Positions are those of a channel file; the velocity is that of the other mobility.
+    """
+
+    def __init__(self, mobility: Mobility, channel: PathChannel) -> None:
+        self._mobility, self._channel = mobility, channel
+
+    def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position [3] [m] and velocity [3] [m/s]."""
+        position, velocity = self._mobility.state(now_s)
+        return self._channel.users[self._channel.nearest(position[None])[0]].copy(), velocity
 
 
 def make_plugin(

@@ -1,6 +1,8 @@
 """Multipath: spatial covariance, correlation over sub-bands and frames, random gains.
 
-Indices of bands, sub-bands and frames start at 0. Bands are independent.
+Indices of bands, sub-bands and frames start at 0. Bands are independent. Fields of a scenario
+declare the covariance of the gains; a measured one adds a term of the rank of its measurements to
+it, see `multipath_estimate`.
 """
 
 import functools
@@ -12,6 +14,7 @@ import numpy as np
 
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
+from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
 # Gauss-Legendre nodes on an interval of angles in which the profile is smooth, and the largest
@@ -27,14 +30,14 @@ _ROI_NODES = 24
 
 
 def multipath_covariance(scenario: Scenario) -> np.ndarray:
-    """Implements Eq. (2). Covariance of the multipath gains of the elements.
+    """Implements Eq. (2). Covariance of the multipath gains of the elements that fields declare.
 
     The power-angle profile is a product of two Laplacians of `angular_spread_deg` about
     `multipath_direction_deg`, normalised over the half space in front of the surface and scaled by
     the mean line-of-sight power in the region of interest times ``multipath_to_los_db``. The paper
     leaves the scale open; that both powers are equal by default is the reading of this package. A
     gain pattern of the elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E].
-    `spatial_covariance` needs less memory for many elements.
+    `declared_covariance` needs less memory for many elements.
     """
     return _matrix(_lattice(scenario), scenario)
 
@@ -42,23 +45,25 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
 class SpatialCovariance:
     """V_i of Eq. (2) for products with it, in one band or in several with a leading axis.
 
-    The covariance of two elements depends only on their lattice offset, so that a product is a
-    convolution. For few elements, a matrix is as fast.
+    The declared covariance of two elements depends only on their lattice offset, so that a product
+    is a convolution. For few elements, a matrix is as fast. A measured covariance adds a term of
+    low rank.
 
     Attributes
     ----------
     power
-        Power of the gain of an element, float64 [] or [N_B].
+        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
     is_real
-        Whether V_i is real, as for an even profile.
+        Whether V_i is real, as for an even profile that is not measured.
     matrix
         V_i [..., N_E, N_E]; None for many elements.
     """
 
     def __init__(self, shape: tuple[int, int], is_real: bool, power: np.ndarray,
-                 matrix: np.ndarray | None, spectrum: np.ndarray) -> None:
+                 matrix: np.ndarray | None, spectrum: np.ndarray | None,
+                 excess: tuple[np.ndarray, np.ndarray] | None = None) -> None:
         self._shape, self.is_real, self.power = shape, is_real, power
-        self.matrix, self._spectrum = matrix, spectrum
+        self.matrix, self._spectrum, self._excess = matrix, spectrum, excess
 
     @property
     def n_elements(self) -> int:
@@ -69,11 +74,24 @@ class SpatialCovariance:
         """Return V_i of some bands."""
         return SpatialCovariance(
             self._shape, self.is_real, self.power[bands],
-            None if self.matrix is None else self.matrix[bands], self._spectrum[bands])
+            None if self.matrix is None else self.matrix[bands],
+            None if self._spectrum is None else self._spectrum[bands],
+            self._excess and (self._excess[0][bands], self._excess[1][bands]))
+
+    def plus(self, weights: np.ndarray, factor: np.ndarray) -> 'SpatialCovariance':
+        """Return the sum with F^H W F, of W [N_B, R, R] and F [N_B, R, N_E]; W is Hermitian."""
+        through = np.matmul(weights, factor)
+        power = self.power + np.sum(np.conj(factor) * through, axis=-2).real
+        if self.matrix is None:
+            return SpatialCovariance(
+                self._shape, False, power, None, self._spectrum, (through, factor))
+        matrix = self.matrix + np.matmul(np.conj(np.swapaxes(factor, -2, -1)), through)
+        matrix.flags.writeable = False
+        return SpatialCovariance(self._shape, False, power, matrix, None)
 
     def scatter(self, weights: np.ndarray) -> np.ndarray:
         """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
-        rows = weights.reshape(*self.power.shape, -1, weights.shape[-1])
+        rows = weights.reshape(*self.power.shape[:-1], -1, weights.shape[-1])
         result = np.empty(rows.shape, complex)
         if self.matrix is None:
             self._convolve(rows, result)
@@ -88,6 +106,7 @@ class SpatialCovariance:
     def _convolve(self, rows: np.ndarray, result: np.ndarray) -> None:
         from scipy import fft
 
+        assert self._spectrum is not None
         lattice = rows.reshape(*rows.shape[:-1], *self._shape)
         (n_rows, n_columns), sizes = self._shape, self._spectrum.shape[-2:]
         block = max(_BLOCK_NUMBERS // math.prod(sizes), 1)
@@ -97,17 +116,32 @@ class SpatialCovariance:
             waves *= self._spectrum[..., None, :, :]
             found = fft.ifft2(waves, overwrite_x=True)[..., :n_rows, :n_columns]
             result[..., part, :] = found.reshape(result[..., part, :].shape)
+        if self._excess:
+            through, factor = self._excess
+            result += np.matmul(rows @ np.conj(np.swapaxes(factor, -2, -1)), through)
 
 
 @functools.lru_cache(maxsize=16)
 def spatial_covariance(scenario: Scenario) -> SpatialCovariance:
-    """Return V_i of all bands, for products with it."""
+    """Return V_i of all bands; a measured covariance is averaged over the measurements."""
+    declared = declared_covariance(scenario)
+    if not (measured := scenario.multipath):
+        return declared
+    correlation = measurement_correlation(scenario)
+    weights = measured.excess * np.matmul(
+        np.swapaxes(correlation, 1, 2), np.conj(correlation)) / correlation.shape[1]
+    return declared.plus(weights, declared.scatter(measured.radiation))
+
+
+@functools.lru_cache(maxsize=16)
+def declared_covariance(scenario: Scenario) -> SpatialCovariance:
+    """Return V_i of all bands as fields declare it, the same in all measurements."""
     lattice, shape = _lattice(scenario), (scenario.n_rows, scenario.n_columns)
     is_real = not lattice.imag.any()
-    power = lattice[:, shape[0] - 1, shape[1] - 1].real
+    power = np.repeat(lattice[:, shape[0] - 1, shape[1] - 1, None].real, scenario.n_elements, 1)
     if scenario.n_elements <= _MAX_MATRIX:
         matrix = _matrix(lattice.real if is_real else lattice, scenario)
-        return SpatialCovariance(shape, is_real, power, matrix, power)
+        return SpatialCovariance(shape, is_real, power, matrix, None)
     from scipy import fft
 
     # A circle long enough that nothing wraps around; the offset 0 comes first.
@@ -147,7 +181,7 @@ def _lattice(scenario: Scenario) -> np.ndarray:
                 np.einsum('e,ey,ez->zy', waves.elevation_weights, along_y, one)
                 for one in along_z])
         half = np.concatenate([total[-1][:0:-1], total[0]])
-        half = half * mean_los_power(scenario, band) * 10 ** (scenario.multipath_to_los_db / 10)
+        half = half * _mean_power(scenario, band)
         lattice[band] = np.concatenate([np.conj(half[::-1, :0:-1]), half], axis=1)
     return lattice
 
@@ -187,7 +221,8 @@ def _plane_waves(
     # The elevation affects the phases along both axes.
     lengths = columns[-1], math.hypot(columns[-1], rows[-1])
     (azimuth, azimuth_weights), (elevations, elevation_weights) = (
-        _profile_quadrature(scenario, mean, even, wavenumber * length)
+        _profile_quadrature(
+            _fields(scenario).angular_spread_deg, mean, even, wavenumber * length)
         for mean, even, length in zip(
             scenario.multipath_direction_deg, is_even, lengths, strict=True))
     phasors = [np.cos if even else lambda phase: np.exp(1j * phase) for even in is_even]
@@ -207,6 +242,11 @@ def _plane_waves(
             elevation_weights[start:start + step], azimuth_weights, gain,
             phasors[1](wavenumber * np.sin(elevation)[:, None] * rows),
             phasors[0](wavenumber * across[..., None] * columns))
+
+
+def _mean_power(scenario: Scenario, band: int) -> float:
+    level_db = _fields(scenario).multipath_to_los_db
+    return mean_los_power(scenario, band) * float(10 ** (level_db / 10))
 
 
 def mean_los_power(scenario: Scenario, band: int) -> float:
@@ -233,7 +273,7 @@ def frequency_correlation(
     """Implements Eq. (3). Correlation rho_f of two sub-bands, complex128; indices broadcast."""
     frequencies = subband_frequencies_hz(scenario)[band]
     difference = frequencies[first] - frequencies[second]
-    correlation: np.ndarray = 1 / (1 + 2j * np.pi * scenario.delay_spread_s * difference)
+    correlation: np.ndarray = 1 / (1 + 2j * np.pi * _fields(scenario).delay_spread_s * difference)
     return correlation
 
 
@@ -277,14 +317,35 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
     return correlation
 
 
+def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Compute the declared covariance between signals received with two radiation matrices [W].
+
+    Returns complex128 [N_B, N_SB F, N_SB F] for matrices T_i, complex128 [N_B, N_SB F, N_E].
+    """
+    scattered = np.matmul(declared_covariance(scenario).scatter(radiation),
+                          np.conj(np.swapaxes(other, 1, 2)))
+    covariance: np.ndarray = measurement_correlation(scenario) * scattered
+    return covariance
+
+
+def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
+    """Compute the covariance of the multipath in the received signals, as `signal_covariance`."""
+    covariance = coupling(scenario, radiation, radiation)
+    if measured := scenario.multipath:
+        to_survey = coupling(scenario, radiation, measured.radiation)
+        covariance += np.matmul(
+            to_survey @ measured.excess, np.conj(np.swapaxes(to_survey, 1, 2)))
+    return covariance
+
+
 @functools.lru_cache(maxsize=16)
 def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray | None, np.ndarray], ...]:
     """Compute the factors with which `draw_multipath` correlates the gains.
 
-    For each band, these are G [N_E, r] with G G^H = V_i, or None for many elements, and
-    L [N_SB F, s] with L L^H = K_ft; r and s are the numerical ranks.
+    For each band, these are G [N_E, r] with G G^H = V_i as declared, or None for many elements,
+    and L [N_SB F, s] with L L^H = K_ft; r and s are the numerical ranks.
     """
-    has_matrix = spatial_covariance(scenario).matrix is not None
+    has_matrix = declared_covariance(scenario).matrix is not None
     matrices = multipath_covariance(scenario) if has_matrix else [None] * scenario.n_bands
     return tuple(
         (None if spatial is None else square_root(spatial), square_root(correlation))
@@ -297,23 +358,54 @@ def draw_multipath(
     """Draw multipath gains h^MP of n independent phases, complex128 [n, N_SB F, N_E]."""
     spatial, over_rows = multipath_factors(scenario)[band]
     n_draws = over_rows.shape[1]
-    gains: np.ndarray
-    if spatial is not None:
-        white = complex_normal((n, n_draws, spatial.shape[1]), rng)
-        gains = over_rows @ (white @ spatial.T)
-        return gains
-    # Independent plane waves need no factor of V_i.
+    if spatial is None:
+        drawn = _draw_plane_waves(scenario, band, n * n_draws, rng).reshape(n, n_draws, -1)
+    else:
+        drawn = complex_normal((n, n_draws, spatial.shape[1]), rng) @ spatial.T
+    gains: np.ndarray = over_rows @ drawn
+    if measured := scenario.multipath:
+        stretch, factor = _stretches(scenario)[band]
+        signals = np.sum(gains * measured.radiation[band], axis=-1) @ stretch.T
+        gains += (measurement_correlation(scenario)[band] * signals[:, None]) @ np.conj(factor)
+    return gains
+
+
+def _draw_plane_waves(
+        scenario: Scenario, band: int, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw n vectors of gains from independent plane waves, which need no factor of V_i."""
     drawn = np.zeros((1, 1, 1))
-    for waves in _plane_waves(scenario, band, (False, False), n * n_draws):
+    for waves in _plane_waves(scenario, band, (False, False), n):
         amplitudes = complex_normal(
-            (len(waves.elevation_weights), n * n_draws, len(waves.azimuth_weights)), rng)
+            (len(waves.elevation_weights), n, len(waves.azimuth_weights)), rng)
         amplitudes *= (waves.gain * np.sqrt(
             waves.elevation_weights[:, None] * waves.azimuth_weights))[:, None]
         drawn = drawn + np.einsum(
             'ez,eny->nzy', waves.along_z, np.matmul(amplitudes, waves.along_y), optimize=True)
-    scale = mean_los_power(scenario, band) * 10 ** (scenario.multipath_to_los_db / 10)
-    gains = over_rows @ (np.sqrt(scale) * drawn).reshape(n, n_draws, -1)
+    gains: np.ndarray = np.sqrt(_mean_power(scenario, band)) * drawn
     return gains
+
+
+@functools.lru_cache(maxsize=16)
+def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Compute how a measured covariance changes gains with the declared one.
+
+    For each band, these are A and T V_0, so that gains g become g + C_0 T^H A T g. With the
+    covariance S of the signals T g, and R = S^(1/2), it follows from `multipath_estimate` that
+    R A R = (1 + R M R)^(1/2) - 1.
+    """
+    assert scenario.multipath
+    radiation, stretches = scenario.multipath.radiation, []
+    for declared, excess, factor in zip(
+            coupling(scenario, radiation, radiation), scenario.multipath.excess,
+            declared_covariance(scenario).scatter(radiation), strict=True):
+        root = square_root(declared)
+        values, vectors = np.linalg.eigh(np.conj(root.T) @ excess @ root)
+        growth = np.sqrt(np.maximum(1 + values, 0.0)) - 1
+        # Columns of the root are orthogonal.
+        inverse = root / np.sum(np.abs(root)**2, axis=0)
+        whitened = inverse @ vectors
+        stretches.append((whitened * growth @ np.conj(whitened.T), factor))
+    return tuple(stretches)
 
 
 def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -322,7 +414,12 @@ def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarr
     return numbers
 
 
-def _profile_quadrature(scenario: Scenario, mean_deg: float, is_even: bool, phase: float
+def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:
+    """Return the owner of the three fields that declare the covariance."""
+    return scenario.multipath or scenario
+
+
+def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase: float
                         ) -> tuple[np.ndarray, np.ndarray]:
     """Angles [n] and weights [n] of the Laplacian profile, normalised to a sum of one.
 
@@ -330,7 +427,7 @@ def _profile_quadrature(scenario: Scenario, mean_deg: float, is_even: bool, phas
     angles are included.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
-    mean, spread = np.deg2rad(mean_deg), np.deg2rad(scenario.angular_spread_deg)
+    mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
     signs = (1,) if is_even else (-1, 1)
     # An interval begins at the cusp, the mean, and ends earlier for a narrow profile.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rhs_isac_ros.model.impairments import ElementErrors, draw_impairments
-from rhs_isac_ros.model.los import checked_positions, los_gain
+from rhs_isac_ros.model.los import checked_positions, direct_gain
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
@@ -50,7 +50,8 @@ def simulate_received(
 
     Takes the user's position in each phase, float64 [N, 3] [m], and returns complex128
     [N, N_B, N_SB F], sub-band-major. Impairments that the scenario declares are drawn too: a new
-    user and a new cycle for each position, and one surface for all of them.
+    user and a new cycle for each position, and one surface for all of them. With a channel file,
+    the signals are those of its users nearest to the positions.
 
     Parameters
     ----------
@@ -74,8 +75,9 @@ def simulate_received(
     for start in range(0, len(positions), _BLOCK):
         block = positions[start:start + _BLOCK]
         for band in range(n_bands):
-            los = los_gain(scenario, block, band)
-            gains = draw_multipath(scenario, band, len(block), rng)
+            los = direct_gain(scenario, block, band)
+            gains = (0.0 if scenario.channel
+                     else draw_multipath(scenario, band, len(block), rng))
             noise = amplitude * complex_normal((len(block), n_measurements), rng)
             symbol = 1.0 if factors is None else factors[start:start + _BLOCK, band]
             received[start:start + _BLOCK, band] = received_signal(

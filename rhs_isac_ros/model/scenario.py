@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.model import plugins
-from rhs_isac_ros.model.files import read_yaml
+from rhs_isac_ros.model.files import ArchiveError, ArrayFile, read_yaml
 from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
+from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
+from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.plugins import PluginError
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
@@ -174,6 +176,20 @@ class Extensions:
         (), 0.0, 1e300,
         'Impairments of installed plug-ins: a mapping of names to strengths, each in the unit '
         'that the plug-in documents.', '', label='impairments')
+    multipath: MultipathEstimate | None = declare(
+        None, 0.0, 0.0,
+        'File of a measured covariance of the multipath, as a survey estimates it; it replaces '
+        'multipath_to_los_db, delay_spread_s and angular_spread_deg, which then have no effect.',
+        '', label='multipath')
+    channel: PathChannel | None = declare(
+        None, 0.0, 0.0,
+        'File of propagation paths of users at known positions. Signals then follow these paths '
+        'instead of direct path and random multipath; estimators and bounds do not.',
+        '', label='channel')
+
+
+# Fields whose values are files of arrays.
+_FILES: dict[str, type[ArrayFile]] = {'multipath': MultipathEstimate, 'channel': PathChannel}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,7 +203,8 @@ class Scenario(Extensions, Table1):
     the origin, with x pointing outward and z up.
 
     A gain is a number, a `GainPattern`, a function of the angle from the boresight, or the name
-    of an installed plug-in. Files can hold numbers and names only.
+    of an installed plug-in. Files can hold numbers and names only. `multipath` and
+    `channel` are objects, or the paths of their files.
 
     Raises
     ------
@@ -225,12 +242,17 @@ class Scenario(Extensions, Table1):
         if self.amplitude_levels == 1:
             raise ScenarioError(
                 'amplitude_levels: 1, expected 0 for continuous amplitudes, or at least 2')
+        for name in _FILES:
+            arrays = getattr(self, name)
+            if arrays is not None and (misfit := arrays.misfit(self)):
+                raise ScenarioError(f'{name}: {misfit}')
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> 'Scenario':
         """Read a scenario from a YAML file that maps field names to values.
 
-        Fields that are not in the file have their defaults.
+        Fields that are not in the file have their defaults. Paths in the file are relative to its
+        folder.
 
         Raises
         ------
@@ -248,6 +270,8 @@ class Scenario(Extensions, Table1):
         for key in content:
             if key not in known:
                 raise ScenarioError(f'{path}: {key}: unknown field, expected one of {known}')
+        content |= {name: str(Path(path).parent / content[name])
+                    for name in _FILES if isinstance(content.get(name), str)}
         try:
             return cls(**content)
         except ScenarioError as error:
@@ -256,8 +280,8 @@ class Scenario(Extensions, Table1):
     def changes(self) -> dict[str, Any]:
         """Return the fields that differ from Table I, as values that `from_yaml` can read.
 
-        Gain patterns are written as name and digest. A pattern that is not a plug-in cannot be
-        read back.
+        Gain patterns are written as name and digest, and files as path and digest. A pattern that
+        is not a plug-in cannot be read back, and neither can arrays that are not in a file.
         """
         return {field.name: _plain(value) for field in dataclasses.fields(self)
                 if (value := getattr(self, field.name)) != field.default}
@@ -271,10 +295,13 @@ class Scenario(Extensions, Table1):
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
-        for name in ('impairments', 'multipath_direction_deg'):
+        for name in ('impairments', 'multipath_direction_deg', *_FILES):
             # Identifiers in existing files precede these fields.
             if name not in changes:
                 del fields[name]
+            elif name in _FILES:
+                # The same file has the same identifier on every host.
+                fields[name] = fields[name].rpartition('@')[2]
         return f'sc{hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:16]}'
 
     @property
@@ -319,7 +346,12 @@ class Scenario(Extensions, Table1):
         return bounds
 
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw positions uniformly from the region of interest, float64 [n, 3] [m]."""
+        """Draw positions from the region of interest, float64 [n, 3] [m].
+
+        They are uniform, or with a channel file those of its users.
+        """
+        if self.channel:
+            return self.channel.users[rng.integers(len(self.channel.users), size=n)]
         low, high = self.roi_bounds_m
         return rng.uniform(low, high, size=(n, 3))
 
@@ -339,7 +371,7 @@ def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) 
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, GainPattern | str):
+    if isinstance(value, GainPattern | ArrayFile | str):
         return str(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
@@ -360,6 +392,8 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
         return _gain(field, value)
     if name == 'impairments':
         return _strengths(field, value)
+    if name in _FILES:
+        return _arrays(field, value)
     if name == 'elements_per_side' and isinstance(value, list | tuple | np.ndarray):
         if len(value) != 2:
             raise ScenarioError(f'{name}: {value!r}, expected an integer or two')
@@ -390,6 +424,18 @@ def _gain(field: dataclasses.Field[Any], value: Any) -> float | GainPattern:
     except (PatternError, PluginError) as error:
         raise ScenarioError(f'{field.name}: {error}') from None
     return _number(field, value)
+
+
+def _arrays(field: dataclasses.Field[Any], value: Any) -> ArrayFile | None:
+    kind = _FILES[field.name]
+    if value is None or isinstance(value, kind):
+        return value
+    if not isinstance(value, str | Path):
+        raise ScenarioError(f'{field.name}: {value!r}, expected the path of a file, or null')
+    try:
+        return kind.named(str(value))
+    except ArchiveError as error:
+        raise ScenarioError(f'{field.name}: {error}') from None
 
 
 def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, float], ...]:

@@ -34,8 +34,11 @@ class UserNode(RoleNode[User]):
             raise ParameterError(f'position_m: {len(starts)} points, expected {one}')
         if values.mobility == 'waypoints' and count > 1:
             raise ParameterError(f'user_count: {count}, expected 1 with mobility waypoints')
-        return {values.user_id + n: self._mobility(
+        users = {values.user_id + n: self._mobility(
             values.user_id + n, starts[n] if len(starts) else None) for n in range(count)}
+        if channel := self.scenario.channel:
+            return {user: mobility.Traced(path, channel) for user, path in users.items()}
+        return users
 
     def _mobility(self, user: int, position: np.ndarray | None) -> mobility.Mobility:
         """Return the mobility of a user that starts at `position`; None: anywhere."""

@@ -116,7 +116,7 @@ class SearchEstimator(abc.ABC):
         self._grid = TemplateTable(scenario, arrays)
         self._outside = Outside(scenario, arrays)
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
-        self._test = FitTest(n_measurements)
+        self._test = FitTest(n_measurements, float(arrays['energy'].min()))
         self._bounds = scenario.roi_bounds_m
         self._volume_m3 = float(np.prod(scenario.roi_size_m))
         self._alignment = Alignment(likelihood, self._grid.spread)

@@ -18,6 +18,8 @@ REGION_PROBABILITY = 0.5
 # and none of them should lose a fix. Above the second, the covariance includes positions outside.
 OUTSIDE_LIMIT = 0.99
 DOUBT_LIMIT = 0.05
+# Share of the energy of a direct path that some multipath may leave.
+_WEAK_SHARE = 0.25
 
 
 class FitTest:
@@ -26,22 +28,28 @@ class FitTest:
     An energy is the squared norm of a whitened signal, and `n_measurements` is the number of
     complex measurements of a positioning phase, N_B N_SB F.
 
+    Parameters
+    ----------
+    weakest
+        Energy of the weakest whitened mean in the region. Multipath may be weaker than in the
+        model; signals that are weaker than any direct path as well contain noise alone.
+
     Attributes
     ----------
     min_energy, max_residual
-        Lower limit of the energy of signals, from noise alone, and upper limit of the energy of a
-        residual.
+        Lower limit of the energy of signals, and upper limit of the energy of a residual.
     """
 
-    def __init__(self, n_measurements: int) -> None:
+    def __init__(self, n_measurements: int, weakest: float = math.inf) -> None:
         # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
         from scipy.special import gammainccinv, gammaincinv
 
-        self.min_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
+        self.min_energy = min(float(gammaincinv(n_measurements, FALSE_ALARM)),
+                              weakest * _WEAK_SHARE)
         self.max_residual = float(gammainccinv(n_measurements, FALSE_ALARM))
 
     def min_energy_test(self, energy: float) -> str:
-        """Reject signals that are weaker than noise."""
+        """Reject signals that are weaker than noise and any direct path."""
         if energy >= self.min_energy:
             return ''
         return (f'energy of the whitened signals: {energy:.3g}, expected at least '

@@ -406,7 +406,8 @@ class TemplateTable:
             return amplitude
         bounds = [self._over_gain(one, energy, prior)[0]
                   for one, energy in zip(amplitude, energies.tolist(), strict=True)]
-        return np.stack(bounds) - template_energy
+        over_gain: np.ndarray = np.stack(bounds) - template_energy
+        return over_gain
 
     def _over_gain(self, amplitude: np.ndarray, energy: float, prior: NuisancePrior
                    ) -> tuple[np.ndarray, np.ndarray]:

@@ -197,7 +197,8 @@ def _ranges(scenario: Scenario) -> np.ndarray:
     nearest_m = max(_NEAREST * resolution.nearest_m, _MIN_APERTURES * aperture_m)
     ratio = _MAX_RANGE_FACTOR * resolution.farthest_m / nearest_m
     n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(_RANGE_RATIO))))
-    return nearest_m * _RANGE_RATIO**np.arange(n_ranges)
+    ranges: np.ndarray = nearest_m * _RANGE_RATIO**np.arange(n_ranges)
+    return ranges
 
 
 def _directions(scenario: Scenario) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Tables on disk: computed once for a scenario and codebook, then mapped into memory."""
 
 import contextlib
-import dataclasses
 import hashlib
 import os
 import tokenize
@@ -63,7 +62,7 @@ def _tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
 
 def table_key(model: MeasurementModel, codebook_id: str) -> str:
     """Return a hash of all that the table of a model depends on, 32 hexadecimal digits."""
-    parts = (dataclasses.astuple(model.scenario), codebook_id, __version__, _FORMAT,
+    parts = (model.scenario.id, codebook_id, __version__, _FORMAT,
              *([model.surface.id] if model.surface else []))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 

@@ -5,10 +5,10 @@ import itertools
 
 import numpy as np
 
-from rhs_isac_ros.link import Beam, capacity
+from rhs_isac_ros.link import Beam, actual_capacity
 from rhs_isac_ros.model import Scenario, streams
 from rhs_isac_ros.model.impairments import DeclaredElements, draw_factors, draw_surface
-from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.los import direct_gain
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
@@ -32,13 +32,16 @@ class Fading:
     to (4), and consecutive cycles have the correlation of Eq. (4); it is negative for some times.
     Over several cycles the correlation is the product of these, not Eq. (4): the exact
     conditional distribution would need all earlier cycles.
+
+    With a channel file there is no fading: the paths of a user move with it.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._scenario, self._seed = scenario, seed
         # The first draw factorises covariances. Draw once now, so that it does not delay the first
         # cycle.
-        draw_multipath(scenario, 0, 1, np.random.default_rng(0))
+        if not scenario.channel:
+            draw_multipath(scenario, 0, 1, np.random.default_rng(0))
         # Time [s] and gains of the latest cycle of each user.
         self._latest: NewestDict[int, tuple[float, list[np.ndarray]]] = NewestDict(_MAX_USERS)
 
@@ -48,6 +51,9 @@ class Fading:
         Without memory, they are independent of the previous cycle.
         """
         scenario = self._scenario
+        if scenario.channel:
+            shape = scenario.n_subbands, scenario.n_frames, scenario.n_elements
+            return [np.zeros(shape, complex)] * scenario.n_bands
         gains = [
             draw_multipath(
                 scenario, band, 1,
@@ -100,7 +106,8 @@ class _Cycle:
     Attributes
     ----------
     los
-        Line-of-sight gains of each band, complex128 [N_SB, N_E].
+        Gains of the direct path or of the paths of a channel file in each band, complex128
+        [N_SB, N_E].
     multipath
         Multipath gains of each band, complex128 [N_SB, F, N_E].
     surface
@@ -113,7 +120,7 @@ class _Cycle:
                  drawn: _Drawn) -> None:
         self.truth, self.multipath = truth, multipath
         # Computed here rather than on the first pilot, while other roles prepare the cycle.
-        self.los = [los_gain(scenario, truth.position[None], band)[0]
+        self.los = [direct_gain(scenario, truth.position[None], band)[0]
                     for band in range(scenario.n_bands)]
         self.surface, self.factors = drawn.surface, drawn.factors(truth)
 
@@ -269,7 +276,7 @@ class Channel(PlainRole):
             # Only the magnitude, the gain of the user, changes the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
         used = Beam(configuration, digital, beam.band)
-        rate_bps = float(capacity(self._scenario, used, truth.position[None])[0])
+        rate_bps = float(actual_capacity(self._scenario, used, truth.position[None])[0])
         bits = min(data.bits, rate_bps * data.duration_s // 1)
         return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)
 

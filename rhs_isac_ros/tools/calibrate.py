@@ -1,7 +1,7 @@
-"""``scripts/calibrate``: estimates errors of a surface from pilots at known positions.
+"""``scripts/calibrate``: estimates a surface, or the multipath, from pilots at known positions.
 
 The pilots are the received signals of a recording, or of a running network, whose users
-publish their true positions.
+publish their true positions, or arrays in a file.
 """
 
 import argparse
@@ -9,6 +9,7 @@ import dataclasses
 import os
 import sys
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,11 +21,15 @@ from rhs_isac_ros.calibration import (
     Calibration,
     Pilots,
     SurfacePrior,
+    SurveyWarning,
     calibrate,
+    load_surface,
     prior_of,
     report,
+    survey,
+    survey_report,
 )
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.arguments import (
@@ -37,6 +42,7 @@ from rhs_isac_ros.model.arguments import (
     positive_float,
     positive_int,
 )
+from rhs_isac_ros.model.files import ArchiveError, read_arrays
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
@@ -163,19 +169,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parse(parser, arguments)
     check_distinct(parser, {'file': options.file, '--config': options.config,
-                            '--codebook': options.codebook}, {'--output': options.output})
+                            '--codebook': options.codebook,
+                            '--calibration': options.calibration}, {'--output': options.output})
     try:
         scenario = _scenario(options)
-        log = PilotLog(scenario, options.user)
-        if options.file:
-            _read(options, scenario, log)
-        elif not _listen(options, scenario, log, arguments):
-            print_error(
-                f'{log.n_pilots} pilots within {options.timeout:g} s, expected {options.cycles}, '
-                f'in the domain {os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace',
-                parser.prog)
-            return 1
-        pilots = _checked(log, options)
+        if options.file and options.file.suffix == '.npz':
+            pilots = [_arrays(options)]
+        else:
+            log = PilotLog(scenario, options.user)
+            if options.file:
+                _read(options, scenario, log)
+            elif not _listen(options, scenario, log, arguments):
+                print_error(
+                    f'{log.n_pilots} pilots within {options.timeout:g} s, expected '
+                    f'{options.cycles}, in the domain {os.environ.get("ROS_DOMAIN_ID", "0")} and '
+                    'this namespace', parser.prog)
+                return 1
+            pilots = _checked(log, options)
+        if options.multipath:
+            _survey(scenario, pilots, options)
+            return 0
         calibration = calibrate(scenario, pilots, _prior(scenario, options))
         print(report(calibration, scenario), flush=True)
         for text, surface in (('before', None), ('after', calibration.surface)):
@@ -192,10 +205,41 @@ def _write(calibration: Calibration, output: Path) -> None:
     print(f'{output}: calibration {calibration.id}')
 
 
+def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
+    """Estimate the multipath from the codebook with the most pilots."""
+    group = max(pilots, key=lambda group: len(group.positions))
+    n_other = sum(len(one.positions) for one in pilots) - len(group.positions)
+    if n_other:
+        print(f'{n_other} pilots with other codebooks have no effect')
+    surface = load_surface(str(options.calibration or ''), scenario)
+    with warnings.catch_warnings():
+        # The report contains them.
+        warnings.simplefilter('ignore', SurveyWarning)
+        estimate = survey(scenario, group.beams, group.positions, group.received, surface)
+    print(survey_report(estimate), flush=True)
+    measured = dataclasses.replace(scenario, multipath=estimate)
+    for text, known in (('before', scenario), ('after', measured)):
+        print(f'position error of the pilots {text}: {_error(known, [group], surface)}')
+    estimate.save(options.output)
+    print(f'{options.output}: multipath {estimate.digest}; use it with the line '
+          f'"multipath: {options.output.name}" in a scenario file beside it')
+
+
+def _arrays(options: argparse.Namespace) -> Pilots:
+    """Return the pilots of a file with the arrays ``positions`` and ``received``."""
+    arrays = read_arrays(options.file)
+    for name in ('positions', 'received'):
+        if name not in arrays:
+            raise ArchiveError(f'{options.file}: {name}: missing, expected an array of this name')
+    codebook = Codebook.load(options.codebook or default_codebook_file())
+    return Pilots(codebook, arrays['positions'], arrays['received'])
+
+
 def _scenario(options: argparse.Namespace) -> Scenario:
     if options.config:
         return Scenario.from_yaml(options.config)
-    return (read_scenario(options.file) if options.file else None) or Scenario()
+    is_recording = options.file and options.file.suffix != '.npz'
+    return (read_scenario(options.file) if is_recording else None) or Scenario()
 
 
 def _prior(scenario: Scenario, options: argparse.Namespace) -> SurfacePrior:
@@ -271,17 +315,24 @@ def _error(scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimat
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='calibrate', description='Estimate errors and failures of the elements, and gains '
-        'and phases of the bands, from signals of users at known positions. Without a recording, '
-        'the signals are those of a running network; ROS arguments select its namespace: '
-        '--ros-args -r __ns:=/lab')
+        'and phases of the bands, or the covariance of the multipath, from signals of users at '
+        'known positions. Without a file, the signals are those of a running network; ROS '
+        'arguments select its namespace: --ros-args -r __ns:=/lab')
     add = parser.add_argument
-    add('file', type=input_file, nargs='?', help='recording made with record')
+    add('file', type=input_file, nargs='?',
+        help='recording made with record, or .npz file with the arrays positions [N, 3] (m) and '
+        'received [N, N_B, N_SB F]')
+    add('--multipath', action='store_true',
+        help='estimate the multipath of the hall instead of the surface')
+    add('--calibration', type=input_file, metavar='FILE',
+        help='calibrated surface to assume with --multipath')
     add('--output', type=output_file, default=Path('calibration.npz'), metavar='FILE',
-        help='calibration to write (default: calibration.npz)')
+        help='calibration or multipath to write (default: calibration.npz)')
     add('--config', type=input_file, metavar='FILE',
         help="scenario file; by default the recorded scenario, or the paper's Table I")
     add('--codebook', type=input_file, metavar='FILE',
-        help='codebook to assume if the recording contains none')
+        help='codebook to assume if the recording contains none; of arrays, by default the '
+        'default one')
     add('--user', type=integer(0), default=0, metavar='ID',
         help='use only the signals of this user (default: of all users)')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')

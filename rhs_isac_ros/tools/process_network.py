@@ -28,7 +28,7 @@ _DISCOVERY_PERIOD_S = 0.02
 def add_network_options(parser: argparse.ArgumentParser) -> None:
     """Add the seed and the files of a network to the options of a command."""
     parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', type=input_file, metavar='FILE',
+    parser.add_argument('--config', '--scenario', type=input_file, metavar='FILE',
                         help="scenario file; by default the paper's Table I")
     parser.add_argument('--codebook', type=input_file, metavar='FILE',
                         help='codebook file; by default that of the package')

@@ -1,11 +1,14 @@
 """The chain rule from radiation matrices to a codebook, also for an estimated surface."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from rhs_isac_ros.bounds import AverageCrlb
+from rhs_isac_ros.bounds import AverageCrlb, crlb
 from rhs_isac_ros.bounds.average import gradient_analog, gradient_digital
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.calibration import survey
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import AppliedBeams
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
@@ -101,3 +104,26 @@ def test_gradients_for_an_estimated_surface_are_slopes(average, random_beams, na
             for step in (-1e-5, 1e-5)]
     slope = np.sum(np.conj(direction) * gradient).real
     assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(slope, rel=1e-4)
+
+
+def test_gradients_under_a_measured_covariance_are_difference_quotients(odd, random_beams):
+    scenario, codebook = odd
+    rng = np.random.default_rng(4)
+    places = scenario.sample_positions(30, rng)
+    hall = dataclasses.replace(scenario, angular_spread_deg=40.0, delay_spread_s=2e-8)
+    other = random_beams(scenario, np.random.default_rng(5))
+    measured = dataclasses.replace(scenario, multipath=survey(
+        scenario, other, places, MeasurementModel(hall, other).sample(places, rng)))
+    cost = AverageCrlb(measured, places[:4])
+    gradient = cost(codebook)
+    assert gradient.value == pytest.approx(np.mean(crlb(measured, codebook, places[:4])))
+    for name, index, unit in (('analog', (1, 0, 3), 1.0), ('digital', (0, 2, 1, 3), 1.0),
+                              ('digital', (1, 0, 0, 2), 1j)):
+        values, derivative = getattr(codebook, name), getattr(gradient, f'by_{name}')[index]
+        step = np.zeros_like(values)
+        step[index] = 1e-5 * np.abs(values).max() * unit
+        ends = [cost.value(AppliedBeams(**{
+            'analog': codebook.analog, 'digital': codebook.digital, name: values + sign * step}))
+            for sign in (1, -1)]
+        expected = (ends[0] - ends[1]) / (2 * np.abs(step[index]))
+        assert (derivative * np.conj(unit)).real == pytest.approx(expected, rel=1e-4)

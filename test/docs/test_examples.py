@@ -197,3 +197,14 @@ def test_sweeps_vary_the_strength():
     settings = settings_of(phase_noise_scenario(0.0), [axis], 'random', 'bayes')
     assert [one.scenario for one in settings] == [
         phase_noise_scenario(0.02), phase_noise_scenario(0.2)]
+
+
+def test_the_box_hall_is_that_of_the_package():
+    example = runpy.run_path(str(EXAMPLES / 'box_hall.py'))
+    traced = example['trace'](example['raster'](Scenario()))
+    shipped = Scenario.from_yaml(EXAMPLES.parents[1] / 'config' / 'hall.yaml').channel
+    np.testing.assert_array_equal(traced.users, shipped.users)
+    np.testing.assert_allclose(traced.coefficients, shipped.coefficients, rtol=1e-5)
+    # Two reflections at most, and nothing from behind the surface.
+    assert set(traced.n[traced.a != 0]) == {0, 1, 2}
+    assert (traced.src[traced.a != 0][:, 0] > 0).all()

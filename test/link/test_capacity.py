@@ -5,9 +5,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link import Beam, capacity, expected_capacity, steer
+from rhs_isac_ros.calibration import survey
+from rhs_isac_ros.link import (
+    Beam,
+    actual_capacity,
+    capacity,
+    capacity_report,
+    expected_capacity,
+    steer,
+)
 from rhs_isac_ros.link.capacity import posterior_points
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.multipath import spatial_covariance
+from rhs_isac_ros.model.path_channel import PathChannel
 
 POSITION = np.array([9.0, 1.5, -0.4])
 # Long in range and short across, as are the posteriors of the shipped codebook.
@@ -218,3 +228,48 @@ def test_an_invalid_covariance_still_gives_a_finite_capacity(table1, covariance)
 def test_invalid_moments_are_errors_that_name_the_field(table1, mean, covariance, name):
     with pytest.raises(ValueError, match=rf'(?s)^{name}: .* expected \[3.* finite'):
         posterior_points(table1.scenario, mean, covariance)
+
+
+def test_a_measured_covariance_has_its_own_capacity(table1, reference_link, shipped):
+    """Multipath of one direction: the covariance is complex, unlike a declared one."""
+    scenario, rng = table1.scenario, np.random.default_rng(0)
+    model = MeasurementModel(scenario, shipped)
+    places = scenario.sample_positions(40, rng)
+    wave = np.exp(2j * np.pi * rng.uniform(size=100)) * 1e-3
+    gains = rng.normal(size=(40, 2)) @ [1, 1j]
+    received = model.sample(places, rng) + gains[:, None, None] * (model.radiation @ wave)
+    measured = dataclasses.replace(
+        scenario, multipath=survey(scenario, shipped, places, received))
+    spatial = spatial_covariance(measured).matrix
+    assert np.abs(spatial[0].imag).max() > 0.05 * np.abs(spatial[0]).max()
+    link = reference_link(table1)
+    link.spatial = spatial[0]
+    beam = random_beam(scenario, rng)
+    assert capacity(measured, beam, POSITION[None])[0] == pytest.approx(
+        link.capacity(beam, POSITION), rel=1e-8)
+    steered = steer(measured, POSITION)
+    assert capacity(measured, steered, POSITION[None])[0] > 1.1 * capacity(
+        measured, beam, POSITION[None])[0]
+
+
+def test_the_actual_capacity_is_that_of_the_paths(small):
+    """A reflection in phase with the direct path doubles the amplitude."""
+    scenario, rng = small.scenario, np.random.default_rng(0)
+    beam, users = random_beam(scenario, rng), scenario.sample_positions(3, rng)
+    assert actual_capacity(scenario, beam, users) == pytest.approx(
+        capacity(scenario, beam, users))
+    f0 = scenario.center_frequencies_hz[0]
+    distance = np.linalg.norm(users, axis=1)[:, None]
+    a = np.tile(299_792_458 / (4 * np.pi * f0 * distance), (1, 2)) + 0j
+    paths = PathChannel(users, a, np.stack([users, users], axis=1), np.tile([0, 1], (3, 1)), f0)
+    traced = dataclasses.replace(scenario, channel=paths)
+    no_multipath = dataclasses.replace(
+        scenario, multipath_to_los_db=-200.0, noise_psd_dbm_hz=scenario.noise_psd_dbm_hz
+        - 10 * np.log10(4))
+    np.testing.assert_allclose(actual_capacity(traced, beam, users),
+                               capacity(no_multipath, beam, users), rtol=1e-6)
+    np.testing.assert_allclose(capacity(traced, beam, users), capacity(scenario, beam, users))
+    report = capacity_report(traced, steer(traced, users[0]), users[0])
+    assert abs(report.loss_percent) < 1
+    assert report.actual_bps == pytest.approx(
+        actual_capacity(traced, steer(traced, users[0]), users[:1])[0], rel=1e-9)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import Scenario, mobility
+from rhs_isac_ros.model import PathChannel, Scenario, mobility
 
 SQUARE = [(6.0, 0.0, 0.0), (8.0, 0.0, 0.0), (8.0, 3.0, 0.0), (6.0, 3.0, 0.0)]
 START_S = 1234.5
@@ -24,6 +24,16 @@ def test_a_static_user_does_not_move():
     positions, velocities = track(mobility.Static((7.0, -1.0, 0.5)), [0.0, 1.0, 1e6])
     assert (positions == [7, -1, 0.5]).all()
     assert (velocities == 0).all()
+
+
+def test_a_traced_user_is_at_the_nearest_traced_position():
+    users = np.array([[6.0, 0, 0], [7.0, 0, 0], [8.0, 0, 0]])
+    paths = PathChannel(users, np.full((3, 1), 1e-4 + 0j), users[:, None],
+                        np.zeros((3, 1), int), 2.75e9)
+    moves = mobility.Traced(mobility.Waypoints(SQUARE[:2], 1.0), paths)
+    positions, velocities = track(moves, [0.0, 0.4, 0.6, 1.4, 1.8])
+    np.testing.assert_array_equal(positions, users[[0, 0, 1, 1, 2]])
+    np.testing.assert_array_equal(velocities, [[1, 0, 0]] * 5)
 
 
 @pytest.mark.parametrize('make', [

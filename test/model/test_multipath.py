@@ -84,11 +84,11 @@ def rectangle(request) -> Scenario:
 @pytest.fixture
 def by_convolution(monkeypatch):
     """Multiply by V as for a surface of many elements."""
-    for cache in (mp.spatial_covariance, mp.multipath_factors):
+    for cache in (mp.spatial_covariance, mp.declared_covariance, mp.multipath_factors):
         cache.cache_clear()
     monkeypatch.setattr(mp, '_MAX_MATRIX', 1)
     yield
-    for cache in (mp.spatial_covariance, mp.multipath_factors):
+    for cache in (mp.spatial_covariance, mp.declared_covariance, mp.multipath_factors):
         cache.cache_clear()
 
 

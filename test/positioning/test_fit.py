@@ -1,5 +1,7 @@
 """Signals that the model cannot explain at any position give no fix."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -45,6 +47,25 @@ def test_limits_are_quantiles_of_the_chi_square_distribution():
                                (test.residual_test, test.max_residual, 1)):
         assert check(limit * (1 - 1e-6 * sign)) == ''
         assert check(limit * (1 + 1e-6 * sign)) != ''
+
+
+def test_a_quarter_of_the_weakest_direct_path_is_not_noise():
+    """Multipath may be weaker than in the model, as in an empty hall."""
+    assert FitTest(64, 12.0).min_energy == 3.0
+    assert FitTest(64, 1e4).min_energy == FitTest(64).min_energy
+
+
+def test_users_without_multipath_keep_their_fix(setting):
+    scenario, codebook, estimator = setting
+    empty = dataclasses.replace(scenario, multipath_to_los_db=-60.0)
+    positions = scenario.sample_positions(60, np.random.default_rng(5))
+    received = simulate_received(empty, codebook, positions, np.random.default_rng(6))
+    estimate = estimator.estimate(received)
+    assert estimate.fix.all()
+    errors = estimate.mean - positions
+    distances = np.einsum(
+        'na,na->n', errors, np.linalg.solve(estimate.covariance, errors[..., None])[..., 0])
+    assert np.mean(distances <= chi2.ppf(0.95, 3)) > 0.95
 
 
 def test_the_largest_energy_is_that_of_the_strongest_position_with_noise():

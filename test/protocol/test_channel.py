@@ -10,6 +10,7 @@ from in_memory_network import feed
 
 from rhs_isac_ros.link import Beam, capacity, steer
 from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel
@@ -278,3 +279,22 @@ def test_gain_and_element_errors_change_the_capacity(scenario, truth, beam, appl
     assert bits(phase_std_rad=7.0, carrier_offset_std_hz=1e4) == bits()
     assert bits(user_gain_std_db=3.0) != bits()
     assert bits(failed_element_share=1.0) < bits()
+
+
+def test_a_channel_file_takes_the_place_of_fading(scenario, truth, configuration, pilots):
+    """Two users at one traced position have the same signals, and so have two cycles."""
+    users = np.array([PLACE + [0.3, 0, 0], PLACE + [1, 0, 0]])
+    distance = np.linalg.norm(users, axis=1)[:, None]
+    paths = PathChannel(users, 299_792_458 / (4 * np.pi * 2.75e9 * distance) + 0j,
+                        users[:, None], np.zeros((2, 1), int), 2.75e9)
+    traced = dataclasses.replace(scenario, channel=paths)
+    signals = []
+    for seed in (0, 1):
+        channel = Channel(traced, seed)
+        ((answer,),) = feed(channel, [truth, configuration, pilots])[-1:]
+        signals.append(answer.signals)
+    np.testing.assert_array_equal(*signals)
+    expected = np.einsum('jm,fm,jkm->fjk', los_gain(scenario, users[:1], 0)[0],
+                         configuration.analog, onboard_matrix(scenario)[0])
+    expected = expected * pilots.symbols[:, None, None]
+    np.testing.assert_allclose(signals[0], expected, rtol=1e-9)

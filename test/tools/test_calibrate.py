@@ -1,5 +1,6 @@
 """``scripts/calibrate`` on a recording of a network with a damaged surface, and what follows."""
 
+import dataclasses
 import functools
 import re
 import subprocess
@@ -18,7 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, draw_surface, streams
+from rhs_isac_ros.model import Scenario, draw_surface, simulate_received, streams
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.impairments import Impairments
@@ -136,6 +137,37 @@ def test_the_pilots_may_come_from_the_running_network(built_scripts, process, re
         capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     assert done.returncode == 0, done.stderr
     assert 5 <= Calibration.load(tmp_path / 'live.npz').about['pilots'] < 50
+
+
+def test_a_recording_is_a_survey_of_the_multipath(recording, tmp_path, capsys):
+    surface, hall = tmp_path / 'surface.npz', tmp_path / 'hall.npz'
+    common = recording, '--namespace', NAMESPACE, '--output'
+    assert call(capsys, *common, surface).code == 0
+    done = call(capsys, *common, hall, '--multipath', '--calibration', surface)
+    assert (done.code, done.err) == (0, '')
+    assert re.search(r'pilots after: [\d.]+ m rms, 0 of \d+ without a fix', done.out)
+    estimate = dataclasses.replace(SCENARIO, multipath=hall).multipath
+    # The emulated multipath is the declared one.
+    assert estimate.multipath_to_los_db == pytest.approx(
+        SCENARIO.multipath_to_los_db, abs=2)
+    assert f'{estimate.about["positions"]} positions' in done.out
+    assert done.out.splitlines()[-1].startswith(f'{hall}: multipath {estimate.digest}; ')
+
+
+def test_arrays_are_a_survey_of_the_multipath(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    positions = SCENARIO.sample_positions(12, rng)
+    received = simulate_received(SCENARIO, CODEBOOK, positions, rng)
+    np.savez(tmp_path / 'arrays.npz', positions=positions, received=received)
+    options = ('--multipath', '--config', CONFIG / 'quick.yaml', '--codebook',
+               CONFIG / 'codebook_quick.yaml', '--output', tmp_path / 'hall.npz')
+    done = call(capsys, tmp_path / 'arrays.npz', *options)
+    assert (done.code, done.err) == (0, '')
+    assert 'warning: positions: 12, expected at least 20' in done.out
+    np.savez(tmp_path / 'arrays.npz', positions=positions)
+    done = call(capsys, tmp_path / 'arrays.npz', *options)
+    assert done.code == 2
+    assert 'received: missing' in done.err
 
 
 @pytest.mark.parametrize(('arguments', 'error'), [

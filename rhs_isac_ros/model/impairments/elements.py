@@ -168,7 +168,7 @@ class DeclaredElements(SurfaceModel):
         radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
         n_bands, n_rows, n_terms, n_elements = radiation.shape
         amplitude = np.sqrt(spatial_covariance(scenario).power)
-        flat = (radiation * amplitude[:, None, None, None]).reshape(n_bands, n_rows, -1)
+        flat = (radiation * amplitude[:, None, None]).reshape(n_bands, n_rows, -1)
         scattered = np.matmul(flat, np.conj(np.swapaxes(flat, 1, 2)))
 
         def direct(band: int, positions: np.ndarray) -> np.ndarray:

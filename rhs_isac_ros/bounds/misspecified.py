@@ -1,0 +1,229 @@
+"""Bias and covariance of an estimator that assumes another model than the true one.
+
+The maximum-likelihood estimator of a model with the mean mu(p) and the covariance L tends to the
+pseudo-true position p*, which minimises (m - mu(p))^H L^-1 (m - mu(p)) for the true mean m. Its
+errors about p* have the sandwich covariance A^-1 B A^-1, where A is the expected curvature of the
+assumed log-likelihood at p*, and B the covariance of its gradient, under the true covariance
+(Fortunati, Gini, Greco and Richmond, Performance bounds for parameter estimation under
+misspecified models, IEEE Signal Processing Magazine 34 (6), 2017; for reconfigurable surfaces:
+Zheng, Chen, Ballal, Valkama, Wymeersch and Al-Naffouri, arXiv 2204.12783). If both models are the
+same, this is the Cramer-Rao bound.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.bounds.fisher import inverse_information
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.surface import Beamforming
+from rhs_isac_ros.model.threads import one_blas_thread
+
+_MAX_STEPS, _HALVINGS = 60, 12
+# Steps of finite differences, and of a search that has converged [m].
+_DIFFERENCE_M, _TOLERANCE_M = 1e-4, 1e-7
+# Points along the range per shortest wavelength at which ambiguities are looked for.
+_PER_WAVELENGTH = 8
+# Scale of the distance of an ambiguity's maximum from the ray [m].
+_MAX_OFFSET_M = 0.5
+# Probability with which estimators refuse a residual of a model that holds.
+_FALSE_ALARM = 1e-9
+# Quantile of the residual's energy that they should accept, 99 %, in standard deviations.
+_QUANTILE = 2.33
+# Largest share of ambiguities in the squared error, distance from the border of the region in
+# standard deviations, and relative error of the linearised mean, at which the result is valid.
+_MAX_AMBIGUITY, _MIN_BORDER, _MAX_NONLINEARITY = 0.01, 3.0, 0.25
+
+
+class Misspecified(NamedTuple):
+    """Errors of the maximum-likelihood estimator of an assumed model under a true one.
+
+    Attributes
+    ----------
+    bias
+        Pseudo-true less true position, float64 [N, 3] [m].
+    covariance
+        Of the errors about the pseudo-true position, float64 [N, 3, 3] [m^2].
+    valid
+        Whether the result describes the estimator: ambiguities of the range are improbable, the
+        mean is linear over the errors, the border of the region is far away, and estimators
+        do not refuse the signals for their residual, bool [N].
+    """
+
+    bias: np.ndarray
+    covariance: np.ndarray
+    valid: np.ndarray
+
+    @property
+    def mse_m2(self) -> np.ndarray:
+        """Mean squared error, float64 [N] [m^2]."""
+        result: np.ndarray = (np.sum(self.bias**2, axis=1)
+                              + np.trace(self.covariance, axis1=1, axis2=2))
+        return result
+
+
+def misspecified(assumed: Scenario, true: Scenario, codebook: Beamforming,
+                 positions: np.ndarray) -> Misspecified:
+    """Compute the errors of an estimator that assumes one scenario while another one is true.
+
+    Takes positions of the user, float64 [N, 3] [m].
+
+    Raises
+    ------
+    ValueError
+        If `positions` is not a finite [N, 3] array, the sizes of the scenarios differ, or one of
+        them declares nuisance parameters, such as phases, which are not included.
+    """
+    return misspecified_of(
+        MeasurementModel(assumed, codebook), MeasurementModel(true, codebook), positions)
+
+
+@one_blas_thread
+def misspecified_of(assumed: MeasurementModel, true: MeasurementModel, positions: np.ndarray
+                    ) -> Misspecified:
+    """Compute `misspecified` for two models, for example of different surfaces."""
+    positions = checked_positions(positions)
+    if assumed.shape != true.shape:
+        raise ValueError(f'true: N_B, N_SB F = {true.shape}, expected {assumed.shape}')
+    for name, model in (('assumed', assumed), ('true', true)):
+        if len(nuisance_of(model.scenario)):
+            raise ValueError(f'{name}: a scenario with nuisance parameters, expected none')
+    target = assumed.whiten(true.mean(positions))
+    places = _pseudo_true(assumed, positions, target)
+    slopes, residual = _slopes(assumed, places), target - assumed.whiten(assumed.mean(places))
+    # L^-1 of the assumed model turns the true covariance into W Lambda W^H.
+    white = np.matmul(assumed.whitener @ true.covariance(),
+                      np.conj(np.swapaxes(assumed.whitener, 1, 2)))
+    gradients = 2 * np.einsum('nair,irs,nbis->nab', slopes.conj(), white, slopes,
+                              optimize=True).real
+    curvature = 2 * np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
+    curvature -= _bending(assumed, places, residual)
+    inverse = inverse_information(curvature)
+    covariance = inverse @ gradients @ inverse
+    bias = places - positions
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    valid = finite.copy()
+    valid[finite] = _is_valid(
+        assumed, places[finite], bias[finite], covariance[finite], residual[finite], white)
+    return Misspecified(bias, covariance, valid)
+
+
+def _slopes(model: MeasurementModel, places: np.ndarray) -> np.ndarray:
+    """Whitened derivative of the mean, complex128 [N, 3, N_B, N_SB F] [1/m]."""
+    slopes: np.ndarray = model.whiten(model.jacobian(places))
+    return slopes
+
+
+def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Minimise the distance of the whitened mean from a target by damped Gauss-Newton steps."""
+    def cost(places: np.ndarray) -> np.ndarray:
+        distances = np.abs(target - model.whiten(model.mean(places)))**2
+        total: np.ndarray = np.sum(distances, axis=(1, 2))
+        return total
+
+    places: np.ndarray = positions.copy()
+    costs = cost(positions)
+    for _ in range(_MAX_STEPS):
+        slopes = _slopes(model, places)
+        residual = target - model.whiten(model.mean(places))
+        information = np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
+        gradient = np.einsum('nair,nir->na', slopes.conj(), residual).real
+        ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        step = np.linalg.solve(information + ridge, gradient[..., None])[..., 0]
+        for _ in range(_HALVINGS):
+            # The mean is defined in front of the surface only.
+            trial = places + step
+            trial[:, 0] = np.maximum(trial[:, 0], places[:, 0] / 2)
+            other = cost(trial)
+            worse = other > costs
+            step[worse] /= 2
+            places[~worse], costs[~worse] = trial[~worse], other[~worse]
+            if not worse.any():
+                break
+        if not len(step) or np.abs(step).max() < _TOLERANCE_M:
+            break
+    return places
+
+
+def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Part of the curvature from the second derivative of the mean, float64 [N, 3, 3]."""
+    bending = np.empty((len(places), 3, 3))
+    for axis in range(3):
+        step = _DIFFERENCE_M * np.eye(3)[axis]
+        second = (_slopes(model, places + step) - _slopes(model, places - step)) / (
+            2 * _DIFFERENCE_M)
+        bending[:, axis] = 2 * np.einsum('nair,nir->na', second.conj(), residual).real
+    result: np.ndarray = (bending + np.swapaxes(bending, 1, 2)) / 2
+    return result
+
+
+def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
+              covariance: np.ndarray, residual: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Return whether the local description holds, bool [N]."""
+    from scipy.special import gammainccinv
+
+    low, high = model.scenario.roi_bounds_m
+    reach = _MIN_BORDER * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    valid: np.ndarray = ((places - reach >= low) & (places + reach <= high)).all(axis=1)
+    energy = np.trace(white, axis1=1, axis2=2).real.sum() + np.sum(
+        np.abs(residual)**2, axis=(1, 2))
+    spread = np.sum(np.abs(white)**2) + 2 * np.einsum(
+        'nir,irs,nis->n', residual.conj(), white, residual).real
+    limit = gammainccinv(np.prod(model.shape), _FALSE_ALARM)
+    valid &= energy + _QUANTILE * np.sqrt(spread) <= limit
+    mean, slopes = model.whiten(model.mean(places)), _slopes(model, places)
+    values, vectors = np.linalg.eigh(covariance)
+    for axis in range(3):
+        step = vectors[:, :, axis] * np.sqrt(np.maximum(values[:, axis], 0))[:, None]
+        linear = np.einsum('na,nair->nir', step, slopes)
+        ends = places + step
+        ends[:, 0] = np.maximum(ends[:, 0], places[:, 0] / 2)
+        bent = model.whiten(model.mean(ends)) - mean - linear
+        valid &= np.linalg.norm(bent, axis=(1, 2)) <= _MAX_NONLINEARITY * np.linalg.norm(
+            linear, axis=(1, 2))
+    total = np.sum(bias**2, axis=1) + np.trace(covariance, axis1=1, axis2=2)
+    for row in np.flatnonzero(valid).tolist():
+        excess = _ambiguities(model, places[row], mean[row], residual[row], white, covariance[row])
+        valid[row] = excess <= _MAX_AMBIGUITY * total[row]
+    return valid
+
+
+def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
+                 residual: np.ndarray, white: np.ndarray, covariance: np.ndarray) -> float:
+    """Bound the squared error from other ranges of the same direction [m^2].
+
+    It is the sum over maxima of the probability that a range is more likely than the true one,
+    times the squared distance.
+    """
+    from scipy.special import ndtr
+
+    scenario = model.scenario
+    low, high = scenario.roi_bounds_m
+    distance = float(np.linalg.norm(place))
+    direction = place / distance
+    step = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz) / _PER_WAVELENGTH
+    points = np.arange(step, 2 * np.linalg.norm(np.abs([low, high]).max(axis=0)), step)
+    points = points[((low <= points[:, None] * direction)
+                     & (points[:, None] * direction <= high)).all(axis=1)]
+    means, slopes = model.mean_and_jacobian(points[:, None] * direction, whitened=True)
+    # The maximum of an ambiguity is beside the ray.
+    away = mean + residual - means
+    information = np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
+    information += np.diag([_MAX_OFFSET_M**-2] * 3)
+    gradient = np.einsum('nair,nir->na', slopes.conj(), away).real
+    offset = np.linalg.solve(information, gradient[..., None])[..., 0]
+    difference = means + np.einsum('na,nair->nir', offset, slopes) - mean
+    excess = np.sum(np.abs(difference)**2, axis=(1, 2)) - 2 * np.einsum(
+        'nir,ir->n', difference.conj(), residual).real
+    variance = 2 * np.einsum('nir,irs,nis->n', difference.conj(), white, difference,
+                             optimize=True).real
+    probability = ndtr(-excess / np.sqrt(np.maximum(variance, 1e-300)))
+    is_maximum = np.r_[True, probability[1:] >= probability[:-1]] & np.r_[
+        probability[:-1] >= probability[1:], True]
+    # The mode of the true position has the local standard deviation along the range.
+    own = 4 * np.sqrt(direction @ covariance @ direction) + step
+    other = is_maximum & (np.abs(points - distance) > own)
+    return float(np.sum(probability[other] * (points[other] - distance)**2))

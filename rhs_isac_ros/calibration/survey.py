@@ -1,0 +1,357 @@
+"""Covariance of the multipath in one hall from signals at known positions.
+
+The residuals of N positions have the sample covariance S. With an inverse Wishart prior of the
+weight nu, whose mean L_0 is the covariance that three fields declare, the posterior mean is
+
+    L = t (nu L_0 + N S) / (nu + N).
+
+Fields and nu maximise the evidence, so that few positions yield almost the fields, and many the
+sample covariance. Multipath of few strong paths is not Gaussian: errors of positions then exceed
+the bound of L for t = 1. Each position is therefore left out in turn, and t makes the 95 % region
+of the local bound contain 95 % of the positions left out, and the test of the residual pass 99 %.
+
+Positions whose signals are more probable without a direct path, as multipath of an unknown level,
+are left out.
+"""
+
+import dataclasses
+import itertools
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros import __version__
+from rhs_isac_ros.calibration.estimate import Pilots, set_phases
+from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
+from rhs_isac_ros.model.impairments import nuisance_of
+from rhs_isac_ros.model.measurement import Surface
+from rhs_isac_ros.model.multipath_estimate import CONDITIONS, FIELDS, MultipathEstimate
+from rhs_isac_ros.model.threads import one_blas_thread
+
+# Share of positions in the region of the local bound, and of residuals that pass their test, with
+# the false alarms of that test.
+COVERAGE = 0.95
+_PASSING = 0.99
+_FALSE_ALARM = 1e-9
+# Inflation that a survey without positions would have, and its weight in positions: a margin for
+# small surveys, in which the quantiles above are uncertain.
+_INFLATION, _INFLATION_WEIGHT = 1.8, 40
+# Smaller surveys, and those that span less of a side of the region, cause a warning.
+MIN_POSITIONS = 20
+_MIN_SPAN = 0.5
+# Range of delay spreads in units of the inverse bandwidth, of angular spreads [deg], of levels
+# [dB] and of prior weights.
+_DELAYS, _ANGLES, _LEVELS, _WEIGHTS = (1e-3, 10.0), (0.5, 300.0), (-80.0, 60.0), (0.5, 1e4)
+# Steps of the search: level [dB] and the logarithms of the others.
+_STEPS = (3.0, 1.0, 0.7, 1.0)
+# Prior probability of a position without direct path, and standard deviation of its level [dB].
+_BLOCKED_PROBABILITY, _BLOCKED_STD_DB = 0.1, 10.0
+# Rounds of alignment of impairments, estimation and search for positions without direct path; and
+# steps of each alignment.
+_ROUNDS, _ALIGNMENT_STEPS = 4, 6
+
+
+class SurveyWarning(UserWarning):
+    """A survey is too small, or covers a part of the region only."""
+
+
+@one_blas_thread
+def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
+           received: np.ndarray, surface: Surface | None = None) -> MultipathEstimate:
+    """Estimate the covariance of the multipath from signals at known positions.
+
+    Parameters
+    ----------
+    scenario
+        The scenario of the signals. Fields of the multipath are starting points only; impairments
+        that the scenario declares are estimated for each position.
+    positions
+        Float64 [N, 3] [m], spread over the region of interest; at least one.
+    received
+        Complex128 [N, N_B, N_SB F], sub-band-major.
+    surface
+        What is known of the surface, as in `MeasurementModel`.
+
+    Returns
+    -------
+    MultipathEstimate
+        The value of the field `multipath` of a scenario:
+        ``dataclasses.replace(scenario, multipath=estimate)``. The expected coverage and other
+        properties are in `MultipathEstimate.about`.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a number is not finite, or there is no position.
+
+    Warns
+    -----
+    SurveyWarning
+        If there are fewer than `MIN_POSITIONS` positions, or they span less than half of a side of
+        the region of interest.
+    """
+    pilots = Pilots(codebook, np.asarray(positions, float), np.asarray(received, complex))
+    n = len(pilots.positions)
+    if not n:
+        raise ValueError('positions: none given, expected at least one')
+    fit = _fitted(dataclasses.replace(scenario, multipath=None), pilots, surface)
+    model, n_sight = MeasurementModel(fit.fields, codebook, surface), int(fit.in_sight.sum())
+    left_out = _left_out(model, pilots.positions[fit.in_sight], fit.residuals[fit.in_sight],
+                         fit.total, fit.weight + n_sight - 1)
+    inflation = _inflation(left_out, int(np.prod(model.shape)))
+    measured, declared = inflation * fit.total / (fit.weight + n_sight), model.covariance()
+    inverse = np.linalg.inv(declared)
+    excess = inverse @ (measured - declared) @ inverse
+    texts = _warnings(scenario, pilots.positions[fit.in_sight])
+    if texts:
+        warnings.warn('; '.join(texts), SurveyWarning, stacklevel=3)
+    inside = int(np.sum(left_out.distances <= inflation * _radius()))
+    about: dict[str, Any] = {
+        'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': fit.weight,
+        'inflation': inflation, 'coverage': [inside / n_sight, *_interval(inside, n_sight)],
+        'warnings': texts, 'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
+    plain = scenario.fields()
+    return MultipathEstimate(
+        **{name: getattr(fit.fields, name) for name in FIELDS},
+        radiation=np.array(model.radiation),
+        excess=(excess + np.conj(np.swapaxes(excess, 1, 2))) / 2,
+        conditions={name: plain[name] for name in CONDITIONS}, about=about)
+
+
+def survey_report(estimate: MultipathEstimate) -> str:
+    """Describe an estimate: fields, weights, and the expected coverage."""
+    about = estimate.about
+    coverage, low, high = (100 * share for share in about['coverage'])
+    return '\n'.join([
+        f'{about["positions"]} positions, {about["blocked"]} more without a direct path, codebook '
+        f'{about["codebook"]}',
+        f'fields: multipath / direct path {estimate.multipath_to_los_db:.1f} dB, delay spread '
+        f'{1e9 * estimate.delay_spread_s:.0f} ns, angular spread '
+        f'{estimate.angular_spread_deg:.1f} deg; they weigh as much as '
+        f'{about["prior_weight"]:.1f} positions',
+        f'inflation of the covariance: {about["inflation"]:.2f}; {coverage:.1f} % '
+        f'[{low:.1f}, {high:.1f}] of the positions left out are in the 95 % region',
+        *(f'warning: {text}' for text in about['warnings'])])
+
+
+class _Fit(NamedTuple):
+    """The most likely fields of a scenario, and what follows from them.
+
+    Attributes
+    ----------
+    fields, weight
+        Scenario with the fields, and weight of the prior in positions.
+    residuals
+        Of all positions, complex128 [N, N_B, R].
+    in_sight
+        Which positions have a direct path, bool [N].
+    total
+        Sum over these positions and of the prior, complex128 [N_B, R, R].
+    """
+
+    fields: Scenario
+    weight: float
+    residuals: np.ndarray
+    in_sight: np.ndarray
+    total: np.ndarray
+
+
+def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
+    """Fit fields, impairments and positions without direct path in turn."""
+    has_nuisance, in_sight = len(nuisance_of(fields)) > 0, np.ones(len(pilots.positions), bool)
+    for _ in range(_ROUNDS):
+        model = MeasurementModel(fields, pilots.beams, surface)
+        residuals, n = _residuals(model, pilots), int(in_sight.sum())
+        sample = np.einsum('nir,nis->irs', residuals[in_sight], residuals[in_sight].conj())
+        fields, weight = _most_likely(fields, model, sample / n, n)
+        model = MeasurementModel(fields, pilots.beams, surface)
+        fit = _Fit(fields, weight, residuals, in_sight, weight * model.covariance() + sample)
+        in_sight = _in_sight(
+            model, pilots.positions, residuals, in_sight, fit.total, weight + n)
+        if (in_sight == fit.in_sight).all() and not has_nuisance:
+            break
+    return fit
+
+
+def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
+    """Signals without the most likely factors of impairments, less their mean [N, N_B, R]."""
+    nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
+    patterns, n = nuisance.scaled_patterns, len(mean)
+    values = np.zeros((n, len(nuisance)))
+    outputs = np.sum(np.conj(model.whiten(mean)) * model.whiten(pilots.received), axis=2)
+    set_phases(values, outputs, nuisance.phases)
+    for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
+        signals = pilots.received * np.exp(-np.tensordot(values, patterns, axes=1))
+        sources = np.where(
+            nuisance.moves_multipath[:, None, None], signals[:, None], mean[:, None])
+        slopes = model.whiten(patterns * sources).reshape(n, len(nuisance), -1)
+        white = model.whiten(signals - mean).reshape(n, -1, 1)
+        gradient = 2 * np.matmul(slopes.conj(), white)[..., 0].real - values
+        curvature = 2 * np.matmul(slopes.conj(), np.swapaxes(slopes, 1, 2)).real
+        values += np.linalg.solve(
+            curvature + np.eye(len(nuisance)), gradient[..., None])[..., 0]
+    residuals: np.ndarray = (
+        pilots.received * np.exp(-np.tensordot(values, patterns, axes=1)) - mean)
+    return residuals
+
+
+def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray, n: int
+                 ) -> tuple[Scenario, float]:
+    """Return the scenario with the fields, and the prior weight, of the highest evidence."""
+    from scipy.optimize import minimize
+
+    bandwidth_hz = scenario.n_subbands * scenario.subband_width_hz
+    low, high = np.array([
+        _LEVELS, np.log(_DELAYS) - np.log(bandwidth_hz), np.log(_ANGLES), np.log(_WEIGHTS)]).T
+
+    def declaring(point: np.ndarray) -> Scenario:
+        level, delay, angle = np.clip(point, low, high)[:3].tolist()
+        return dataclasses.replace(
+            scenario, **dict(zip(FIELDS, (level, np.exp(delay), np.exp(angle)), strict=True)))
+
+    def cost(point: np.ndarray) -> float:
+        covariance = MeasurementModel(
+            declaring(point), model.beams, model.surface).covariance()
+        return -_log_evidence(covariance, sample, n, float(np.exp(np.clip(point, low, high)[3])))
+
+    # The level follows from the power, at least if the noise is weak.
+    power = np.trace(sample, axis1=1, axis2=2).real.sum()
+    power /= np.trace(model.covariance(), axis1=1, axis2=2).real.sum()
+    level = scenario.multipath_to_los_db + 10 * np.log10(max(power, 1e-12))
+    starts = [np.clip([level, np.log(delay), np.log(angle), np.log(len(sample[0]))], low, high)
+              for delay, angle in itertools.product(
+                  (max(scenario.delay_spread_s, 1e-12), 0.05 / bandwidth_hz),
+                  (scenario.angular_spread_deg, 30.0))]
+    start = min(starts, key=cost)
+    steps = np.where(start + _STEPS < high, _STEPS, -np.array(_STEPS))
+    found = minimize(cost, start, method='Nelder-Mead', options={
+        'initial_simplex': np.vstack([start, start + np.diag(steps)]),
+        'xatol': 0.02, 'fatol': 0.05, 'maxiter': 400})
+    return declaring(found.x), float(np.exp(np.clip(found.x, low, high)[3]))
+
+
+def _log_evidence(declared: np.ndarray, sample: np.ndarray, n: int, weight: float) -> float:
+    """Logarithm of the evidence of N residuals, up to a constant.
+
+    The covariances of the bands are inverse Wishart variables of the mean `declared`, complex128
+    [N_B, R, R], and with ``weight + R`` degrees of freedom.
+    """
+    from scipy.special import gammaln
+
+    n_bands, size = declared.shape[:2]
+    degrees = weight + size
+    volume = np.sum(gammaln(degrees + n - np.arange(size)) - gammaln(degrees - np.arange(size)))
+    before = np.linalg.slogdet(weight * declared)[1].sum()
+    after = np.linalg.slogdet(weight * declared + n * sample)[1].sum()
+    return float(n_bands * volume + degrees * before - (degrees + n) * after)
+
+
+class _LeftOut(NamedTuple):
+    """What each position yields under the covariance of all others.
+
+    Attributes
+    ----------
+    distances
+        Squared Mahalanobis distance of the local position error, float64 [N].
+    energies
+        Energy of the whitened residual, float64 [N].
+    """
+
+    distances: np.ndarray
+    energies: np.ndarray
+
+
+def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
+              total: np.ndarray, n_others: float) -> _LeftOut:
+    """Evaluate every position under the covariance ``(total - e e^H) / n_others`` of the others.
+
+    `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. The errors are
+    those of a scoring step from the true position, with unknown nuisance parameters.
+    """
+    whitener = np.linalg.inv(np.linalg.cholesky(total))
+    nuisance = nuisance_of(model.scenario).scaled_patterns
+    slopes = np.concatenate(
+        [model.jacobian(positions), nuisance * model.mean(positions)[:, None]], axis=1)
+    white = np.einsum('irs,nis->nir', whitener, residuals)
+    columns = np.einsum('irs,nais->nair', whitener, slopes)
+    # The inverse of total - e e^H is a change of rank one; the share of e in total is below 1.
+    own = 1 / (1 - np.sum(np.abs(white)**2, axis=2))
+    products = np.einsum('nair,nir->nai', columns.conj(), white)
+    information = np.einsum('nair,nbir->nab', columns.conj(), columns) + np.einsum(
+        'nai,nbi,ni->nab', products, products.conj(), own)
+    information = 2 * n_others * information.real + np.diag(np.concatenate(
+        [12 / np.array(model.scenario.roi_size_m)**2, np.ones(len(nuisance))]))
+    gradient = 2 * n_others * np.einsum('nai,ni->na', products[:, :3], own).real
+    covariance = np.linalg.inv(information)[:, :3, :3]
+    return _LeftOut(np.einsum('na,nab,nb->n', gradient, covariance, gradient),
+                    n_others * np.sum(own - 1, axis=1))
+
+
+def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndarray,
+              in_sight: np.ndarray, total: np.ndarray, weight: float) -> np.ndarray:
+    """Return which positions probably have a direct path, given the others, bool [N].
+
+    Without it, signals are multipath of an unknown level. `total` is the sum over the positions
+    that are `in_sight` and of the prior, of this weight, complex128 [N_B, R, R].
+    """
+    whitener = np.linalg.inv(np.linalg.cholesky(total))
+    with_path = np.einsum('irs,nis->nir', whitener, residuals)
+    without = with_path + np.einsum('irs,nis->nir', whitener, model.mean(positions))
+    # A position does not explain itself: its term in the total is a change of rank one.
+    share, counts = np.sum(np.abs(with_path)**2, axis=2), in_sight[:, None]
+    cross = np.abs(np.sum(with_path.conj() * without, axis=2))**2
+    others = weight - in_sight
+    energy = others * np.sum(share / (1 - share * counts), axis=1)
+    energy_without = others * np.sum(
+        np.sum(np.abs(without)**2, axis=2) + counts * cross / (1 - share * counts), axis=1)
+    level = np.log(10) / 10 * _BLOCKED_STD_DB * np.linspace(-3, 3, 61)
+    prior = np.exp(-np.linspace(-3, 3, 61)**2 / 2)
+    exponents = -energy_without[:, None] * np.exp(-level) - np.prod(model.shape) * level
+    highest = exponents.max(axis=1)
+    blocked = highest + np.log(np.exp(exponents - highest[:, None]) @ (prior / prior.sum()))
+    log_odds = np.log(1 / _BLOCKED_PROBABILITY - 1) - energy - blocked
+    result: np.ndarray = log_odds > 0
+    return result if result.any() else np.ones(len(result), bool)
+
+
+def _inflation(left_out: _LeftOut, n_measurements: int) -> float:
+    """Return t, with the margin for small surveys."""
+    from scipy.special import gammainccinv
+
+    n = len(left_out.energies)
+    most = max(1.0, float(left_out.energies.mean()) / n_measurements,
+               float(np.quantile(left_out.distances, COVERAGE)) / _radius(),
+               float(np.quantile(left_out.energies, _PASSING)
+                     / gammainccinv(n_measurements, _FALSE_ALARM)))
+    weights = np.array([n, _INFLATION_WEIGHT])
+    return float(np.exp(weights @ np.log([most, _INFLATION]) / weights.sum()))
+
+
+def _radius() -> float:
+    """Squared Mahalanobis radius of the region of the probability `COVERAGE`."""
+    from scipy.special import chdtri
+
+    return float(chdtri(3, 1 - COVERAGE))
+
+
+def _interval(successes: int, n: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    square = 1.959964**2 / n
+    share = successes / n
+    centre, reach = share + square / 2, np.sqrt(share * (1 - share) * square + square**2 / 4)
+    return float((centre - reach) / (1 + square)), float((centre + reach) / (1 + square))
+
+
+def _warnings(scenario: Scenario, positions: np.ndarray) -> list[str]:
+    """Return why the estimate may not hold in the whole region."""
+    texts = []
+    if len(positions) < MIN_POSITIONS:
+        texts.append(f'positions: {len(positions)}, expected at least {MIN_POSITIONS} for a '
+                     'covariance of this hall rather than of its most similar declaration')
+    spans = np.ptp(positions, axis=0)
+    for axis, span, side in zip('xyz', spans.tolist(), scenario.roi_size_m, strict=True):
+        if span < _MIN_SPAN * side:
+            texts.append(f'positions: a span of {span:.2g} m along {axis}, expected at least half '
+                         f'of the {side:g} m of the region of interest')
+    return texts
