@@ -7,7 +7,7 @@ descends through three levels: the outputs of the matched filters at every templ
 sub-band; their sum at range cells, within which delays and amplitudes hardly change; and range
 steps that resolve the carriers, along which one output per band rotates.
 
-All lengths of the grid follow from the scenario; see `Resolution`.
+All lengths of the grid follow from the scenario; see `lattice`.
 """
 
 from collections.abc import Mapping
@@ -19,23 +19,25 @@ from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.threads import map_blocks
 from rhs_isac_ros.positioning.coordinates import (
-    PHASE_ERROR,
-    Resolution,
     carrier_wavenumbers,
     is_inside,
     likelihood_loss,
     offset_to_roi,
-    subband_wavenumbers,
     to_positions,
 )
-from rhs_isac_ros.positioning.likelihood import Expansion, NuisancePrior
+from rhs_isac_ros.positioning.expansion import Expansion
+from rhs_isac_ros.positioning.lattice import (
+    PHASE_ERROR,
+    Resolution,
+    lay_grid,
+    subband_wavenumbers,
+)
+from rhs_isac_ros.positioning.likelihood import NuisancePrior
 
 # Number of points that represent a standard Gaussian.
 _N_NORMAL = 128
 # Number of templates to compute at a time.
 _BLOCK = 128
-# Largest sine of the angle from boresight on the grid: directions have no derivative at the rim.
-_MAX_SINE = 0.995
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
 STEPS_PER_WAVELENGTH = 8
 # Number of outputs to compute at a time, which limits the number of phases.
@@ -53,92 +55,6 @@ _TABLE_ERROR = 0.015
 # Error of the likelihood that a step with the slopes predicts, relative to the loss that it makes
 # up for.
 _STEP_ERROR = 0.5
-
-
-class Grid(NamedTuple):
-    """Templates and range cells that cover ranges and directions.
-
-    Attributes
-    ----------
-    nodes
-        Points (r [m], u, v) of the templates, float64 [G, 3].
-    ranges_m, widths_m
-        Centres and widths of the range cells, float64 [R].
-    node, cell
-        Template and range cell of each pair that belongs to the grid, int [C].
-    segments
-        Successive templates, range cells and pairs of one range of templates: a segment's pairs
-        are some of all pairs of its range cells and templates.
-    """
-
-    nodes: np.ndarray
-    ranges_m: np.ndarray
-    widths_m: np.ndarray
-    node: np.ndarray
-    cell: np.ndarray
-    segments: list[tuple[slice, slice, slice]]
-
-    @property
-    def points(self) -> np.ndarray:
-        """Centres of all pairs, (r [m], u, v), float64 [C, 3]."""
-        points: np.ndarray = self.nodes[self.node]
-        points[:, 0] = self.ranges_m[self.cell]
-        return points
-
-
-def lay_grid(scenario: Scenario) -> Grid:
-    """Cover the region of interest with a grid."""
-    resolution = Resolution.of(scenario)
-    # Modes slightly outside of the region extend into it.
-    beyond_m = resolution.wavelength_m / 2
-    edges = [max(resolution.nearest_m - beyond_m, resolution.nearest_m / 2)]
-    while edges[-1] < resolution.farthest_m + beyond_m:
-        edges.append(edges[-1] + resolution.cell_width_m(edges[-1]))
-    edges_m = np.array(edges)
-    ranges_m, widths_m = (edges_m[1:] + edges_m[:-1]) / 2, np.diff(edges_m)
-    steps = 2 * PHASE_ERROR * resolution.direction
-    low, high = scenario.roi_bounds_m
-    lines = []
-    for axis in range(2):
-        limit = resolution.directions[axis]
-        lines.append(np.arange(np.floor(limit[0] / steps[axis]),
-                               np.ceil(limit[1] / steps[axis]) + 1) * steps[axis])
-    directions = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
-    # Directions slightly beyond the rim of the half space are moved onto it.
-    excess = np.maximum(np.hypot(*directions.T) / _MAX_SINE, 1.0)
-    directions = (directions / excess[:, None])[excess < 1 + 2 * steps.max()]
-    halves = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing='ij'), axis=-1).reshape(-1, 3)
-    nodes, node, cell, segments, n_nodes, n_pairs = [], [], [], [], 0, 0
-    for first, last in _shared_ranges(edges_m, 2 * PHASE_ERROR / resolution.curvature_m):
-        inside = []
-        for index in range(first, last):
-            centres = np.insert(directions, 0, ranges_m[index], axis=1)
-            # A cell belongs to the grid if the bounding box of its vertices meets the region.
-            vertices = to_positions(
-                centres[:, None] + halves * np.array([widths_m[index], *steps]))
-            inside.append(((vertices.max(axis=1) >= low) & (vertices.min(axis=1) <= high)
-                           ).all(axis=1))
-        used = np.flatnonzero(np.any(inside, axis=0))
-        range_m = 2 / (1 / edges_m[first] + 1 / edges_m[last])
-        nodes.append(np.insert(directions[used], 0, range_m, axis=1))
-        which, direction = np.nonzero(np.array(inside)[:, used])
-        node.append(direction + n_nodes)
-        cell.append(which + first)
-        segments.append((slice(n_nodes, n_nodes + len(used)), slice(first, last),
-                         slice(n_pairs, n_pairs + len(which))))
-        n_nodes, n_pairs = n_nodes + len(used), n_pairs + len(which)
-    return Grid(np.concatenate(nodes), ranges_m, widths_m, np.concatenate(node),
-                np.concatenate(cell), segments)
-
-
-def _shared_ranges(edges_m: np.ndarray, inverse_step: float) -> list[tuple[int, int]]:
-    """Group successive cells whose inverse ranges differ by at most a step."""
-    groups, first = [], 0
-    for last in range(1, len(edges_m)):
-        if last + 1 == len(edges_m) or 1 / edges_m[first] - 1 / edges_m[last + 1] > inverse_step:
-            groups.append((first, last))
-            first = last
-    return groups
 
 
 def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:

@@ -16,11 +16,8 @@ import numpy as np
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.positioning.coordinates import (
-    Resolution,
-    carrier_wavenumbers,
-    to_positions,
-)
+from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, to_positions
+from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
 
 # Relative to the nearest range of the region: distance from it up to which a user may be located

@@ -4,6 +4,7 @@ The surface restricts the weights of the elements: a configuration scales the wa
 and all feeds share it. Here, every output of a receiver has weights of its own.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -17,7 +18,9 @@ from rhs_isac_ros.model.multipath import (
     measurement_correlation,
     multipath_covariance,
 )
+from rhs_isac_ros.positioning.expansion import Means
 from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
+from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
 from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
 from rhs_isac_ros.positioning.search import find_modes
@@ -47,7 +50,10 @@ class ArrayReceiver:
 
     def __init__(self, scenario: Scenario, weights: np.ndarray, frames: np.ndarray,
                  averaged: int = 1) -> None:
-        self.scenario = scenario
+        # The outputs combine the sub-bands, so that the search sees one with the same width.
+        self._scenario, self.scenario = scenario, dataclasses.replace(
+            scenario, n_subbands=1,
+            subband_width_hz=scenario.n_subbands * scenario.subband_width_hz)
         n_elements, n_rows = scenario.n_elements, scenario.n_subbands * len(frames)
         weights = np.broadcast_to(weights, (
             scenario.n_bands, scenario.n_subbands, len(frames), n_elements))
@@ -71,6 +77,8 @@ class ArrayReceiver:
         self._responses = [response @ basis[:rank].conj().T for response, (_, basis) in zip(
             self._responses, bases, strict=True)]
         self.shape = len(whiteners), min(rank, *(len(basis) for _, basis in bases))
+        # The signals are white.
+        self.whitener = np.tile(np.eye(self.shape[1]), (len(whiteners), 1, 1))
 
     @staticmethod
     def _response(scenario: Scenario, whitener: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -79,7 +87,7 @@ class ArrayReceiver:
 
     def _gains(self, function: Callable[[Scenario, np.ndarray, int], np.ndarray],
                positions: np.ndarray, band: int) -> np.ndarray:
-        gains = function(self.scenario, positions, band)
+        gains = function(self._scenario, positions, band)
         return gains.reshape(*gains.shape[:-2], -1)
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
@@ -129,6 +137,7 @@ class ArrayLikelihood(Likelihood):
                       scenario.n_feeds)))
         # The prior of no parameters is the same for all beams.
         self.nuisance = NuisancePrior(MeasurementModel(scenario, dark))
+        self.resolution, self._means = Resolution.of(scenario), Means(receiver)
 
 
 def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray:

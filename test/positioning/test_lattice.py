@@ -1,0 +1,61 @@
+"""The lattice of directions and ranges, at every wavelength, aperture, bandwidth and region."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.positioning.coordinates import to_polar
+from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution, lay_grid
+
+REGIONS = {
+    'small': {'roi_center_m': (5, 1, 0.5), 'roi_size_m': (4, 4, 2)},
+    'Table I': {},
+    # At wide angles, a step in direction spans a large depth.
+    'wide': {'roi_center_m': (3, 0, 0), 'roi_size_m': (5, 14, 6)},
+    # Ranges from almost zero.
+    'near': {'roi_center_m': (1, 0, 0), 'roi_size_m': (1.9, 2, 2)},
+    'millimetre waves': {'center_frequencies_hz': (28e9,), 'elements_per_side': 16},
+}
+
+
+@pytest.mark.parametrize('changes', REGIONS.values(), ids=REGIONS)
+def test_grid_covers_the_region(changes):
+    """Nearly every position is within half a step of a grid point in range and direction."""
+    scenario = Scenario(**{'n_subbands': 1, 'n_frames': 2, 'elements_per_side': 4} | changes)
+    grid, resolution = lay_grid(scenario), Resolution.of(scenario)
+    steps = np.array([1.0, *2 * PHASE_ERROR * resolution.direction])
+
+    def scaled(points):
+        """Points whose range is in units of the relative width of a range cell."""
+        return np.column_stack([np.log(points[:, 0]) / 0.1, points[:, 1:] / steps[1:]])
+
+    targets = to_polar(scenario.sample_positions(4000, np.random.default_rng(1)))
+    targets = targets[targets[:, 0] > 2 * resolution.nearest_m]
+    distance, _ = cKDTree(scaled(grid.points)).query(scaled(targets), p=np.inf)
+    # The grid is irregular at the rim of the half space.
+    assert distance.max() < 0.76
+    assert np.mean(distance < 0.53) > 0.98
+
+
+@pytest.mark.parametrize('changes, factor', [
+    ({'elements_per_side': 20}, 4), ({'center_frequencies_hz': (6e9,)}, 4),
+    ({'roi_size_m': (10, 10, 0.5)}, 0.4)], ids=['aperture', 'wavelength', 'region'])
+def test_the_grid_follows_the_number_of_distinguishable_directions(changes, factor):
+    base = dataclasses.replace(
+        Scenario(), center_frequencies_hz=(3e9,), element_interval_wavelengths=0.5)
+    if 'center_frequencies_hz' in changes:
+        # The same aperture in metres.
+        changes = changes | {'element_interval_wavelengths': 1.0}
+    counts = [len(lay_grid(scenario).nodes) / len(lay_grid(scenario).segments)
+              for scenario in (base, dataclasses.replace(base, **changes))]
+    assert counts[1] / counts[0] == pytest.approx(factor, rel=0.35)
+
+
+def test_range_cells_follow_the_bandwidth():
+    narrow, wide = (Scenario(subband_width_hz=width) for width in (1e5, 25e6))
+    assert lay_grid(narrow).widths_m.min() == pytest.approx(0.1 * 5, rel=0.02)
+    assert lay_grid(wide).widths_m.max() == pytest.approx(
+        2 * PHASE_ERROR * 299_792_458 / (np.pi * 8 * 25e6))
