@@ -27,6 +27,7 @@ setup(
         (f'share/{NAME}/config', sorted(glob('config/*.*'))),
         (f'share/{NAME}/config/rviz', sorted(glob('config/rviz/*.*'))),
         (f'share/{NAME}/config/sros2', sorted(glob('config/sros2/*.*'))),
+        (f'share/{NAME}/config/scenarios', sorted(glob('config/scenarios/*.*'))),
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.*'))),
     ],
     python_requires='>=3.10',

@@ -28,6 +28,7 @@ from rhs_isac_ros.positioning.fit import (
     outside_test,
 )
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, standard_normal
+from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
     Conditional,
@@ -117,8 +118,8 @@ class SearchEstimator(abc.ABC):
         self._outside = Outside(scenario, arrays)
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
         self._test = FitTest(n_measurements, float(arrays['energy'].min()))
-        self._bounds = scenario.roi_bounds_m
-        self._volume_m3 = float(np.prod(scenario.roi_size_m))
+        self._bounds = likelihood.resolution.bounds_m
+        self._volume_m3 = likelihood.resolution.volume_m3
         self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
         self._failures = (FailedElements(likelihood, self._grid)
@@ -352,7 +353,7 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:
         return None
-    samples = draw_samples(modes, estimator.normal, estimator.scenario.roi_bounds_m)
+    samples = draw_samples(modes, estimator.normal, Resolution.of(estimator.scenario).bounds_m)
     weights = np.exp(samples.log_weights - samples.log_weights.max())
     shares = weights.sum(axis=1)
     order = np.argsort(-shares)[:np.count_nonzero(shares)]

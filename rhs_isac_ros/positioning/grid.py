@@ -158,7 +158,7 @@ class TemplateTable:
         half = PHASE_ERROR * self._resolution.direction
         across = np.abs(arrays['curvature'][:, 1:, 1:])
         self._loss = np.einsum('a,cab,b->c', half, across, half) / 2 + _TABLE_ERROR * self._energy
-        self._bounds = scenario.roi_bounds_m
+        self._bounds = self._resolution.bounds_m
         self._wavenumbers = subband_wavenumbers(scenario)
         self._cell_turns = self._turns(grid.ranges_m).astype(np.complex64)
         self._set_windows(scenario)

@@ -34,6 +34,8 @@ _COARSE_CELLS = 0.75
 # Direction cosines per radian of apertures below a few wavelengths: the gains of elements and of
 # the user also change with the direction.
 _MAX_DIRECTION = 0.4
+# Smallest thickness of the region, in wavelengths.
+_MIN_THICKNESS = 0.2
 # Smallest range relative to the farthest one: directions lose their meaning at the surface.
 _MIN_RANGE = 1e-3
 # Information about the position that is added everywhere, relative to that of a uniform prior on
@@ -58,6 +60,9 @@ class Resolution(NamedTuple):
         Extent of the region in range.
     directions
         Extent of the region in u and in v, float64 [2, 2].
+    bounds_m
+        Lower and upper vertex of the region, float64 [2, 3]. A flat region is a fraction of a
+        wavelength thick, so that samples of a posterior can be inside.
     """
 
     wavelength_m: float
@@ -67,6 +72,7 @@ class Resolution(NamedTuple):
     nearest_m: float
     farthest_m: float
     directions: np.ndarray
+    bounds_m: np.ndarray
 
     @classmethod
     @functools.lru_cache(maxsize=16)
@@ -74,7 +80,8 @@ class Resolution(NamedTuple):
         """Derive the lengths from a scenario."""
         elements = element_positions(scenario)
         wavenumber = subband_wavenumbers(scenario).max()
-        low, high = scenario.roi_bounds_m
+        bounds = cls.thick_bounds(scenario)
+        low, high = bounds
         nearest, farthest = np.clip(0.0, low, high), np.maximum(np.abs(low), np.abs(high))
         directions = np.empty((2, 2))
         for axis, other in ((1, 2), (2, 1)):
@@ -88,7 +95,24 @@ class Resolution(NamedTuple):
             1 / np.maximum(wavenumber * np.abs(elements[:, 1:]).max(axis=0), 1 / _MAX_DIRECTION),
             max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
             SPEED_OF_LIGHT_MPS / (np.pi * scenario.n_subbands * scenario.subband_width_hz),
-            max(float(np.linalg.norm(nearest)), _MIN_RANGE * farthest_m), farthest_m, directions)
+            max(float(np.linalg.norm(nearest)), _MIN_RANGE * farthest_m), farthest_m, directions,
+            bounds)
+
+    @staticmethod
+    def thick_bounds(scenario: Scenario) -> np.ndarray:
+        """Return the bounds of the region, at least a fraction of a wavelength apart, [2, 3]."""
+        bounds = scenario.roi_bounds_m
+        thickness_m = _MIN_THICKNESS * SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+        center = np.array(scenario.roi_center_m)
+        thick = np.stack([center - thickness_m / 2, center + thickness_m / 2])
+        result: np.ndarray = np.where(
+            np.array(scenario.roi_size_m) < thickness_m, thick, bounds)
+        return result
+
+    @property
+    def volume_m3(self) -> float:
+        """Volume of the region between the bounds."""
+        return float(np.prod(self.bounds_m[1] - self.bounds_m[0]))
 
     def cell_width_m(self, range_m: float) -> float:
         """Change of a range over which delays and amplitudes hardly change."""
@@ -172,7 +196,7 @@ def lay_grid(scenario: Scenario) -> Grid:
     edges_m = np.array(edges)
     ranges_m, widths_m = (edges_m[1:] + edges_m[:-1]) / 2, np.diff(edges_m)
     steps = 2 * PHASE_ERROR * resolution.direction
-    low, high = scenario.roi_bounds_m
+    low, high = resolution.bounds_m
     lines = []
     for axis in range(2):
         limit = resolution.directions[axis]

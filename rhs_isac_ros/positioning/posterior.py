@@ -175,7 +175,7 @@ def draw_broad_samples(
 
     Takes the likelihood of each state of the surface.
     """
-    bounds = likelihood.scenario.roi_bounds_m
+    bounds = likelihood.resolution.bounds_m
     samples = draw_samples(modes, _SPREAD * normal, bounds)
     inside = np.isfinite(samples.log_weights)
     log_weights, positions = np.full(inside.shape, -np.inf), samples.positions.copy()

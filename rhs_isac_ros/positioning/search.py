@@ -177,7 +177,7 @@ def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, sign
     step, values = whole[:, :3], values + whole[:, 3:]
     evidence = local.value + marginal.log_volume
     points = points + step
-    offset = offset_to_roi(points, marginal.information, likelihood.scenario.roi_bounds_m,
+    offset = offset_to_roi(points, marginal.information, likelihood.resolution.bounds_m,
                            likelihood.resolution.tolerance_m)
     gain = rise - likelihood_loss(offset, marginal.information)
     modes = Modes(

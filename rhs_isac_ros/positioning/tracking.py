@@ -15,6 +15,7 @@ from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.coordinates import is_inside, jacobian
 from rhs_isac_ros.positioning.estimate import Estimate
 from rhs_isac_ros.positioning.estimators import SearchEstimator
+from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
 from rhs_isac_ros.positioning.motion import Mixture, Motion, concatenate, reduce
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes
@@ -143,7 +144,7 @@ class Tracker:
         covariances = np.linalg.inv(modes.curvature) / share
         log_mass = (np.log(np.linalg.det(jacobian(modes.roi_points))) + 1.5 * np.log(2 * np.pi)
                     + np.linalg.slogdet(covariances)[1] / 2)
-        volume_m3 = float(np.prod(self.estimator.scenario.roi_size_m))
+        volume_m3 = Resolution.of(self.estimator.scenario).volume_m3
         return self._motion.start(
             modes.roi_points, covariances,
             share * modes.roi_log_likelihood + log_mass - np.log(volume_m3))
@@ -161,14 +162,15 @@ class Tracker:
         heavy = mixture.log_weights >= _MIN_LOG_WEIGHT
         mixture, light = mixture.select(heavy), mixture.select(~heavy)
         positions = mixture.positions(self.estimator.normal)
-        inside = is_inside(positions, self.estimator.scenario.roi_bounds_m)
+        bounds_m = Resolution.of(self.estimator.scenario).bounds_m
+        inside = is_inside(positions, bounds_m)
         reaches = inside.mean(axis=1) >= _MIN_INSIDE
         if reaches.any():
             mixture, positions = mixture.select(reaches), positions[reaches]
             inside = inside[reaches]
         else:
             inside[...] = True
-            positions = np.clip(positions, *self.estimator.scenario.roi_bounds_m)
+            positions = np.clip(positions, *bounds_m)
         weights = np.exp(mixture.log_weights)[:, None] * inside
         flat, points = (weights / weights.sum()).ravel(), positions.reshape(-1, 3)
         mean = flat @ points

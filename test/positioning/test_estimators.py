@@ -199,6 +199,20 @@ def test_declared_impairments_leave_consistent_estimates(codebook, changes):
     assert 75 < np.median(estimate.residual) < 110
 
 
+def test_a_flat_region_leaves_two_unknown_coordinates(codebook):
+    scenario = dataclasses.replace(SINGLE_MODE, roi_size_m=(2, 2, 0))
+    rng = np.random.default_rng(3)
+    positions = scenario.sample_positions(40, rng)
+    received = MeasurementModel(scenario, codebook).sample(positions, rng)
+    estimate = make_estimator('bayes', scenario, codebook, reject_outside=True).estimate(received)
+    assert estimate.fix.all()
+    # A region without height is treated as a fraction of a wavelength high.
+    assert np.abs(estimate.mean[:, 2]).max() < 0.02
+    errors = (estimate.mean - positions)[:, :2]
+    normalised = squared_normalised(errors, estimate.covariance[:, :2, :2])
+    assert np.mean(normalised <= 5.991) >= 0.85
+
+
 @pytest.mark.parametrize('std', [1e-300, 1e-12])
 def test_negligible_impairments_change_no_estimate(codebook, std):
     scenario = dataclasses.replace(
