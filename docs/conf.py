@@ -43,6 +43,5 @@ nitpick_ignore_regex = [
     ('py:.*', r'(?!rhs_isac_ros\.).*'),
     ('py:.*', r'rhs_isac_ros\.(.*\.)?_.*'),
     # Type variables.
-    ('py:.*', r'rhs_isac_ros\.(protocol\.newest\.Item|protocol\.newest\.(Key|Value)|'
-             r'protocol\.role\.SettingsT|protocol\.state_machine\.\w+T)'),
+    ('py:.*', r'rhs_isac_ros\.protocol\.(role\.(Item|Key|Value|\w+T)|settings\.SettingsT)'),
 ]

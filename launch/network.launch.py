@@ -34,6 +34,7 @@ ARGUMENTS = {
     'estimator': ('bayes', 'Position estimator.'),
     'params_file': ('', 'ROS parameter file for all nodes, which takes precedence over the other '
                         'arguments; empty: none.'),
+    'use_sim_time': ('false', 'Whether the world moves with the topic /clock.'),
     'visualizer': ('false', 'Whether to publish markers for RViz and Foxglove.'),
     'rviz': ('false', 'Whether to start the visualizer and RViz.'),
     'record': ('', 'Recording to write (MCAP file); empty: none.'),
@@ -44,7 +45,8 @@ ARGUMENTS = {
     'composed': ('false', 'Whether to run all nodes but the visualizer in one process.'),
 }
 CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']} | {
-    name: ['true', 'false'] for name in ('visualizer', 'rviz', 'respawn', 'composed')}
+    name: ['true', 'false']
+    for name in ('use_sim_time', 'visualizer', 'rviz', 'respawn', 'composed')}
 RESPAWN_DELAY_S = 1.0
 # Exit code for invalid parameters, arguments or files: a restart would fail again.
 INVALID = 2
@@ -114,7 +116,8 @@ def _node(given: dict[str, str], executable: str, name: str | None, **values: in
     file = [ParameterFile(given['params_file'])] if given['params_file'] else []
     # JSON quotes a string so that YAML does not read it as another type.
     pairs = [f'{key}:={json.dumps(value, ensure_ascii=False)}'
-             for key, value in {**values, 'scenario_file': given['config']}.items()]
+             for key, value in {**values, 'scenario_file': given['config'],
+        'use_sim_time': given['use_sim_time'] == 'true'}.items()]
     return _process(
         given, name or executable, given['respawn'] == 'true',
         [word for pair in pairs for word in ('-p', pair)],
@@ -141,7 +144,7 @@ def _process(
         package=PACKAGE, exec_name=exec_name, output='screen', prefix=END_WITH_LAUNCH,
         namespace=given['namespace'], respawn=respawn, respawn_delay=RESPAWN_DELAY_S,
         ros_arguments=['--log-level', given['log_level'], *ros_arguments],
-        on_exit=functools.partial(_end_if_failed, respawn or is_optional), **options)
+        on_exit=functools.partial(_end_if_failed, respawn, is_optional), **options)
 
 
 def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
@@ -158,7 +161,8 @@ def _rviz(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
         namespace=given['namespace'], prefix=END_WITH_LAUNCH, arguments=['-d', file])]
 
 
-def _end_if_failed(may_fail: bool, event: ProcessExited, context: LaunchContext) -> None:
+def _end_if_failed(
+        respawns: bool, is_optional: bool, event: ProcessExited, context: LaunchContext) -> None:
     """End the launch, with exit code 1, if a process failed that may not, or is invalid.
 
     Raises
@@ -166,6 +170,6 @@ def _end_if_failed(may_fail: bool, event: ProcessExited, context: LaunchContext)
     RuntimeError
         ``launch`` logs it and ends; its action ``Shutdown`` would result in exit code 0.
     """
-    is_tolerated = may_fail and event.returncode != INVALID
+    is_tolerated = is_optional or respawns and event.returncode != INVALID
     if event.returncode and not is_tolerated and not context.is_shutdown:
         raise RuntimeError(f'{event.process_name} ended with exit code {event.returncode}')

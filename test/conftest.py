@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, plugins
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import plugins
 
 # Fixtures that several folders share. Those of processes need ROS, which the pure layers do not.
 pytest_plugins = ['in_memory_network']
@@ -26,7 +27,7 @@ LIBRARIES = ('numpy', 'scipy', 'scikit-learn', 'matplotlib', 'pyyaml', 'joblib',
 # The profile quick uses the same examples in every run; thorough uses many more, which differ from
 # run to run.
 hypothesis.settings.register_profile(
-    'quick', max_examples=150, derandomize=True, database=None, deadline=None)
+    'quick', max_examples=75, derandomize=True, database=None, deadline=None)
 hypothesis.settings.register_profile(
     'thorough', max_examples=5000, database=None, deadline=None, print_blob=True,
     suppress_health_check=[hypothesis.HealthCheck.too_slow])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import random_codebook
-from rhs_isac_ros.model import Scenario, mobility, streams
+from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.receive import receive_feeds, received_signal
@@ -34,12 +34,12 @@ from rhs_isac_ros.protocol.events import (
     SettingsOffered,
     Timeout,
 )
-from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.rhs_controller import RhsController
-from rhs_isac_ros.protocol.settings import BaseStationSettings, PositionerSettings
+from rhs_isac_ros.protocol.settings import BaseStationSettings, Impairments, PositionerSettings
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.support import streams
 
 ROLES = {name: member.role for name, member in ROSTER.items() if member.role}
 SUBSCRIPTIONS = {name: role.RECEIVES for name, role in ROLES.items()}

@@ -112,6 +112,8 @@ PROCESSES = [
     (['run', '../setup'], 'no executable named ../setup'),
     (['reproduce', 'fig5'], 'no experiment named fig5'),
     (['benchmark', ''], 'no benchmark named'),
+    (['benchmark', 'channels', '--blocked', '2'],
+     "argument --blocked: '2', expected a number from 0 to 1"),
 ]
 
 

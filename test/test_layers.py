@@ -11,7 +11,7 @@ import pytest
 import rhs_isac_ros
 
 LAYERS = (
-    'model', 'calibration', 'bounds', 'codebook', 'positioning', 'link', 'experiments',
+    'support', 'model', 'calibration', 'bounds', 'codebook', 'positioning', 'link', 'experiments',
     'protocol', 'monitoring', 'ros', 'nodes', 'tools')
 ROS_LAYERS = ('ros', 'nodes', 'tools')
 PURE_LAYERS = tuple(layer for layer in LAYERS if layer not in ROS_LAYERS)

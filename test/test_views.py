@@ -29,6 +29,7 @@ def published():
     found = recorded_topics() | {topics.MARKERS: (MarkerArray, qos.EXCHANGE)}
     for name in (topics.PATH, topics.TRUE_PATH):
         found |= {name.format(user=user): (PathMessage, qos.EXCHANGE) for user in range(1, 5)}
+    found = {name.lstrip('/'): entry for name, entry in found.items()}
     return lambda name: (found[name][0], type_name(found[name][0]), found[name][1])
 
 
@@ -77,10 +78,10 @@ def test_rviz_lists_the_namespaces_of_all_markers(rviz, small):
         markers.beam(beam_pattern(scenario, steer(scenario, position), 10.0), 1, stamp)]
     (display,) = [one for one in rviz['Displays'] if one['Class'].endswith('/MarkerArray')]
     assert set(display['Namespaces']) == {marker.ns for marker in scene}
-    # The list of the scene is complete: no other function of the module returns a marker.
+    # The list of the scene is complete: no other function of the module makes a marker.
     makers = {name for name, function in vars(markers).items() if not name.startswith('_')
               and getattr(function, '__annotations__', {}).get('return') is markers.Marker}
-    assert makers == {'board', 'region', 'truth', 'estimate', 'beam', 'deletion'}
+    assert makers == {'board', 'region', 'truth', 'estimate', 'beam', 'deletion', 'place'}
 
 
 def names_in(layout):

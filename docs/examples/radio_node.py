@@ -6,8 +6,7 @@ import sys
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Send
-from rhs_isac_ros.protocol.newest import NewestDict
-from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.role import NewestDict, PlainRole
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 

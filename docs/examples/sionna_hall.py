@@ -18,8 +18,8 @@ import numpy as np
 from rhs_isac_ros.calibration import survey, survey_report
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import PathChannel, Scenario, simulate_received
-from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.support.optional import optional_import
 
 CONFIG = Path(__file__).parents[2] / 'config'
 F0_HZ = 2.75e9

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rhs_isac_ros.protocol.state_machine import (
+from rhs_isac_ros.protocol.role import (
     ANY,
     SAME,
     StateMachine,

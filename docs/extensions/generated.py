@@ -18,9 +18,9 @@ from docutils.statemachine import StringList
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 
-from rhs_isac_ros.experiments.measures import MEASURES
+from rhs_isac_ros.experiments.sweep_settings import MEASURES
 from rhs_isac_ros.model.scenario import Extensions, Table1
-from rhs_isac_ros.protocol.outcomes import Kind, Outcome
+from rhs_isac_ros.protocol.events import Kind, Outcome
 from rhs_isac_ros.ros import parameters
 
 ROOT = Path(__file__).parents[2]

@@ -36,7 +36,7 @@ from rhs_isac_ros.model.multipath import (
 )
 from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses
 # [n] and their negative derivatives with respect to the forms, float64 [n, G, G].
@@ -75,8 +75,7 @@ class Combination(NamedTuple):
 
     def forward(self, band: int, whitened: np.ndarray) -> np.ndarray:
         """Return the rows, complex128 [n, G, R], from those of the source, [n, S, R]."""
-        rows: np.ndarray = whitened[:, self.sources] * self.scale[band, :, None]
-        return rows
+        return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
         """Return derivatives with respect to the source's rows, [n, S, R], from [n, G, R]."""
@@ -271,8 +270,7 @@ def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
 
 def _sum_of_forms(whitened: list[np.ndarray]) -> np.ndarray:
     """Sum of the bands' quadratic forms [n, G, G]."""
-    total: np.ndarray = np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
-    return total
+    return np.sum([quadratic_form(means) for means in whitened], axis=0, dtype=float)
 
 
 def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
@@ -349,8 +347,7 @@ def gradient_analog(
     """
     weights = np.matmul(codebook.digital, onboard_matrix(scenario))
     by_radiation = by_radiation.reshape(weights.shape)
-    gradient: np.ndarray = np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
-    return gradient
+    return np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
 
 
 def gradient_digital(
@@ -360,5 +357,4 @@ def gradient_digital(
     n_bands, n_subbands, _, n_elements = onboard.shape
     by_radiation = by_radiation.reshape(n_bands, n_subbands, -1, n_elements)
     weighted = by_radiation * codebook.analog[:, None]
-    gradient: np.ndarray = np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))
-    return gradient
+    return np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))

@@ -9,7 +9,7 @@ from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import position_blocks
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
-from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
+from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # A normalised matrix with a smaller pivot is singular up to rounding.
 _MIN_PIVOT = 1e-14
@@ -48,8 +48,7 @@ def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
     information = position_information_of(model, positions)
     if region_prior:
         information = information + region_information(model.scenario)
-    bound: np.ndarray = np.trace(inverse_information(information), axis1=1, axis2=2)
-    return bound
+    return np.trace(inverse_information(information), axis1=1, axis2=2)
 
 
 def position_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
@@ -176,5 +175,4 @@ def quadratic_form(whitened: np.ndarray) -> np.ndarray:
         form = np.einsum('nar,nar->na', parts, parts)[..., None]
     else:
         form = np.matmul(parts, np.swapaxes(parts, 1, 2))
-    doubled: np.ndarray = 2 * form
-    return doubled
+    return 2 * form

@@ -24,7 +24,7 @@ from rhs_isac_ros.bounds.fisher import fisher_information_of
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Lattice steps of (r, u, v), in standard deviations of one coordinate with the others known, and
 # the smallest number of steps across the region. With Table I, steps half as large across the
@@ -223,8 +223,7 @@ def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.nd
     gaps = points - nodes[:, None]
     gaps[gaps == 0] = np.finfo(float).tiny
     terms = ((-1.0)**np.arange(len(nodes)) * np.sin(angles))[:, None] / gaps
-    weights: np.ndarray = terms / terms.sum(axis=0)
-    return weights
+    return terms / terms.sum(axis=0)
 
 
 def _polar_box(scenario: Scenario) -> np.ndarray:

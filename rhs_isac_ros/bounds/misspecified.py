@@ -20,7 +20,7 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 _MAX_STEPS, _HALVINGS = 60, 12
 # Steps of finite differences, and of a search that has converged [m].
@@ -60,9 +60,8 @@ class Misspecified(NamedTuple):
     @property
     def mse_m2(self) -> np.ndarray:
         """Mean squared error, float64 [N] [m^2]."""
-        result: np.ndarray = (np.sum(self.bias**2, axis=1)
-                              + np.trace(self.covariance, axis1=1, axis2=2))
-        return result
+        return (np.sum(self.bias**2, axis=1)
+                + np.trace(self.covariance, axis1=1, axis2=2))
 
 
 def misspecified(assumed: Scenario, true: Scenario, codebook: Beamforming,
@@ -113,16 +112,14 @@ def misspecified_of(assumed: MeasurementModel, true: MeasurementModel, positions
 
 def _slopes(model: MeasurementModel, places: np.ndarray) -> np.ndarray:
     """Whitened derivative of the mean, complex128 [N, 3, N_B, N_SB F] [1/m]."""
-    slopes: np.ndarray = model.whiten(model.jacobian(places))
-    return slopes
+    return model.whiten(model.jacobian(places))
 
 
 def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Minimise the distance of the whitened mean from a target by damped Gauss-Newton steps."""
     def cost(places: np.ndarray) -> np.ndarray:
         distances = np.abs(target - model.whiten(model.mean(places)))**2
-        total: np.ndarray = np.sum(distances, axis=(1, 2))
-        return total
+        return np.sum(distances, axis=(1, 2))
 
     places: np.ndarray = positions.copy()
     costs = cost(positions)
@@ -156,8 +153,7 @@ def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) 
         second = (_slopes(model, places + step) - _slopes(model, places - step)) / (
             2 * _DIFFERENCE_M)
         bending[:, axis] = 2 * np.einsum('nair,nir->na', second.conj(), residual).real
-    result: np.ndarray = (bending + np.swapaxes(bending, 1, 2)) / 2
-    return result
+    return (bending + np.swapaxes(bending, 1, 2)) / 2
 
 
 def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,

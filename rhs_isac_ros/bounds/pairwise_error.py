@@ -196,8 +196,7 @@ def _rows_of_bands(n_bands: int) -> Combination:
 def _repeated_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
     """Line-of-sight gains [n, N_SB, N_E], computed once for equal positions that are adjacent."""
     is_new = np.concatenate([[True], np.any(np.diff(positions, axis=0) != 0, axis=1)])
-    gains: np.ndarray = los_gain(scenario, positions[is_new], band)[np.cumsum(is_new) - 1]
-    return gains
+    return los_gain(scenario, positions[is_new], band)[np.cumsum(is_new) - 1]
 
 
 def _inclusion_probabilities(shares: np.ndarray, n: int) -> np.ndarray:
@@ -206,5 +205,4 @@ def _inclusion_probabilities(shares: np.ndarray, n: int) -> np.ndarray:
     rest = np.cumsum(descending[::-1])[::-1]
     # The first number of certain items with which no other probability exceeds 1.
     n_certain = np.argmax((n - np.arange(len(shares))) * descending <= rest)
-    probabilities: np.ndarray = np.minimum(shares * ((n - n_certain) / rest[n_certain]), 1.0)
-    return probabilities
+    return np.minimum(shares * ((n - n_certain) / rest[n_certain]), 1.0)

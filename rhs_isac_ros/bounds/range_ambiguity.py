@@ -158,8 +158,7 @@ def _refined(mismatch: np.ndarray, plan: np.ndarray, lag: np.ndarray) -> np.ndar
     """Minima of the parabolas through minima and their neighbours, at least 0 [n]."""
     before, at, after = (mismatch[plan, lag + step] for step in (-1, 0, 1))
     lowest = at - (after - before)**2 / (8 * (before - 2 * at + after))
-    refined: np.ndarray = np.maximum(lowest, 0.0)
-    return refined
+    return np.maximum(lowest, 0.0)
 
 
 def _real(signals: np.ndarray) -> np.ndarray:

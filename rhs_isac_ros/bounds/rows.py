@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model import MeasurementModel, Scenario, streams
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.support import streams
 
 # Callable that takes (block of n items, band) and returns the items' rows, complex128
 # [n, G, N_SB, N_E].

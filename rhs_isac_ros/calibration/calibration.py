@@ -11,8 +11,8 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.calibration.estimate import TOLERANCE, Pilots, estimate_surface, prior_of
 from rhs_isac_ros.calibration.mixture import SurfacePrior
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import ArchiveError, read_archive, write_archive
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 _FORMAT = 1
 # Types of the arrays in a file, and of their standard deviations, which are there for readers.

@@ -30,7 +30,7 @@ from rhs_isac_ros.model.surface_estimate import (
     element_radiation,
     scattered_errors,
 )
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Prior of scenarios that declare no errors or failures.
 DEFAULT_ERROR_RMS = 0.05
@@ -285,9 +285,7 @@ class PilotStatistics:
     def _curvature(self, slopes: np.ndarray) -> np.ndarray:
         n, n_values = slopes.shape[:2]
         flat = np.ascontiguousarray(slopes.reshape(n, n_values, -1)).view(float)
-        curvature: np.ndarray = (
-            2 * np.matmul(flat, np.swapaxes(flat, 1, 2)) + np.eye(n_values))
-        return curvature
+        return 2 * np.matmul(flat, np.swapaxes(flat, 1, 2)) + np.eye(n_values)
 
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
@@ -329,8 +327,7 @@ class _Block:
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Whiten signals [..., N_B, N_SB F]."""
-        whitened: np.ndarray = np.einsum('irs,...is->...ir', self._whiteners, signals)
-        return whitened
+        return np.einsum('irs,...is->...ir', self._whiteners, signals)
 
 
 def _real_matrix(matrix: np.ndarray) -> np.ndarray:

@@ -72,8 +72,7 @@ class Posterior(NamedTuple):
         """Return the covariance E[z z^H] of the errors z, complex128 [P, P]."""
         top, bottom = np.split(self.covariance, 2)
         (rr, ri), (ir, ii) = np.split(top, 2, axis=1), np.split(bottom, 2, axis=1)
-        covariance: np.ndarray = rr + ii + 1j * (ir - ri)
-        return covariance
+        return rr + ii + 1j * (ir - ri)
 
 
 def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> Posterior:

@@ -24,10 +24,11 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.calibration.estimate import Pilots, set_phases
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
+from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.model.multipath_estimate import CONDITIONS, FIELDS, MultipathEstimate
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Share of positions in the region of the local bound, and of residuals that pass their test, with
 # the false alarms of that test.
@@ -45,8 +46,8 @@ _MIN_SPAN = 0.5
 _DELAYS, _ANGLES, _LEVELS, _WEIGHTS = (1e-3, 10.0), (0.5, 300.0), (-80.0, 60.0), (0.5, 1e4)
 # Steps of the search: level [dB] and the logarithms of the others.
 _STEPS = (3.0, 1.0, 0.7, 1.0)
-# Prior probability of a position without direct path, and standard deviation of its level [dB].
-_BLOCKED_PROBABILITY, _BLOCKED_STD_DB = 0.1, 10.0
+# Prior probability of a position without direct path if the scenario has none, and the largest.
+_BLOCKED_PROBABILITY, _MAX_BLOCKED = 0.1, 0.9
 # Rounds of alignment of impairments, estimation and search for positions without direct path; and
 # steps of each alignment.
 _ROUNDS, _ALIGNMENT_STEPS = 4, 6
@@ -191,9 +192,7 @@ def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
         curvature = 2 * np.matmul(slopes.conj(), np.swapaxes(slopes, 1, 2)).real
         values += np.linalg.solve(
             curvature + np.eye(len(nuisance)), gradient[..., None])[..., 0]
-    residuals: np.ndarray = (
-        pilots.received * np.exp(-np.tensordot(values, patterns, axes=1)) - mean)
-    return residuals
+    return pilots.received * np.exp(-np.tensordot(values, patterns, axes=1)) - mean
 
 
 def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray, n: int
@@ -305,12 +304,9 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     energy = others * np.sum(share / (1 - share * counts), axis=1)
     energy_without = others * np.sum(
         np.sum(np.abs(without)**2, axis=2) + counts * cross / (1 - share * counts), axis=1)
-    level = np.log(10) / 10 * _BLOCKED_STD_DB * np.linspace(-3, 3, 61)
-    prior = np.exp(-np.linspace(-3, 3, 61)**2 / 2)
-    exponents = -energy_without[:, None] * np.exp(-level) - np.prod(model.shape) * level
-    highest = exponents.max(axis=1)
-    blocked = highest + np.log(np.exp(exponents - highest[:, None]) @ (prior / prior.sum()))
-    log_odds = np.log(1 / _BLOCKED_PROBABILITY - 1) - energy - blocked
+    blocked = log_evidence_of_level(energy_without, int(np.prod(model.shape)), BLOCKED_STD_DB)
+    prior = min(model.scenario.blocked_probability or _BLOCKED_PROBABILITY, _MAX_BLOCKED)
+    log_odds = np.log(1 / prior - 1) - energy - blocked
     result: np.ndarray = log_odds > 0
     return result if result.any() else np.ones(len(result), bool)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rhs_isac_ros.codebook.command import ERRORS, add_options, check, run
 from rhs_isac_ros.executables import exit_code_of, print_error
-from rhs_isac_ros.model.arguments import ArgumentParser
+from rhs_isac_ros.support.arguments import ArgumentParser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rhs_isac_ros.codebook import provenance_text
+from rhs_isac_ros.codebook.provenance import from_parameter, to_parameter
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import read_yaml, write_whole
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
+from rhs_isac_ros.support.files import read_yaml, write_whole
 
 # The node whose parameters a codebook file holds, in any namespace.
 PARAMETER_NODE = '/**/optimizer'
@@ -121,7 +121,7 @@ class Codebook:
             'codebook.id': self.id,
             'codebook.shape': list(self.shape),
             'codebook.average_crlb': float(self.average_crlb_m2),
-            'codebook.provenance': provenance_text.to_parameter(self.provenance),
+            'codebook.provenance': to_parameter(self.provenance),
             'codebook.analog': self.analog.ravel().tolist(),
             'codebook.digital_re': self.digital.real.ravel().tolist(),
             'codebook.digital_im': self.digital.imag.ravel().tolist(),
@@ -153,7 +153,7 @@ class Codebook:
         codebook = cls(
             _array(parameters, 'analog', (n_bands, n_frames, n_elements)), digital,
             _number(parameters, 'average_crlb'),
-            provenance_text.from_parameter(str(parameters.get('codebook.provenance', ''))))
+            from_parameter(str(parameters.get('codebook.provenance', ''))))
         claimed_id = parameters.get('codebook.id', '')
         if claimed_id and claimed_id != codebook.id:
             raise CodebookError(
@@ -221,3 +221,23 @@ def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.
             f'codebook.{name}: {values.size} values, expected {math.prod(shape)} = '
             f'{" x ".join(map(str, shape))} by codebook.shape')
     return values.reshape(shape)
+
+
+def default_codebook_file() -> Path:
+    """Return the path of the default codebook, ``config/codebook.yaml``.
+
+    Raises
+    ------
+    CodebookError
+        If the package was installed without its data files.
+    """
+    # Every installation scheme puts share/ into a folder above the modules: the prefix of pip and
+    # colcon, or the folder of pip's --target. A clone has config/ beside the package.
+    package = Path(__file__).resolve().parents[1]
+    folders = [package.parent / 'config',
+               *(folder / 'share' / 'rhs_isac_ros' / 'config' for folder in package.parents)]
+    for folder in folders:
+        if (file := folder / 'codebook.yaml').is_file():
+            return file
+    raise CodebookError(f'codebook.yaml: not found in {folders[0]}, nor in '
+                        f'share/rhs_isac_ros/config of any folder above {package}')

@@ -32,11 +32,12 @@ from rhs_isac_ros.codebook.optimize import (
     optimize,
 )
 from rhs_isac_ros.codebook.plot import plot_optimization
+from rhs_isac_ros.codebook.problem import Progress
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
-from rhs_isac_ros.codebook.search import Progress
-from rhs_isac_ros.codebook.start import STARTS
-from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, streams
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.codebook.starts import STARTS
+from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import (
     check_distinct,
     input_file,
     integer,
@@ -47,8 +48,8 @@ from rhs_isac_ros.model.arguments import (
     positive_int,
     seed,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.optional import MissingLibraryError
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.optional import MissingLibraryError
 
 __all__ = ['ERRORS', 'HELD_OUT_POSITIONS', 'INTERRUPTED', 'add_options', 'check', 'run']
 # Positions for the average bound of the result, drawn independently of the samples.

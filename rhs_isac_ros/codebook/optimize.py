@@ -9,23 +9,26 @@ import numpy as np
 
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
-from rhs_isac_ros.codebook.alternating import minimize_alternating
 from rhs_isac_ros.codebook.codebook import Codebook
-from rhs_isac_ros.codebook.direct import minimize_direct
-from rhs_isac_ros.codebook.genetic import minimize_genetic
-from rhs_isac_ros.codebook.lbfgs import minimize_lbfgs
-from rhs_isac_ros.codebook.levels import minimize_levels
+from rhs_isac_ros.codebook.methods import (
+    FEWEST_PAIRS,
+    minimize_alternating,
+    minimize_direct,
+    minimize_genetic,
+    minimize_lbfgs,
+    minimize_levels,
+    minimize_sampled,
+)
 from rhs_isac_ros.codebook.objective import OBJECTIVES
-from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress, Search
 from rhs_isac_ros.codebook.provenance import Provenance
-from rhs_isac_ros.codebook.sampled import FEWEST_PAIRS, minimize_sampled
 from rhs_isac_ros.codebook.sampling import SAMPLINGS
-from rhs_isac_ros.codebook.search import BudgetSpent, Progress, Search
-from rhs_isac_ros.codebook.start import STARTS, random_codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario, streams
+from rhs_isac_ros.codebook.starts import STARTS, random_codebook
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.surface import on_levels
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Sobol points; as good as 1200 independent positions.
 DEFAULT_POSITIONS = 256
@@ -156,7 +159,7 @@ def optimize(
         method=method, objective=objective, seed=int(seed), sampling=sampling,
         positions=len(positions), scenario=scenario.changes(),
         calibration=calibration.id if calibration else '')
-    done = provenance.resumed(resume) if resume else provenance
+    done = provenance.resumed(resume.provenance) if resume else provenance
     first = resume or start or STARTS.get(method, random_codebook)(
         scenario, streams.generator(seed, streams.START))
     check_start(first, scenario)
@@ -172,7 +175,10 @@ def optimize(
             value_m2 = _determined(bound) if objective == 'crlb' else np.nan
             history = [Progress(done.steps, done.evaluations, value_m2, 0.0)]
             report(history[0])
-        text = provenance.to_text(history[-1], reason)
+        end = history[-1]
+        text = dataclasses.replace(
+            provenance, steps=end.step, evaluations=end.evaluations,
+            value_m2=float(end.value_m2), reason=reason).to_text()
         return OptimizeResult(
             dataclasses.replace(best, average_crlb_m2=bound, provenance=text),
             tuple(history), reason)

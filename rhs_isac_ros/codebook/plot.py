@@ -8,10 +8,11 @@ import numpy as np
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook.codebook import Codebook
-from rhs_isac_ros.codebook.search import Progress
+from rhs_isac_ros.codebook.problem import Progress
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.pictures import (
+from rhs_isac_ros.model.surface import radiation_matrix
+from rhs_isac_ros.support.pictures import (
     LOOKS,
     PAGE_IN,
     add_panels,
@@ -21,7 +22,6 @@ from rhs_isac_ros.model.pictures import (
     paper_style,
     write_picture,
 )
-from rhs_isac_ros.model.surface import radiation_matrix
 
 # Points of the map of the bound along each axis, and of a beam over azimuth.
 _N_MAP_POINTS = 60

@@ -1,4 +1,8 @@
-"""The optimisation problem: objective, constraints and variables."""
+"""The optimisation problem of a codebook, and the search that a method performs on it."""
+
+import dataclasses
+import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -91,3 +95,159 @@ class Problem:
         raw = (real + 1j * imag).reshape(self._digital_shape)
         norm = np.sqrt(np.sum(np.abs(raw)**2, axis=(1, 3), keepdims=True))
         return analog, raw, norm
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Progress of an optimisation after a step.
+
+    Attributes
+    ----------
+    step
+        Update steps so far.
+    evaluations
+        Evaluations of the objective so far, with or without its gradient.
+    value_m2
+        Lowest objective so far [m^2].
+    elapsed_s
+        Time since the start [s].
+    """
+
+    step: int
+    evaluations: int
+    value_m2: float
+    elapsed_s: float
+
+
+class BudgetSpent(Exception):
+    """No evaluation is left; methods let this exception propagate."""
+
+
+class Search:
+    """Objective that a method minimises; counts evaluations and keeps the best point.
+
+    Parameters
+    ----------
+    start
+        First point, float64 [n].
+    max_steps
+        Maximum number of update steps; each method defines what a step is.
+    max_evaluations
+        Maximum number of evaluations; None if unlimited.
+    progress
+        Called after each step.
+    done
+        Steps and evaluations of the search that this one resumes; they count towards the limits.
+
+    Attributes
+    ----------
+    max_steps
+        Update steps that remain.
+    value_m2
+        Lowest objective evaluated [m^2].
+    best
+        Point with that objective, float64 [n].
+    history
+        Progress after each step, beginning with the start.
+    """
+
+    def __init__(
+            self, problem: Problem, start: np.ndarray, max_steps: int,
+            max_evaluations: int | None, rng: np.random.Generator,
+            progress: Callable[[Progress], None] | None,
+            done: tuple[int, int] = (0, 0)) -> None:
+        self._first_step, self._evaluations = done
+        self.start, self.max_steps, self.rng = start, max_steps - self._first_step, rng
+        self.bounds, self.n_analog = problem.bounds, problem.n_analog
+        self._problem, self._progress = problem, progress
+        self._max_evaluations = max_evaluations
+        self._begin = time.perf_counter()
+        self.value_m2, self.best = np.inf, start
+        self.history: list[Progress] = []
+        self._last: tuple[np.ndarray, float, np.ndarray] | None = None
+
+    @property
+    def amplitude_levels(self) -> int:
+        """Number of amplitudes of an element; 0 if they are continuous."""
+        return self._problem.scenario.amplitude_levels
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs of the objective that samples are drawn from; 0 if it has no pairs."""
+        return self._problem.n_pairs
+
+    def begin(self) -> float:
+        """Evaluate the start [m^2] and record it as the first entry of the history.
+
+        An evaluation of the same point by an earlier search is not counted again. Raise
+        BudgetSpent if no evaluation is left.
+        """
+        if self._evaluations:
+            self._evaluations -= 1
+        value, _ = self.value_and_gradient(self.start)
+        self.on_step()
+        return value
+
+    def finish(self) -> None:
+        """Record a last step if there were evaluations since the previous one."""
+        if not self.history or self._evaluations > self.history[-1].evaluations:
+            self.on_step()
+
+    def value(self, variables: np.ndarray) -> float:
+        """Evaluate the objective [m^2] at a point, float64 [n], or raise BudgetSpent."""
+        self._count()
+        value = self._problem.value(variables)
+        self._keep_best(value, variables)
+        return value
+
+    def value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        """Evaluate the objective [m^2] and its gradient, float64 [n], or raise BudgetSpent."""
+        # A method begins by evaluating the point at which the previous one ended.
+        if self._last is None or not np.array_equal(self._last[0], variables):
+            self._count()
+            value, gradient = self._problem.value_and_gradient(variables)
+            self._keep_best(value, variables)
+            self._last = np.array(variables), value, gradient
+        return self._last[1:]
+
+    def relaxed_value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        """Evaluate as if amplitudes were continuous [m^2], [n], or raise BudgetSpent.
+
+        The point does not become the best one.
+        """
+        self._count()
+        return self._problem.value_and_gradient(variables, relaxed=True)
+
+    def sample(
+            self, variables: np.ndarray, n_pairs: int
+    ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+        """Return an estimate of `value_and_gradient` from a sample of the pairs at a point.
+
+        It counts evaluations as `value_and_gradient` does, and raises BudgetSpent if none would
+        be left for its result. Its points do not become the best one.
+        """
+        problem = self._problem.sample(variables, n_pairs, self.rng)
+
+        def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
+            self._count(reserve=1)
+            return problem.value_and_gradient(point)
+        return evaluate
+
+    def on_step(self) -> None:
+        """Record a step; methods call this after each of their steps."""
+        elapsed = time.perf_counter() - self._begin
+        step = self._first_step + len(self.history)
+        entry = Progress(step, self._evaluations, self.value_m2, elapsed)
+        self.history.append(entry)
+        if self._progress:
+            self._progress(entry)
+
+    def _count(self, reserve: int = 0) -> None:
+        if (self._max_evaluations is not None
+                and self._evaluations + reserve >= self._max_evaluations):
+            raise BudgetSpent
+        self._evaluations += 1
+
+    def _keep_best(self, value: float, variables: np.ndarray) -> None:
+        if value < self.value_m2:
+            self.value_m2, self.best = value, np.array(variables)

@@ -36,8 +36,7 @@ def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
 
     points = qmc.Sobol(3, scramble=True, seed=rng).random_base2(max(n - 1, 0).bit_length())[:n]
     low, high = scenario.roi_bounds_m
-    samples: np.ndarray = low + (high - low) * points
-    return samples
+    return low + (high - low) * points
 
 
 SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarray]] = {
@@ -94,9 +93,8 @@ def confusable_volumes(
         (1 / np.clip(cosine, 0.01, 1)**2 - 1) / _beam_width(scenario)**2, _ROUNDING)
     narrow, wide = (np.exp(-square / (2 * scale**2)) for scale in scales)
     by_direction = (wide - narrow) / (2 * np.pi * square * np.log(scales[1] / scales[0]))
-    volumes: np.ndarray = other_ranges**2 / (
+    return other_ranges**2 / (
         ranges**5 * np.maximum(by_lag * by_direction, np.finfo(float).tiny))
-    return volumes
 
 
 def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,

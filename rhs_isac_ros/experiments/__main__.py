@@ -1,23 +1,202 @@
-"""Run experiments on the cores of this machine or on a Dask cluster.
+"""Measure accuracy, bounds and capacity over every combination of values of scenario fields.
 
-The figures of the paper are experiments of their own: scripts/reproduce.
+The results are a CSV file with a row for each setting and measure, a picture, and a table on the
+terminal. An interrupted sweep resumes when the command is repeated. Positions, signals and
+codebooks depend on the seed alone, and all settings with the same region use the same positions.
 """
 
+import argparse
+import importlib.util
+import math
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
 
+from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.experiments import sweep_command
-from rhs_isac_ros.model.arguments import ArgumentParser, HelpFormatter
+from rhs_isac_ros.experiments.command import add_run_options, markdown_table, run_command
+from rhs_isac_ros.experiments.sweep import KINDS, OPTIMIZE, Point, Sweep, run_sweep, table
+from rhs_isac_ros.experiments.sweep_picture import draw, shown
+from rhs_isac_ros.experiments.sweep_settings import (
+    CODEBOOK,
+    ESTIMATOR,
+    FIELDS,
+    MEASURES,
+    Axis,
+    Setting,
+    names_of,
+    parse_axis,
+    parse_measures,
+    settings_of,
+)
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.positioning import REGION_ESTIMATORS
+from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    HelpFormatter,
+    input_file,
+    integer,
+    picture_file,
+    positive_int,
+    seed,
+)
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.pictures import write_picture
 
-_COMMANDS = {'sweep': sweep_command.main}
+PROGRAM = 'python3 -m rhs_isac_ros.experiments'
+# The bootstrap holds 2000 weights of each position.
+_MAX_POSITIONS = 10**5
+_MAX_SETTINGS = 10**4
+_Parsed = TypeVar('_Parsed')
+_EPILOG = '\n\n'.join(textwrap.fill(f'{title}: {", ".join(names)}.', 79) for title, names in (
+    ('fields', (*FIELDS, CODEBOOK, ESTIMATOR)), ('measures', MEASURES)))
+
+
+def sweep(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return the exit code of `run_command`, or 2 after a usage error."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    _check(parser, options)
+    try:
+        base = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+        settings = settings_of(base, options.vary, options.codebook, options.estimator)
+        _check_names(settings)
+        sweep = Sweep(
+            base, settings, names_of(options.measure), options.positions, options.seed,
+            options.objective, options.steps, options.optimize_for, options.repeats)
+    except (CodebookError, ScenarioError, ValueError) as error:
+        parser.error(str(error))
+    return run_command(lambda: _run(sweep, options))
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        prog=f'{PROGRAM} sweep', description=__doc__, epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add('--vary', type=_type(lambda text: parse_axis(text).distinct()), action='append',
+        required=True, metavar='FIELD=VALUE,...',
+        help='field and its values, in the syntax of scenario files; the first one is the x axis '
+             'of the picture, the second one has a line for each value, and the others have '
+             'panels')
+    add('--with', type=_type(parse_axis), action=_Along, metavar='FIELD=VALUE,...',
+        help='field that varies together with that of the previous --vary')
+    add('--measure', type=_type(parse_measures), default='crlb,mse', metavar='NAME,...',
+        help='measures, a panel for each; NAME+NAME for a panel of several '
+             '(default: %(default)s)')
+    add('--scenario', type=input_file, metavar='FILE',
+        help="YAML file of all other fields (default: the paper's Table I)")
+    add('--estimator', default='bayes', metavar='NAME',
+        help='bayes, ml or an installed plug-in (default: %(default)s)')
+    add('--codebook', default=OPTIMIZE, metavar='CODEBOOK',
+        help=f'{", ".join(KINDS)} for each setting, or a file for all (default: %(default)s)')
+    add('--optimize-for', nargs='*', choices=(*FIELDS,), metavar='FIELD',
+        help='fields whose values the optimisation of a codebook takes from the setting; it uses '
+             'the base values of all others, except for fields that change the sizes, bands or '
+             'amplitude levels (default: all)')
+    add('--objective', choices=sorted(OBJECTIVES), default='ambiguity',
+        help='objective of the optimisation (default: %(default)s)')
+    add('--steps', type=positive_int, default=300, metavar='N',
+        help='maximum number of steps of an optimisation (default: %(default)s)')
+    add('--repeats', type=integer(1, 1000), default=1, metavar='N',
+        help='codebooks of each setting with successive seeds, if optimised or random '
+             '(default: %(default)s)')
+    add('--positions', type=integer(1, _MAX_POSITIONS), default=2000, metavar='N',
+        help='positions of each setting (default: %(default)s)')
+    add('--seed', type=seed, default=0, metavar='N',
+        help='seed of positions, signals and codebooks (default: %(default)s)')
+    add('--picture', type=picture_file, metavar='FILE',
+        help='PNG, PDF or SVG file (default: sweep.png in the folder of the results)')
+    add_run_options(parser, 'results/sweep')
+    return parser
+
+
+def _check(parser: ArgumentParser, options: argparse.Namespace) -> None:
+    """Exit with a usage error if there are too many settings, or a library is missing."""
+    n_settings = math.prod(len(axis.values) for axis in options.vary)
+    if n_settings > _MAX_SETTINGS:
+        parser.error(f'argument --vary: {n_settings} settings, expected at most {_MAX_SETTINGS}')
+    if options.picture and not importlib.util.find_spec('matplotlib'):
+        parser.error('argument --picture: drawing needs matplotlib, which is not installed '
+                     "(pip install 'rhs_isac_ros[plot]')")
+
+
+def _check_names(settings: Sequence[Setting]) -> None:
+    """Raise ValueError if an estimator is unknown, or a codebook is neither a kind nor a file."""
+    # A network would have to be trained for each codebook.
+    estimators = {*REGION_ESTIMATORS, *plugins.names(plugins.ESTIMATORS)}
+    for name, known in ((ESTIMATOR, estimators), (CODEBOOK, {*KINDS})):
+        for value in sorted({getattr(setting, name) for setting in settings} - known):
+            if name == ESTIMATOR or not Path(value).is_file():
+                expected = f'{", ".join(sorted(known))}{" or a file" * (name == CODEBOOK)}'
+                raise ValueError(f'{name}: {value!r}, expected {expected}')
+
+
+def _run(sweep: Sweep, options: argparse.Namespace) -> None:
+    """Run the jobs, write the files and print the table."""
+    folder = options.output
+    points = run_sweep(sweep, folder / 'jobs', options.jobs, options.dask)
+    print(_report(options.vary, points))
+    write_whole(folder / 'sweep.csv', table(sweep, points))
+    if not importlib.util.find_spec('matplotlib'):
+        print(f'\nwritten: {folder}/sweep.csv; drawing the picture needs matplotlib, which is not '
+              "installed (pip install 'rhs_isac_ros[plot]')")
+        return
+    picture = options.picture or folder / 'sweep.png'
+    write_picture(picture, draw(options.vary, points, options.measure))
+    print(f'\nwritten: {folder}/sweep.csv and {picture}')
+
+
+def _report(axes: Sequence[Axis], points: Sequence[Point]) -> str:
+    """Return the points as a table: a row for each setting, a column for each measure."""
+    names = [axis.fields[0] for axis in axes]
+    measures = list(dict.fromkeys(point.measure for point in points))
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for point in points:
+        key = tuple(shown(name, point.setting.varied[name]) for name in names)
+        rows.setdefault(key, []).append('{:.4g} [{:.4g}, {:.4g}]'.format(*point.interval))
+    return markdown_table(
+        [*names, *(f'{name} [{MEASURES[name].unit}]' for name in measures)],
+        [[*key, *cells] for key, cells in rows.items()])
+
+
+class _Along(argparse.Action):
+    """Adds a field to the last axis of ``--vary``."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 values: Any, option_string: str | None = None) -> None:
+        """Add the field."""
+        if not getattr(namespace, 'vary', None):
+            parser.error(f'argument {option_string}: expected after --vary')
+        try:
+            namespace.vary[-1] = namespace.vary[-1].along(values)
+        except ValueError as error:
+            parser.error(f'argument {option_string}: {error}')
+
+
+def _type(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
+    """Return a type for argparse from a function whose ValueErrors are for the user."""
+    def parse_argument(text: str) -> _Parsed:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+    return parse_argument
+
+
+_COMMANDS = {'sweep': sweep}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     parser = ArgumentParser(
-        prog=sweep_command.PROGRAM, description=__doc__, formatter_class=HelpFormatter,
+        prog=PROGRAM,
+        description='Run experiments on the cores of this machine or on a Dask cluster.',
+        formatter_class=HelpFormatter,
         epilog='The option --help of an experiment lists its options.')
     parser.add_argument('experiment', choices=_COMMANDS,
                         help='sweep: measures over combinations of values of scenario fields')

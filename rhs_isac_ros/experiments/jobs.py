@@ -1,13 +1,20 @@
-"""Jobs: the independent parts of an experiment."""
+"""Running jobs on the cores of this machine or on a Dask cluster."""
 
+import contextlib
 import dataclasses
 import json
+import signal
+import threading
 import traceback
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.model.optional import MissingLibraryError
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 
 class JobError(Exception):
@@ -50,3 +57,218 @@ def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
         return JobResult(job, error=str(error))
     except Exception:
         return JobResult(job, error=traceback.format_exc())
+
+
+class ResultStore:
+    """Folder with one JSON file per result, which later runs reuse; it is created if necessary."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+
+    def path(self, job: Job) -> Path:
+        """Return the file of a job's result, which may not exist yet."""
+        return self._folder / f'{job.name}.json'
+
+    def read(self, job: Job) -> dict[str, Any] | None:
+        """Return the stored result of a job.
+
+        The result is None if there is no file, the file is damaged, or it was written for other
+        arguments or by another version of this package.
+        """
+        try:
+            record = json.loads(self.path(job).read_bytes())
+        except (FileNotFoundError, ValueError):
+            return None
+        if not isinstance(record, dict) or not isinstance(record.get('result'), dict):
+            return None
+        if any(record.get(key) != value for key, value in _settings(job).items()):
+            return None
+        return record['result']
+
+    def write(self, job: Job, result: Mapping[str, Any]) -> None:
+        """Store the result of a job, replacing an existing one atomically, or raise OSError."""
+        record = {**_settings(job), 'result': result}
+        write_whole(self.path(job), json.dumps(record, indent=1) + '\n')
+
+
+def _settings(job: Job) -> dict[str, Any]:
+    """Return version and arguments as they are read back from JSON, which has no tuples."""
+    settings = {'version': __version__, 'arguments': dict(job.arguments)}
+    return json.loads(json.dumps(settings))
+
+
+# Timeout for the scheduler of a cluster, and for its first worker.
+_TIMEOUT_S = 30
+_THREAD_TIMEOUT_S = 5
+
+
+def run_locally(
+        function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], n_jobs: int
+) -> Generator[JobResult, None, None]:
+    """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
+
+    There are `n_jobs` processes: -1 selects one per core; 1 runs all jobs in this process.
+    Closing the generator ends them. Before joblib 1.4, a result also waits for those of all
+    earlier jobs.
+
+    Raises
+    ------
+    JobError
+        If a process dies.
+    MissingLibraryError
+        If joblib is not installed.
+    """
+    with optional_import('running jobs', extra='experiments'):
+        import joblib
+
+    results, threads_before = None, set(threading.enumerate())
+    try:
+        with _interrupts_ignored(), joblib.parallel_config(
+                backend='loky', inner_max_num_threads=1):
+            results = joblib.Parallel(
+                n_jobs=n_jobs, batch_size=1, return_as=_return_as(joblib.__version__))(
+                    joblib.delayed(attempt)(function, job) for job in jobs)
+        # `yield from` would close the generator outside the filter for warnings below.
+        while result := next(results, None):
+            yield result
+    except BrokenExecutor as error:
+        raise JobError(f'a process died, possibly out of memory: {error}') from error
+    finally:
+        if results:
+            with warnings.catch_warnings():
+                # Joblib warns about lost jobs; here they are abandoned deliberately.
+                warnings.simplefilter('ignore', UserWarning)
+                results.close()
+            # A thread of the pool that the end of the interpreter stops may be releasing a
+            # semaphore, which the resource tracker of joblib then reports as leaked.
+            for thread in set(threading.enumerate()) - threads_before:
+                thread.join(_THREAD_TIMEOUT_S)
+
+
+def run_on_cluster(
+        function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], address: str
+) -> Generator[JobResult, None, None]:
+    """Run jobs on a Dask cluster; yield each result when it is ready.
+
+    The address is that of the scheduler. Closing the generator cancels pending jobs. This uses
+    `distributed` directly: through joblib, jobs for a cluster with a single thread run in this
+    process instead, and the run never ends if a worker dies.
+
+    Raises
+    ------
+    ConnectionError
+        If there is no scheduler, or no worker.
+    MissingLibraryError
+        If distributed is not installed.
+    """
+    with optional_import('running jobs on a Dask cluster', extra='experiments'):
+        from distributed import Client, as_completed
+
+    with contextlib.ExitStack() as stack:
+        try:
+            client = stack.enter_context(Client(  # type: ignore[no-untyped-call]
+                address, timeout=_TIMEOUT_S, set_as_default=False))
+            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConnectionError(f'Dask cluster {address}: {error}') from error
+        jobs_by_future = {
+            client.submit(attempt, function, job, pure=False): job for job in jobs}
+        for future in as_completed(  # type: ignore[no-untyped-call]
+                list(jobs_by_future), loop=client.loop):
+            try:
+                yield future.result()
+            except Exception as error:  # the job killed its worker or could not be sent to one
+                yield JobResult(jobs_by_future[future], error=f'{type(error).__name__}: {error}')
+
+
+def _return_as(version: str) -> str:
+    """Return the option of a version of joblib that yields results as early as possible."""
+    release = tuple(int(part) for part in version.split('.')[:2])
+    return 'generator_unordered' if release >= (1, 4) else 'generator'
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore SIGINT inside the block, so that processes started there ignore it, too.
+
+    A terminal sends SIGINT to the whole process group, but only this process may end the
+    workers. Ignored signals are inherited. A blocked signal would be delivered after the block
+    instead of being lost, but joblib unblocks it.
+    """
+    # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def run_jobs(
+        function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path,
+        n_jobs: int = -1, dask: str | None = None, label: str = '') -> list[dict[str, Any]]:
+    """Run the jobs that have no stored result; return all results in order, decoded from JSON.
+
+    Each result is stored as soon as it is available. After an interruption or an error, the same
+    call resumes the experiment. A progress bar is shown on a terminal.
+
+    Parameters
+    ----------
+    function
+        Callable that takes the arguments of a job and returns a dict that JSON can serialise.
+    folder
+        Folder of the stored results.
+    n_jobs
+        Number of parallel jobs on this machine; -1 for one per core.
+    dask
+        Address of the scheduler of a Dask cluster to use instead.
+    label
+        Label of the progress bar.
+
+    Raises
+    ------
+    ValueError
+        If two jobs have the same name.
+    JobError
+        If a job fails, or its worker has another version of this package.
+    ConnectionError
+        If the cluster does not respond.
+    OSError
+        If a result cannot be read or stored.
+    MissingLibraryError
+        If a library is not installed.
+    """
+    if len({job.name for job in jobs}) < len(jobs):
+        raise ValueError('jobs: two have the same name, expected unique names')
+    with optional_import('showing progress', extra='experiments'):
+        from tqdm import tqdm
+
+    store = ResultStore(folder)
+    known = {job.name: result for job in jobs if (result := store.read(job)) is not None}
+    pending = [job for job in jobs if job.name not in known]
+    # None disables the bar if stderr is not a terminal.
+    with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None,
+              desc=label or None) as bar:
+        if pending:
+            job_results = (run_on_cluster(function, pending, dask) if dask
+                           else run_locally(function, pending, n_jobs))
+            with contextlib.closing(job_results):
+                for job_result in job_results:
+                    known[job_result.job.name] = result = _decoded(job_result)
+                    store.write(job_result.job, result)
+                    bar.update()
+    return [known[job.name] for job in jobs]
+
+
+def _decoded(job_result: JobResult) -> dict[str, Any]:
+    """Decode the result of a job, or raise JobError if it failed or ran in another version."""
+    name = job_result.job.name
+    if job_result.error:
+        raise JobError(f'job {name} failed: {job_result.error.strip()}')
+    if job_result.version != __version__:
+        raise JobError(f'job {name}: the worker has rhs_isac_ros {job_result.version}, expected '
+                       f'{__version__}, the version of this machine')
+    return json.loads(job_result.text)

@@ -5,11 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.experiments.measures import MEASURES
 from rhs_isac_ros.experiments.sweep import Point
-from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, plain
+from rhs_isac_ros.experiments.sweep_settings import FIELDS, MEASURES, Axis, plain
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.pictures import (
+from rhs_isac_ros.support.pictures import (
     COLUMN_IN,
     LOOKS,
     PAGE_IN,
@@ -196,8 +195,7 @@ def _shifted(panel: Any, places: np.ndarray, shift: float) -> np.ndarray:
     """Move places on the x axis of a panel by a share of their range."""
     scale = panel.xaxis.get_transform()
     drawn = scale.transform(places)
-    moved: np.ndarray = scale.inverted().transform(drawn + shift * np.ptp(drawn))
-    return moved
+    return scale.inverted().transform(drawn + shift * np.ptp(drawn))
 
 
 def _draw_line(panel: Any, x: np.ndarray, intervals: np.ndarray, line: _Line) -> None:

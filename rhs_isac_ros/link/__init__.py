@@ -1,8 +1,13 @@
 """The transmission phase: capacity, beam steering and the choice of the band."""
 
 from rhs_isac_ros.link.beam_pattern import BeamPattern, beam_pattern
-from rhs_isac_ros.link.capacity import Beam, actual_capacity, capacity, expected_capacity
-from rhs_isac_ros.link.quartiles import RunningQuartiles
+from rhs_isac_ros.link.capacity import (
+    Beam,
+    RunningQuartiles,
+    actual_capacity,
+    capacity,
+    expected_capacity,
+)
 from rhs_isac_ros.link.steering import (
     CapacityReport,
     Choice,

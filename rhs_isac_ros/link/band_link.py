@@ -1,4 +1,4 @@
-"""The links between the surface and one position, as arrays for steering."""
+"""The links between the surface and one position, and the division of the power over them."""
 
 import dataclasses
 import functools
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rhs_isac_ros.link.water_filling import water_filling
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain_at
@@ -14,6 +13,43 @@ from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+
+# Gains above this have finite reciprocals.
+_MIN_GAIN = 1e-300
+
+
+def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
+    """Divide power [W] among channels so that the sum of log(1 + gain * share) is highest.
+
+    The gains are relative to noise, float64 [..., N] [1/W]; each row is a problem of its own. The
+    shares, float64 [..., N] [W], are not negative, and those of a row have the sum `power_w`. If
+    no gain of a row is positive, its shares are equal.
+    """
+    n = gains.shape[-1]
+    if n == 1:
+        return np.full(gains.shape, power_w)
+    if gains.min() > _MIN_GAIN:
+        floors = 1 / gains
+        level = (power_w + floors.sum(axis=-1, keepdims=True)) / n
+        if (level > floors).all():
+            # Every channel is above its floor, as usual.
+            return level - floors
+    # Without any gain, all levels and floors are infinite.
+    with np.errstate(divide='ignore', over='ignore', invalid='ignore'):
+        floors = 1 / np.maximum(gains, 0)
+        ranked = np.sort(floors, axis=-1)
+        levels = (power_w + np.cumsum(ranked, axis=-1)) / np.arange(1, n + 1)
+        # The channels above their floor are the first ones in the order of the floors.
+        n_filled = np.sum(levels > ranked, axis=-1, keepdims=True)
+        level = np.take_along_axis(levels, np.maximum(n_filled - 1, 0), axis=-1)
+        shares: np.ndarray = np.maximum(level - floors, 0.0)
+    if n_filled.all():
+        return shares
+    # The gains are so small that the power is lost in the rounding of the level.
+    best = power_w * (np.arange(n) == np.argmax(gains, axis=-1)[..., None])
+    even = np.broadcast_to(power_w / n, gains.shape)
+    lost = np.where(gains.max(axis=-1, keepdims=True) > 0, best, even)
+    return np.where(n_filled > 0, shares, lost)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,8 +118,7 @@ class BandLink:
         gains, directions = np.linalg.eigh(self.correlations(*self.feeds(analog)))
         power = water_filling(gains[..., -1] / self.noise_power_w, self.power_w)
         # s is a row: s M s^H is largest along the conjugate of the eigenvector.
-        digital: np.ndarray = np.conj(directions[..., -1]) * np.sqrt(power)[..., None]
-        return digital
+        return np.conj(directions[..., -1]) * np.sqrt(power)[..., None]
 
     def best_rate(self, analog: np.ndarray) -> np.ndarray:
         """Return the capacity with the best digital part [nat/symbol], float64 [...].
@@ -92,8 +127,7 @@ class BandLink:
         """
         correlations = self.correlations(*self.feeds(analog))
         gains = np.linalg.eigvalsh(correlations)[..., -1] / self.noise_power_w
-        rate: np.ndarray = np.log1p(gains * water_filling(gains, self.power_w)).sum(axis=-1)
-        return rate
+        return np.log1p(gains * water_filling(gains, self.power_w)).sum(axis=-1)
 
     def feeds(self, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the channels between the feeds and the air for configurations [..., N_E].

@@ -7,7 +7,7 @@ import numpy as np
 
 from rhs_isac_ros.link.capacity import Beam, direct_power_w
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from rhs_isac_ros.model.los import direct_gain, los_sums
 from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Quadrature nodes along each principal axis of the covariance.
 _N_NODES = 3
@@ -63,23 +63,23 @@ def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray)
     through = spatial_covariance(scenario)[band_index(bands)].scatter(radiation)
     scattered = np.sum((through * np.conj(radiation)).real, axis=-1)[:, None]
     snr = (direct + scattered) / scenario.noise_power_w
-    rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
-    return rates
+    return scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
 
 
 @one_blas_thread
-def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
+def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
+                    blocked: np.ndarray | None = None) -> np.ndarray:
     """Compute the capacity on the paths of a channel file; without one, that of `capacity`.
 
-    Takes positions, float64 [N, 3] [m], and returns float64 [N] [bit/s]; errors are the same.
+    Takes positions, float64 [N, 3] [m], and which users are blocked, bool [N], if there is a
+    channel file; returns float64 [N] [bit/s]. Errors are the same.
     """
     if not scenario.channel:
         return capacity(scenario, beam, positions)
-    gains = direct_gain(scenario, positions, beam.band)
+    gains = direct_gain(scenario, positions, beam.band, blocked)
     signals = np.einsum('njm,jm->nj', gains, _radiation(scenario, beam))
     snr = np.abs(signals)**2 / scenario.noise_power_w
-    rates: np.ndarray = scenario.subband_width_hz * np.log2(1 + snr).sum(axis=1)
-    return rates
+    return scenario.subband_width_hz * np.log2(1 + snr).sum(axis=1)
 
 
 @one_blas_thread
@@ -113,8 +113,7 @@ def direct_power_w(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.
     The result is the sum over the sub-bands, float64 [N] [W]. Errors are those of `capacity`.
     """
     (sums,) = los_sums(scenario, positions, [beam.band], _radiation(scenario, beam)[None])
-    power: np.ndarray = np.sum(np.abs(sums)**2, axis=1)
-    return power
+    return np.sum(np.abs(sums)**2, axis=1)
 
 
 def posterior_points(
@@ -176,6 +175,55 @@ def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
     if not 0 <= beam.band < scenario.n_bands:
         raise ValueError(f'band: {beam.band}, expected 0 to {scenario.n_bands - 1}')
     feeds: np.ndarray = np.einsum('jk,jkm->jm', beam.digital, onboard_matrix(scenario)[beam.band])
-    radiation: np.ndarray = feeds * beam.analog
-    return radiation
+    return feeds * beam.analog
 
+
+class RunningQuartiles:
+    """Quartiles of the newest rows of values, exact over a bounded window.
+
+    The window bounds memory and time, and lets the quartiles follow a changing network.
+    A row has `n_values` values; rows older than the last `window` are discarded.
+
+    Raises
+    ------
+    ValueError
+        If a size is not positive.
+    """
+
+    def __init__(self, n_values: int, window: int = 1000) -> None:
+        if n_values < 1 or window < 1:
+            raise ValueError(f'n_values, window: {n_values}, {window}, expected at least 1 each')
+        self._rows = np.empty((window, n_values))
+        self._n_added = 0
+
+    def __len__(self) -> int:
+        """Return the number of rows in the window."""
+        return min(self._n_added, len(self._rows))
+
+    def add(self, row: np.ndarray) -> None:
+        """Add a row, float64 [n_values]; it replaces the oldest one if the window is full.
+
+        Raises
+        ------
+        ValueError
+            If the row has another shape or is not finite.
+        """
+        row = np.asarray(row, dtype=float)
+        if row.shape != self._rows.shape[1:] or not np.isfinite(row).all():
+            raise ValueError(f'row: {row}, expected {self._rows.shape[1]} finite values')
+        self._rows[self._n_added % len(self._rows)] = row
+        self._n_added += 1
+
+    def quartiles(self) -> np.ndarray:
+        """Return lower quartile, median and upper quartile of each value, float64 [n_values, 3].
+
+        Quartiles between two rows are interpolated linearly.
+
+        Raises
+        ------
+        ValueError
+            If no row has been added yet.
+        """
+        if not len(self):
+            raise ValueError('quartiles: no rows, expected at least one')
+        return np.quantile(self._rows[:len(self)], (0.25, 0.5, 0.75), axis=0).T

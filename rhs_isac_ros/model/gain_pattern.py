@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rhs_isac_ros.model import plugins
+from rhs_isac_ros.support import plugins
 
 # Callable that takes angles [rad], float64 of any shape, and returns float64 of that shape.
 AngleFunction = Callable[[np.ndarray], np.ndarray]
@@ -83,8 +83,7 @@ class GainPattern:
             # The pattern is symmetric about the boresight: reflect angles below 0 and above pi.
             shifted = np.abs(angles + steps * _STEP_RAD)
             return self.amplitude(np.pi - np.abs(np.pi - shifted))
-        slope: np.ndarray = (8 * (gain(1) - gain(-1)) - (gain(2) - gain(-2))) / (12 * _STEP_RAD)
-        return slope
+        return (8 * (gain(1) - gain(-1)) - (gain(2) - gain(-2))) / (12 * _STEP_RAD)
 
     @classmethod
     def named(cls, text: str) -> 'GainPattern':

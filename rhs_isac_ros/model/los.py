@@ -24,18 +24,30 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
     return _gain(scenario, distances, band, _amplitude(scenario, offsets))
 
 
-def direct_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
+def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray | None:
+    """Draw whether n users lack the direct path, bool [n]; None if the scenario has none."""
+    if not scenario.blocked_probability:
+        return None
+    return rng.spawn(1)[0].random(n) < scenario.blocked_probability
+
+
+def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
+                blocked: np.ndarray | None = None) -> np.ndarray:
     """Compute the gains without random multipath in the shape of `los_gain`.
 
     They are those of `los_gain`, or with a channel file the sums over the paths of the users
-    nearest to the positions.
+    nearest to the positions; without direct paths for users that are `blocked`, bool [N].
     """
     channel = scenario.channel
+    blocked = np.zeros(len(positions), bool) if blocked is None else blocked
     if not channel:
-        return los_gain(scenario, positions, band)
+        gains = los_gain(scenario, positions, band)
+        gains[blocked] = 0
+        return gains
     total = np.zeros((len(positions), scenario.n_subbands, scenario.n_elements), complex)
     for row, user in enumerate(channel.nearest(checked_positions(positions)).tolist()):
-        (present,) = np.nonzero(channel.coefficients[user])
+        (present,) = np.nonzero(
+            (channel.coefficients[user] != 0) & ~(blocked[row] & (channel.n[user] == 0)))
         weights = channel.coefficients[user, present, None]
         if channel.gains is not None:
             weights = weights * channel.gains[user, present]

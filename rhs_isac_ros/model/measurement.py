@@ -18,6 +18,7 @@ from rhs_isac_ros.model.impairments.factors import draw_impairments
 from rhs_isac_ros.model.los import (
     checked_positions,
     direct_gain,
+    draw_blocked,
     los_derivative,
     los_derivative_terms,
     los_gain,
@@ -31,7 +32,7 @@ from rhs_isac_ros.model.receive import received_signal
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
+from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # Knowledge of the elements of one surface: their errors, or an estimate of them.
 Surface = ElementErrors | SurfaceEstimate
@@ -75,8 +76,7 @@ def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
     # One matrix product per sub-band: [G N, N_E] with [N_E, F].
     stacked = np.moveaxis(slopes, 2, 0).reshape(n_subbands, n_rows * n, n_elements)
     products = np.matmul(stacked, np.swapaxes(frames, 1, 2))
-    derivative: np.ndarray = np.moveaxis(products, 0, 1).reshape(n, n_rows, -1)
-    return derivative
+    return np.moveaxis(products, 0, 1).reshape(n, n_rows, -1)
 
 
 def position_blocks(scenario: Scenario, n: int) -> list[slice]:
@@ -174,8 +174,7 @@ class MeasurementModel:
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Transform signals [..., N_B, N_SB F] to unit covariance; the shape stays the same."""
         # Unlike a matrix product, this rounds a signal the same in a batch of any size.
-        whitened: np.ndarray = np.einsum('irs,...is->...ir', self.whitener, signals)
-        return whitened
+        return np.einsum('irs,...is->...ir', self.whitener, signals)
 
     def mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
@@ -257,16 +256,19 @@ class MeasurementModel:
         there, and so are the signals of a channel file.
         """
         surface, factors = draw_impairments(self.scenario, len(positions), rng)
+        blocked = draw_blocked(self.scenario, len(positions), rng)
         if surface is not None and self.surface is None:
             return MeasurementModel(self.scenario, self.beams, surface)._sample(
-                positions, rng, factors)
-        return self._sample(positions, rng, factors)
+                positions, rng, factors, blocked)
+        return self._sample(positions, rng, factors, blocked)
 
     def _sample(self, positions: np.ndarray, rng: np.random.Generator,
-                factors: np.ndarray | None) -> np.ndarray:
+                factors: np.ndarray | None, blocked: np.ndarray | None) -> np.ndarray:
         if self.scenario.channel:
-            return self._traced(positions, rng, factors)
+            return self._traced(positions, rng, factors, blocked)
         signals = self.mean(positions)
+        if blocked is not None:
+            signals[blocked] = 0
         white = complex_normal(signals.shape, rng)
         if factors is None:
             for band, root in enumerate(self.root):
@@ -277,16 +279,19 @@ class MeasurementModel:
         for band, scattered in enumerate(scattered_covariance(self.scenario, self.radiation)):
             root = square_root(scattered)
             signals[:, band] += white[:, band, :root.shape[1]] @ root.T
-        received: np.ndarray = signals * factors + noise
-        return received
+        return signals * factors + noise
 
     def _traced(self, positions: np.ndarray, rng: np.random.Generator,
-                factors: np.ndarray | None) -> np.ndarray:
+                factors: np.ndarray | None, blocked: np.ndarray | None) -> np.ndarray:
         signals = self._of_bands(positions, (), lambda block, band: received_signal(
             direct_gain(self.scenario, block, band), 0.0, self.radiation[band], 0.0))
+        if blocked is not None and blocked.any():
+            for band, radiation in enumerate(self.radiation):
+                signals[blocked, band] = received_signal(
+                    direct_gain(self.scenario, positions[blocked], band, np.ones(
+                        int(blocked.sum()), bool)), 0.0, radiation, 0.0)
         noise = np.sqrt(self.scenario.noise_power_w) * complex_normal(signals.shape, rng)
-        received: np.ndarray = signals * (1.0 if factors is None else factors) + noise
-        return received
+        return signals * (1.0 if factors is None else factors) + noise
 
     @functools.cached_property
     def _weights(self) -> 'ElementSums':

@@ -7,10 +7,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rhs_isac_ros.model import plugins
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.support import plugins
 
 KINDS = ('static', 'waypoints', 'random_walk')
 
@@ -155,8 +155,7 @@ class RandomWalk(StraightMobility):
                    self._departure_s + self._duration_s)
 
     def _draw(self) -> np.ndarray:
-        position: np.ndarray = self._scenario.sample_positions(1, self._rng)[0]
-        return position
+        return self._scenario.sample_positions(1, self._rng)[0]
 
     def _begin_leg(self) -> None:
         """Compute the velocity and the duration of a leg once: a node may have many users."""
@@ -204,5 +203,4 @@ def make_plugin(
 
 
 def _checked_position(position: ArrayLike) -> np.ndarray:
-    checked: np.ndarray = checked_positions(np.asarray(position, dtype=float)[None])[0]
-    return checked
+    return checked_positions(np.asarray(position, dtype=float)[None])[0]

@@ -273,8 +273,7 @@ def frequency_correlation(
     """Implements Eq. (3). Correlation rho_f of two sub-bands, complex128; indices broadcast."""
     frequencies = subband_frequencies_hz(scenario)[band]
     difference = frequencies[first] - frequencies[second]
-    correlation: np.ndarray = 1 / (1 + 2j * np.pi * _fields(scenario).delay_spread_s * difference)
-    return correlation
+    return 1 / (1 + 2j * np.pi * _fields(scenario).delay_spread_s * difference)
 
 
 def time_correlation(
@@ -286,8 +285,7 @@ def time_correlation(
     # Every node imports this module, and SciPy takes longer to load than ROS.
     from scipy.special import j0
 
-    correlation: np.ndarray = j0(2 * np.pi * doppler_hz * lag_s)
-    return correlation
+    return j0(2 * np.pi * doppler_hz * lag_s)
 
 
 @functools.lru_cache(maxsize=16)
@@ -324,8 +322,7 @@ def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np
     """
     scattered = np.matmul(declared_covariance(scenario).scatter(radiation),
                           np.conj(np.swapaxes(other, 1, 2)))
-    covariance: np.ndarray = measurement_correlation(scenario) * scattered
-    return covariance
+    return measurement_correlation(scenario) * scattered
 
 
 def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
@@ -381,8 +378,7 @@ def _draw_plane_waves(
             waves.elevation_weights[:, None] * waves.azimuth_weights))[:, None]
         drawn = drawn + np.einsum(
             'ez,eny->nzy', waves.along_z, np.matmul(amplitudes, waves.along_y), optimize=True)
-    gains: np.ndarray = np.sqrt(_mean_power(scenario, band)) * drawn
-    return gains
+    return np.sqrt(_mean_power(scenario, band)) * drawn
 
 
 @functools.lru_cache(maxsize=16)
@@ -410,8 +406,7 @@ def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
 
 def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Draw circularly symmetric complex normal numbers of unit variance, complex128."""
-    numbers: np.ndarray = rng.standard_normal((*shape, 2)).view(complex)[..., 0] * np.sqrt(0.5)
-    return numbers
+    return rng.standard_normal((*shape, 2)).view(complex)[..., 0] * np.sqrt(0.5)
 
 
 def _fields(scenario: Scenario) -> Scenario | MultipathEstimate:

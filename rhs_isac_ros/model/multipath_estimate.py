@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model.files import ArchiveError, ArrayFile, read_archive, write_archive
+from rhs_isac_ros.support.files import ArchiveError, ArrayFile, read_archive, write_archive
 
 _FORMAT = 1
 # Fields of the scenario that a measured covariance replaces.

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model.files import ArchiveError, ArrayFile, read_arrays, write_whole
+from rhs_isac_ros.support.files import ArchiveError, ArrayFile, read_arrays, write_whole
 
 _SPEED_OF_LIGHT_MPS = 299_792_458.0
 # Largest ratio of a centre frequency to the frequency of the paths, or the inverse.
@@ -151,22 +151,18 @@ class PathChannel(ArrayFile):
     def sources(self) -> np.ndarray:
         """Sources in full precision, float64 [N, P, 3] [m]; that of a direct path is the user."""
         missing, direct = (self.a == 0)[..., None], (self.n == 0)[..., None]
-        sources: np.ndarray = np.where(missing | direct, self.users[:, None], self.src)
-        return sources
+        return np.where(missing | direct, self.users[:, None], self.src)
 
     @functools.cached_property
     def coefficients(self) -> np.ndarray:
         """Amplitudes relative to free space over the same distance, complex128 [N, P]."""
         distance = np.linalg.norm(self.sources, axis=2)
-        coefficients: np.ndarray = (
-            self.a * 4 * np.pi * self.f0 * distance / _SPEED_OF_LIGHT_MPS)
-        return coefficients
+        return self.a * 4 * np.pi * self.f0 * distance / _SPEED_OF_LIGHT_MPS
 
     def nearest(self, positions: np.ndarray) -> np.ndarray:
         """Return the index of the user nearest to each position [N, 3] [m], int64 [N]."""
         squares = np.sum((positions[:, None] - self.users)**2, axis=2)
-        nearest: np.ndarray = np.argmin(squares, axis=1)
-        return nearest
+        return np.argmin(squares, axis=1)
 
     def content(self) -> tuple[np.ndarray, ...]:
         """Return the arrays that the digest covers."""

@@ -3,11 +3,11 @@
 import numpy as np
 
 from rhs_isac_ros.model.impairments import ElementErrors, draw_impairments
-from rhs_isac_ros.model.los import checked_positions, direct_gain
+from rhs_isac_ros.model.los import checked_positions, direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Phases simulated at a time. The random numbers of a seed depend on it.
 _BLOCK = 256
@@ -38,8 +38,7 @@ def received_signal(
     combined = direct.reshape(*los.shape[:-2], -1)
     if np.ndim(multipath):
         combined = combined + np.einsum('...rm,rm->...r', multipath, radiation)
-    received: np.ndarray = combined * symbol + noise
-    return received
+    return combined * symbol + noise
 
 
 @one_blas_thread
@@ -66,6 +65,7 @@ def simulate_received(
     """
     positions = checked_positions(positions)
     drawn, factors = draw_impairments(scenario, len(positions), rng)
+    blocked = draw_blocked(scenario, len(positions), rng)
     surface = surface or drawn
     radiation = radiation_matrix(
         scenario, surface.applied_beams(codebook) if surface else codebook)
@@ -74,8 +74,9 @@ def simulate_received(
     amplitude = np.sqrt(scenario.noise_power_w)
     for start in range(0, len(positions), _BLOCK):
         block = positions[start:start + _BLOCK]
+        hidden = None if blocked is None else blocked[start:start + _BLOCK]
         for band in range(n_bands):
-            los = direct_gain(scenario, block, band)
+            los = direct_gain(scenario, block, band, hidden)
             gains = (0.0 if scenario.channel
                      else draw_multipath(scenario, band, len(block), rng))
             noise = amplitude * complex_normal((len(block), n_measurements), rng)

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model import plugins
-from rhs_isac_ros.model.files import ArchiveError, ArrayFile, read_yaml
 from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
 from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
 from rhs_isac_ros.model.path_channel import PathChannel
-from rhs_isac_ros.model.plugins import PluginError
+from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.files import ArchiveError, ArrayFile, read_yaml
+from rhs_isac_ros.support.plugins import PluginError
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 # Relative rounding of differences between frequencies.
@@ -176,6 +176,13 @@ class Extensions:
         (), 0.0, 1e300,
         'Impairments of installed plug-ins: a mapping of names to strengths, each in the unit '
         'that the plug-in documents.', '', label='impairments')
+    blocked_probability: float = declare(
+        0.0, 0.0, 1.0,
+        'Probability that a user has no direct path; drawn once per user. The signals are then '
+        'multipath, of a level that estimators assume to be known within 10 dB. Bounds are those '
+        'of users in sight.', '',
+        'probability of the line of sight, 3GPP TR 38.901, section 7.4.2',
+        label='share of blocked users')
     multipath: MultipathEstimate | None = declare(
         None, 0.0, 0.0,
         'File of a measured covariance of the multipath, as a survey estimates it; it replaces '
@@ -295,7 +302,7 @@ class Scenario(Extensions, Table1):
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
         changes, fields = self.changes(), self.fields()
-        for name in ('impairments', 'multipath_direction_deg', *_FILES):
+        for name in ('impairments', 'multipath_direction_deg', 'blocked_probability', *_FILES):
             # Identifiers in existing files precede these fields.
             if name not in changes:
                 del fields[name]

@@ -32,8 +32,7 @@ def element_signals(los: np.ndarray, multipath: np.ndarray, symbol: complex) -> 
 
     Returns complex128 [..., N_E] for gains of the same shape.
     """
-    signals: np.ndarray = (los + multipath) * symbol
-    return signals
+    return (los + multipath) * symbol
 
 
 def feed_signals(
@@ -51,9 +50,8 @@ def feed_signals(
     elements
         Element signals tau, complex128 [N_SB, N_E].
     """
-    signals: np.ndarray = np.einsum(
+    return np.einsum(
         'jm,jkm->jk', analog * elements, onboard_matrix(scenario)[band])
-    return signals
 
 
 def onboard_gain(
@@ -65,8 +63,7 @@ def onboard_gain(
     """
     distance = np.linalg.norm(sink - source, axis=-1)
     wavenumber = 2 * np.pi * scenario.refractive_index * frequency_hz / SPEED_OF_LIGHT_MPS
-    gain: np.ndarray = np.exp(-1j * wavenumber * distance)
-    return gain
+    return np.exp(-1j * wavenumber * distance)
 
 
 def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
@@ -79,8 +76,7 @@ def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -
     noise
         Thermal noise e, complex128 [...], or 0.
     """
-    combined: np.ndarray = np.einsum('...k,...k->...', digital, feeds) + noise
-    return combined
+    return np.einsum('...k,...k->...', digital, feeds) + noise
 
 
 def radiation_matrix(scenario: Scenario, beams: Beamforming) -> np.ndarray:
@@ -133,5 +129,4 @@ def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
         B_j, complex128 [N_SB, K, N_E].
     """
     interference = np.einsum('jm,jkm->m', los, onboard).real
-    configuration: np.ndarray = (interference / (np.abs(interference).max() or 1.0) + 1) / 2
-    return configuration
+    return (interference / (np.abs(interference).max() or 1.0) + 1) / 2

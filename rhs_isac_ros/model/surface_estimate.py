@@ -61,8 +61,7 @@ class SurfaceEstimate(SurfaceModel):
 
     def std(self) -> np.ndarray:
         """Return the standard deviations of the rows of `factor`, float64 [2 N_E + N_B]."""
-        std: np.ndarray = np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
-        return std
+        return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
 
     def without_errors(self) -> 'SurfaceEstimate':
         """Return an estimate that takes the means as exact."""
@@ -70,8 +69,7 @@ class SurfaceEstimate(SurfaceModel):
 
     def applied(self, analog: np.ndarray) -> np.ndarray:
         """Return the expected coefficients, complex128, for configurations [..., N_E]."""
-        coefficients: np.ndarray = self.gains * analog + self.offsets
-        return coefficients
+        return self.gains * analog + self.offsets
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
         """Return the expected beamforming in effect, with the gains of the bands."""
@@ -87,9 +85,8 @@ class SurfaceEstimate(SurfaceModel):
         def direct(band: int, positions: np.ndarray) -> np.ndarray:
             design = direct_design(scenario, radiation, band, positions)
             mean = design @ np.concatenate([self.gains, self.offsets])
-            errors: np.ndarray = self.band_gains[band] * (
+            return self.band_gains[band] * (
                 design @ of_elements + mean[..., None] * of_bands[band])
-            return errors
 
         return scattered * np.abs(self.band_gains[:, None, None])**2, direct
 
@@ -114,8 +111,7 @@ def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,
     """
     los = los_gain(scenario, positions, band)
     by_measurement = np.repeat(np.concatenate([los, los], axis=-1), scenario.n_frames, axis=1)
-    design: np.ndarray = by_measurement * radiation[band]
-    return design
+    return by_measurement * radiation[band]
 
 
 def scattered_errors(
@@ -127,5 +123,4 @@ def scattered_errors(
     """
     spatial = np.tile(multipath_covariance(scenario), (1, 2, 2))
     products = np.matmul(radiation @ (spatial * errors), np.conj(np.swapaxes(radiation, 1, 2)))
-    covariance: np.ndarray = measurement_correlation(scenario) * products
-    return covariance
+    return measurement_correlation(scenario) * products

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.outcomes import Outcome
+from rhs_isac_ros.protocol.events import Outcome
 
 # Older cycles that still lack a message are discarded, because it will no longer arrive.
 _MAX_OPEN_CYCLES = 16

@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_steps import State
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Send
-from rhs_isac_ros.protocol.outcomes import Outcome, kind_of
+from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Outcome, Send, kind_of
 
 # Percentiles are computed over this number of latest durations.
 _MAX_DURATIONS = 512

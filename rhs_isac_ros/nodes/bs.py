@@ -10,11 +10,13 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import streams
 from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.events import (
     Action,
+    Event,
+    LocateRequested,
     PauseRequested,
     Reply,
     Resumed,
@@ -23,11 +25,17 @@ from rhs_isac_ros.protocol.events import (
     StoodBy,
 )
 from rhs_isac_ros.protocol.settings import BaseStationSettings
-from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import create_or_refuse
+from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.locate import LocateServer
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.support import streams
+
+# Time in which a node that stands by sends the results of its goals [s].
+_FAREWELL_S = 0.5
 
 
 class BsNode(RoleNode[BaseStation]):
@@ -40,6 +48,12 @@ class BsNode(RoleNode[BaseStation]):
         self.start(BaseStation(
             self.scenario, self.make_settings(values), rng, self._receive,
             values.first_cycle or _cycle_from_clock()))
+        frame = Frame.of(self, values)
+        self._make_locate = functools.partial(
+            LocateServer, self, lambda user: self.dispatch(LocateRequested(user)),
+            lambda found: convert.pose(found, convert.stamp_of(found, self), frame),
+            values.max_users)
+        self._locate: LocateServer | None = self._make_locate()
         self._reply = Reply(False, '')
         for name, event in ((topics.PAUSE, PauseRequested()), (topics.RESUME, ResumeRequested()),
                             (topics.STEP, StepRequested())):
@@ -49,11 +63,36 @@ class BsNode(RoleNode[BaseStation]):
 
     def stand_by(self) -> None:
         """Abandon the cycle, and wait."""
+        self._end_locate(_FAREWELL_S)
         self.dispatch(StoodBy())
 
     def resume(self) -> None:
         """Begin cycles once the other nodes are known to be present."""
         self.dispatch(Resumed(_cycle_from_clock()))
+        self._locate = self._make_locate()
+
+    def dispatch(self, event: Event) -> None:
+        """Pass an event to the role, and to the action."""
+        super().dispatch(event)
+        if self._locate and isinstance(event, m.PositionEstimate | m.NoFix):
+            self._locate.observe(event)
+
+    def publish(self, message: m.Message) -> bool:
+        """Publish a message, and pass it to the action."""
+        is_published = super().publish(message)
+        if is_published and self._locate and isinstance(message, m.ProtocolState):
+            self._locate.observe(message)
+        return is_published
+
+    def destroy_node(self) -> None:
+        """End the action, then destroy the node."""
+        self._end_locate()
+        super().destroy_node()  # type: ignore[no-untyped-call]
+
+    def _end_locate(self, delay_s: float = 0.0) -> None:
+        if self._locate:
+            self._locate.destroy(delay_s)
+        self._locate = None
 
     def make_settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
         """Return the settings for parameter values.

@@ -4,12 +4,12 @@ import sys
 import types
 from typing import Any
 
-from rhs_isac_ros.model import streams
-from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
+from rhs_isac_ros.protocol.channel import Channel, ImpairedChannel
+from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.support import streams
 
 
 class ChannelNode(RoleNode[ImpairedChannel]):

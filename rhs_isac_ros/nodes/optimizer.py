@@ -24,7 +24,6 @@ from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options, check
 from rhs_isac_ros.codebook.command import run as run_command
 from rhs_isac_ros.executables import print_error
-from rhs_isac_ros.model.arguments import ArgumentParser, HelpFormatter, input_file
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, qos, topics
 from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
@@ -36,6 +35,7 @@ from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
+from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_file
 
 
 class GroupParameterService(ParameterService):

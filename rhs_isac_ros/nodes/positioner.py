@@ -14,7 +14,7 @@ from nav_msgs.msg import Odometry
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import plugins, simulate_received
+from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     REGION_ESTIMATORS,
@@ -39,9 +39,11 @@ from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
 from rhs_isac_ros.ros.endpoints import UserTopics, create_publisher
+from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.support import plugins
 
 
 class PositionerNode(RoleNode[Positioner]):
@@ -51,8 +53,9 @@ class PositionerNode(RoleNode[Positioner]):
         super().__init__('positioner', **node_options)
         settings = self.make_settings(self.values)
         self._worker = BackgroundWorker(self)
+        self._frame = Frame.of(self, self.values)
         self._pose = create_publisher(
-            self, PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE)
+            self, PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE, overridable=True)
         limit = self.values.user_topics
         self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped}, limit)
         self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry}, limit)
@@ -139,7 +142,7 @@ class PositionerNode(RoleNode[Positioner]):
         if self.is_standing_by:
             return
         odometry = convert.odometry(
-            track.user, track.estimate, self.get_clock().now().to_msg())
+            track.user, track.estimate, convert.stamp_of(track, self), self._frame)
         for publisher in self._user_odometry.publishers(track.user):
             publisher.publish(odometry)
 
@@ -152,7 +155,7 @@ class PositionerNode(RoleNode[Positioner]):
         """Publish a message, and poses for an estimate; return False if it is invalid."""
         is_published = super().publish(message)
         if is_published and isinstance(message, m.PositionEstimate):
-            pose = convert.pose(message, self.get_clock().now().to_msg())
+            pose = convert.pose(message, convert.stamp_of(message, self), self._frame)
             for publisher in (self._pose, *self._user_poses.publishers(message.user)):
                 publisher.publish(pose)
         return is_published

@@ -1,5 +1,6 @@
 """The executable ``visualizer``: shows a network in RViz and Foxglove."""
 
+import copy
 import math
 import sys
 import time
@@ -8,18 +9,20 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Path
 from rclpy.node import Node
+from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rhs_isac_ros.link import Beam, beam_pattern
-from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState, UserState
+from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import markers, parameters, qos, topics, transforms
+from rhs_isac_ros.ros import convert, markers, parameters, qos, topics, transforms
 from rhs_isac_ros.ros.endpoints import (
     UserTopics,
     create_publisher,
     steady_timer,
     subscribe_messages,
 )
+from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.transforms import TransformPublisher
 
@@ -31,16 +34,18 @@ class VisualizerNode(Node):
         super().__init__('visualizer', **node_options)
         values = parameters.declare(self, 'visualizer')
         self._scenario = parameters.scenario_of(values)
+        self._frame = Frame.of(self, values)
         self._forget_s = values.forget_s
         self._scene = SceneState()
         # The latest beam and its marker, cached because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
-        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, qos.EXCHANGE)
+        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, qos.EXCHANGE,
+                                           overridable=True)
         self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path},
                                  values.user_topics)
-        self._transforms = TransformPublisher(self)
-        subscribe_messages(self, RECEIVES, self._scenario.sizes, self._on_message,
+        self._transforms = TransformPublisher(self, self._frame)
+        subscribe_messages(self, SCENE_RECEIVES, self._scenario.sizes, self._on_message,
                            scenario_id=self._scenario.id)
         steady_timer(self, values.period_s, self._show)
         self.get_logger().info(  # type: ignore[no-untyped-call]
@@ -53,7 +58,7 @@ class VisualizerNode(Node):
         # As for the topics, the number of frames is bounded: tf2 keeps every frame.
         if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
             self._transforms.publish(transforms.user(
-                message.user, message.position, self.get_clock().now().to_msg()))
+                self._frame, message.user, message.position, convert.stamp_of(message, self)))
 
     def _show(self) -> None:
         """Publish the whole scene, so that late joiners receive it."""
@@ -70,7 +75,7 @@ class VisualizerNode(Node):
         # Without publishers, the zip is empty.
         for publisher, path in zip(self._paths.publishers(user.user), paths, strict=False):
             if path and publisher.get_subscription_count():
-                publisher.publish(markers.path(path, stamp))
+                publisher.publish(markers.path(path, stamp, self._frame))
 
     def _show_markers(self, stamp: Time) -> None:
         scene = self._scene
@@ -83,6 +88,7 @@ class VisualizerNode(Node):
                 array.append(markers.estimate(user.estimate, stamp))
         if scene.beam:
             array.append(self._beam_marker(scene.beam, stamp))
+        array = [markers.place(marker, self._frame) for marker in array]
         shown = {(marker.ns, marker.id) for marker in array}
         array += [markers.deletion(*key, stamp) for key in sorted(self._shown - shown)]
         self._shown = shown
@@ -95,8 +101,9 @@ class VisualizerNode(Node):
                 self._scenario, Beam(message.analog, message.digital, message.band),
                 math.hypot(*self._scenario.roi_center_m))
             self._drawn = message, markers.beam(pattern, message.user, stamp)
-        self._drawn[1].header.stamp = stamp
-        return self._drawn[1]
+        drawn = copy.copy(self._drawn[1])
+        drawn.header = Header(stamp=stamp, frame_id=drawn.header.frame_id)
+        return drawn
 
 
 main = entry('visualizer', lambda: [VisualizerNode()])

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, plugins
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning.estimate import Estimate, Estimator, SignalError, estimate_each
 from rhs_isac_ros.positioning.estimators import (
     BayesEstimator,
@@ -35,6 +35,7 @@ from rhs_isac_ros.positioning.reference import exhaustive_posterior
 from rhs_isac_ros.positioning.simulate import simulate_pairs
 from rhs_isac_ros.positioning.tracking import Tracker, TrackEstimate
 from rhs_isac_ros.positioning.training import train
+from rhs_isac_ros.support import plugins
 
 ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
     kind.name: kind for kind in (BayesEstimator, MlEstimator, NeuralEstimator)}

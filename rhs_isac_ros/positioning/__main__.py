@@ -8,16 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arguments import (
-    ArgumentParser,
-    check_distinct,
-    input_file,
-    integer,
-    output_file,
-    positive_int,
-    seed,
-)
-from rhs_isac_ros.model.optional import MissingLibraryError
 from rhs_isac_ros.positioning.network import INPUTS
 from rhs_isac_ros.positioning.training import (
     DEFAULT_EPOCHS,
@@ -26,6 +16,16 @@ from rhs_isac_ros.positioning.training import (
     Epoch,
     train,
 )
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    integer,
+    output_file,
+    positive_int,
+    seed,
+)
+from rhs_isac_ros.support.optional import MissingLibraryError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

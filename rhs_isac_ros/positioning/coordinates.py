@@ -109,5 +109,4 @@ def likelihood_loss(offset: np.ndarray, curvature: np.ndarray) -> np.ndarray:
 
     The arguments have the shapes of `offset_to_roi`.
     """
-    loss: np.ndarray = np.einsum('mp,mpq,mq->m', offset, curvature, offset) / 2
-    return loss
+    return np.einsum('mp,mpq,mq->m', offset, curvature, offset) / 2

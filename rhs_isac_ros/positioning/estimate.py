@@ -13,10 +13,10 @@ from rhs_isac_ros.model import Scenario
 # precision.
 _MAX_MAGNITUDE = 1e3
 # Mean [3], covariance [3, 3], reason, and optionally the energy of the residual, the expected
-# energy, and the probability that the user is outside of the region.
+# energy, and the probabilities that the user is outside of the region and blocked.
 Located: TypeAlias = (
     tuple[np.ndarray, np.ndarray, str] | tuple[np.ndarray, np.ndarray, str, float]
-    | tuple[np.ndarray, np.ndarray, str, float, float, float])
+    | tuple[np.ndarray, np.ndarray, str, float, float, float, float])
 
 
 class SignalError(ValueError):
@@ -40,10 +40,13 @@ class Estimate:
         estimators that compute none.
     expected_residual
         Its mean for signals that match the model, given the modes of the posterior, float64 [] or
-        [N]; NaN without a residual, and if the user may be outside of the region.
+        [N]; NaN without a residual, and if the user may be outside of the region or blocked.
     outside_probability
         Probability that the user is outside of the region, float64 [] or [N]; NaN from estimators
         that assume a user inside. Mean and covariance are those of a user inside.
+    blocked_probability
+        Probability that there is no direct path, float64 [] or [N]; NaN from estimators that
+        assume one. Mean and covariance are those of a user in sight.
     """
 
     mean: np.ndarray
@@ -52,12 +55,12 @@ class Estimate:
     residual: float | np.ndarray = np.nan
     expected_residual: float | np.ndarray = np.nan
     outside_probability: float | np.ndarray = np.nan
+    blocked_probability: float | np.ndarray = np.nan
 
     @property
     def fix(self) -> np.ndarray:
         """Whether there is a position, bool [] or [N]."""
-        finite: np.ndarray = np.isfinite(self.mean).all(axis=-1)
-        return finite
+        return np.isfinite(self.mean).all(axis=-1)
 
 
 class Estimator(Protocol):
@@ -70,7 +73,8 @@ class Estimator(Protocol):
 
         The signals are complex128 [N_B, N_SB F], or [N, N_B, N_SB F] for N positions,
         sub-band-major; the estimate has a leading dimension N if the signals have one. It may
-        differ from those of single phases by less than a hundredth of a standard deviation.
+        differ from those of single phases: one in a thousand by more than five hundredths of a
+        standard deviation.
         """
         ...
 
@@ -96,7 +100,7 @@ def estimate_each(
     """
     batch = checked_received(scenario, codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
-    reasons, residuals = [], np.full((3, len(batch)), np.nan)
+    reasons, residuals = [], np.full((4, len(batch)), np.nan)
     for row, (position, spread, reason, *energy) in enumerate(locate(batch)):
         residuals[:len(energy), row] = energy
         reasons.append(reason)

@@ -11,7 +11,13 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.model.threads import map_blocks, one_blas_thread
+from rhs_isac_ros.positioning.alternatives import (
+    ALTERNATIVES,
+    Alternative,
+    Blocked,
+    rejection,
+    shares,
+)
 from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
@@ -21,12 +27,7 @@ from rhs_isac_ros.positioning.estimate import (
     estimate_each,
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.fit import (
-    DOUBT_LIMIT,
-    FitTest,
-    outside_probability,
-    outside_test,
-)
+from rhs_isac_ros.positioning.fit import DOUBT_LIMIT, FitTest
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, standard_normal
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
@@ -51,9 +52,8 @@ from rhs_isac_ros.positioning.search import (
     find_modes,
 )
 from rhs_isac_ros.positioning.store import load_table
+from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
-# Standard deviations of the user's gain that the test of the energy admits.
-_GAIN_REACH = 6
 # Coordinates fitted to the signals of each phase.
 _N_COORDINATES = 3
 # Number of phases that are located together.
@@ -74,28 +74,28 @@ class _Search(NamedTuple):
         Their samples.
     whitened
         Whitened signals without the parameters that they reveal, complex128 [N, N_B, N_SB F].
-    outside
-        Logarithm of the evidence for a user outside of the region, for each phase; empty if users
-        are assumed to be inside.
+    log_weights
+        Logarithm of the prior odds of each alternative times its evidence, float64 [N, A].
     """
 
     modes: Modes
     samples: Samples
     whitened: np.ndarray
-    outside: list[float]
+    log_weights: np.ndarray
 
 
 class SearchEstimator(abc.ABC):
     """An estimator from the modes of the posterior, for a uniform prior on the region of interest.
 
-    Signals that the model cannot explain at the best mode give no fix; see `fit`. Tables are kept
-    in `table_folder` between runs.
+    Signals that the model cannot explain at the best mode give no fix; see `fit`. If the scenario
+    has a `blocked_probability`, users may lack the direct path; see `alternatives`. Tables are
+    kept in `table_folder` between runs.
 
     Parameters
     ----------
     reject_outside
         Whether the user may also be outside of the region; see `outside`. If this is almost
-        certain (`fit.OUTSIDE_LIMIT`), there is no fix either. Otherwise the estimate contains its
+        certain (`outside.OUTSIDE_LIMIT`), there is no fix. Otherwise the estimate contains its
         probability, while position and covariance remain those of a user inside.
     surface
         What is known of the surface, as in `MeasurementModel`; for example a calibration.
@@ -111,13 +111,16 @@ class SearchEstimator(abc.ABC):
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None, *, reject_outside: bool = False,
             surface: Surface | None = None) -> None:
-        self._rejects_outside = reject_outside
         self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
         arrays = load_table(likelihood.model, codebook.id, table_folder)
         self._grid = TemplateTable(scenario, arrays)
-        self._outside = Outside(scenario, arrays)
+        self._alternatives: list[Alternative] = []
+        if reject_outside:
+            self._alternatives.append(Outside(scenario, arrays))
+        if scenario.blocked_probability:
+            self._alternatives.append(Blocked(scenario))
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
-        self._test = FitTest(n_measurements, float(arrays['energy'].min()))
+        self._test = FitTest(n_measurements)
         self._bounds = likelihood.resolution.bounds_m
         self._volume_m3 = likelihood.resolution.volume_m3
         self._alignment = Alignment(likelihood, self._grid.spread)
@@ -125,8 +128,6 @@ class SearchEstimator(abc.ABC):
         self._failures = (FailedElements(likelihood, self._grid)
                           if surface is None and can_enumerate(scenario) else None)
         self._dispersed = None if self._failures else DispersedLikelihood.of(likelihood)
-        # Weak signals may be those of a user with a low gain.
-        self._max_power = np.exp(2 * _GAIN_REACH * prior.gain_std)
         # Twice an energy has two degrees of freedom for each complex measurement, less one for
         # each fitted parameter.
         n_fitted = _N_COORDINATES + len(prior)
@@ -189,7 +190,8 @@ class SearchEstimator(abc.ABC):
 
     def _locate_block(self, signals: Signals) -> list[tuple[Located, Modes | None]]:
         """Locate phases together: position or reason, and modes if there is a position."""
-        energies = np.sum(np.abs(signals.whitened)**2, axis=(1, 2)) * self._max_power
+        energies = (np.sum(np.abs(signals.received)**2, axis=(1, 2))
+                    / self.scenario.noise_power_w)
         reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
         results: list[tuple[Located, Modes | None]] = [
             ((*_no_fix(), reason), None) for reason in reasons]
@@ -223,17 +225,18 @@ class SearchEstimator(abc.ABC):
         else:
             samples = draw_samples(modes, self._normal, self._bounds)
         whitened = likelihood.whitened(aligned, signals)
-        outside: list[float] = []
-        if self._rejects_outside:
-            outside = [self._outside.log_evidence_of(*phase, likelihood.nuisance)
-                       for phase in zip(whitened, aligned, strict=True)]
-        return _Search(modes, samples, whitened, outside)
+        log_weights = np.array([
+            [one.log_odds + one.log_evidence_of(*phase, likelihood.nuisance)
+             for one in self._alternatives] for phase in zip(whitened, aligned, strict=True)])
+        return _Search(modes, samples, whitened, log_weights)
 
     def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None]]:
         """Yield the position of each phase, or why there is none, and its modes."""
         modes = found.modes
         samples = WeightedSamples.of(found.samples, modes)
-        evidence = samples.log_evidence(self._volume_m3)
+        log_weights = np.column_stack(
+            [samples.log_evidence(self._volume_m3), found.log_weights])
+        probabilities = shares(log_weights)
         means, covariances = self._moments(modes, samples)
         # Averaged over the posterior, the energy of a model that holds has the mean of a
         # chi-square variable. At the best of several modes it is smaller, by the difference from
@@ -242,28 +245,38 @@ class SearchEstimator(abc.ABC):
         likelihood = modes.roi_log_likelihood
         ends = [*samples.starts[1:].tolist(), len(modes.phases)]
         for row, (start, end) in enumerate(zip(samples.starts.tolist(), ends, strict=True)):
-            residual = float(modes.residual[start + np.argmax(likelihood[start:end])])
-            outside = np.nan
-            if self._rejects_outside:
-                outside = outside_probability(evidence[row] - found.outside[row])
-            reason = self._reason(found.whitened[row], residual, outside)
+            best = start + int(np.argmax(likelihood[start:end]))
+            residual = float(modes.residual[best])
+            gain = modes.values[best] @ self._likelihood.nuisance.gain
+            reason = self._reason(
+                found.whitened[row] * np.exp(-gain), residual, log_weights[row])
             moments = _no_fix() if reason else (means[row], covariances[row])
-            is_certain = (not outside > DOUBT_LIMIT
-                          or self._test.residual_test(residual) == reason != '')
-            yield ((*moments, reason, residual, expected[row] + residual if is_certain else np.nan,
-                    outside), None if reason else modes.select(slice(start, end)))
+            # Of signals without a fix, only a residual that nothing explains is evidence against
+            # the scenario.
+            counts = (reason == self._test.residual_test(residual) if reason
+                      else probabilities[row, 0] >= 1 - DOUBT_LIMIT)
+            by_name = {one.name: float(share) for one, share in zip(
+                self._alternatives, probabilities[row, 1:], strict=True)}
+            outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
+            yield ((*moments, reason, residual, expected[row] + residual if counts else np.nan,
+                    outside, blocked),
+                   None if reason else modes.select(slice(start, end)))
 
-    def _reason(self, whitened: np.ndarray, residual: float, outside: float) -> str:
+    def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
         """Return why there is no fix, empty if there is one.
 
-        If no position of the region explains the signals, one outside has to explain them for
-        the user to be there.
+        If no position of the region explains the signals, an alternative has to explain them to
+        be the reason.
         """
-        unexplained = self._test.residual_test(residual)
-        if not self._rejects_outside or unexplained and not self._outside.explain(
-                whitened, self._test.max_residual):
-            return unexplained
-        return outside_test(outside) or unexplained
+        unexplained = self._test.residual_test(residual) or self._test.weak_test(
+            float(np.sum(np.abs(whitened)**2)), residual)
+        for index in np.argsort(-log_weights[1:]).tolist():
+            one = self._alternatives[index]
+            share = float(shares(log_weights[None, [0, 1 + index]])[0, 1])
+            reason = rejection(one, share)
+            if reason and (not unexplained or one.explain(whitened, self._test.max_residual)):
+                return reason
+        return unexplained
 
 
 class BayesEstimator(SearchEstimator):

@@ -151,8 +151,7 @@ class FailedElements:
 
     def _aligned(self, values: np.ndarray) -> np.ndarray:
         """Return the parameters [Q] that a search on the grid must know, and 0 for the others."""
-        result: np.ndarray = values * self._likelihood.nuisance.moves_multipath
-        return result
+        return values * self._likelihood.nuisance.moves_multipath
 
     def _converge(self, search: 'FailureSearch', signals: Signals
                   ) -> tuple[Modes, list['FailedSet']]:
@@ -391,8 +390,7 @@ class FailureModel:
                               (len(site.amplitudes), len(failed), *columns.shape[1:]))
         parts = np.concatenate([columns + site.changes, own, site.amplitudes[:, None]], axis=1)
         value = self._predicted(site, parts, extended, len(failed) + 1)
-        result: np.ndarray = (len(failed) + 1) * self._log_odds - extended.log_volume + value
-        return result
+        return (len(failed) + 1) * self._log_odds - extended.log_volume + value
 
     def _predicted(self, site: Site, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
@@ -444,8 +442,7 @@ class FailureModel:
         # A product of two vectors plus its conjugate transpose, and one of the amplitudes.
         left = np.stack([shift, cross, power * spread], axis=-1)
         right = np.stack([cross, shift, spread], axis=-1)
-        result: np.ndarray = self._correlation * np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
-        return result
+        return self._correlation * np.matmul(left, np.conj(np.swapaxes(right, 2, 3)))
 
 
 class FailureSearch:

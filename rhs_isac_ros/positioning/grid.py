@@ -17,7 +17,6 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.threads import map_blocks
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     is_inside,
@@ -33,18 +32,20 @@ from rhs_isac_ros.positioning.lattice import (
     subband_wavenumbers,
 )
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
+from rhs_isac_ros.support.threads import map_blocks
 
 # Number of points that represent a standard Gaussian.
 _N_NORMAL = 128
 # Number of templates to compute at a time.
 _BLOCK = 128
 # Fine range steps per shortest wavelength; at least four are needed to resolve the posterior.
-STEPS_PER_WAVELENGTH = 8
+_STEPS_PER_WAVELENGTH = 8
 # Number of outputs to compute at a time, which limits the number of phases.
 _N_OUTPUTS = 1 << 18
 # Cells of a phase that are examined first. They show how likely others have to be.
 _N_FIRST = 48
-# Largest number of range steps of a phase that are examined further, which limits memory.
+# Largest number of peaks of a phase that are examined further, which limits memory and time. Only
+# signals below the noise have more; the rest of them have little weight.
 _MAX_PEAKS = 8192
 # Squared Mahalanobis distance below which points belong to the same mode.
 _SAME_MODE = 2.0
@@ -125,8 +126,7 @@ def standard_normal(n: int) -> np.ndarray:
     from scipy.special import ndtri
     from scipy.stats import qmc
 
-    result: np.ndarray = ndtri(np.clip(qmc.Sobol(3, seed=0).random(n), 1e-6, 1 - 1e-6))
-    return result
+    return ndtri(np.clip(qmc.Sobol(3, seed=0).random(n), 1e-6, 1 - 1e-6))
 
 
 class TemplateTable:
@@ -173,7 +173,7 @@ class TemplateTable:
         low_m = np.repeat(grid.ranges_m - grid.widths_m / 2, counts)
         self._window_ranges_m = low_m + (place + 0.5) * width_m
         self._window_turns = self._turns(self._window_ranges_m).astype(np.complex64)
-        n_fine = int(np.ceil(width_m.max() / wavelength_m * STEPS_PER_WAVELENGTH))
+        n_fine = int(np.ceil(width_m.max() / wavelength_m * _STEPS_PER_WAVELENGTH))
         # One step more at either end, so that a maximum is within some window.
         self._step_m = width_m.max() / n_fine
         self._offsets_m = (np.arange(n_fine + 2) - (n_fine + 1) / 2) * self._step_m
@@ -183,9 +183,7 @@ class TemplateTable:
 
     def _turns(self, ranges_m: np.ndarray) -> np.ndarray:
         """Factors of the templates' conjugates at ranges [R], complex128 [N_B, N_SB, R]."""
-        turns: np.ndarray = np.exp(
-            1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
-        return turns
+        return np.exp(1j * self._wavenumbers[..., None] * ranges_m) / ranges_m
 
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Starts':
         """Find the most likely separate points, to the accuracy of one Gauss-Newton step.
@@ -322,8 +320,7 @@ class TemplateTable:
             return amplitude
         bounds = [self._over_gain(one, energy, prior)[0]
                   for one, energy in zip(amplitude, energies.tolist(), strict=True)]
-        over_gain: np.ndarray = np.stack(bounds) - template_energy
-        return over_gain
+        return np.stack(bounds) - template_energy
 
     def _over_gain(self, amplitude: np.ndarray, energy: float, prior: NuisancePrior
                    ) -> tuple[np.ndarray, np.ndarray]:
@@ -418,8 +415,7 @@ class TemplateTable:
 
     def _cell_ranges(self, cells: np.ndarray) -> np.ndarray:
         """Ranges of the cells of pairs [K], float64 [K] [m]."""
-        ranges_m: np.ndarray = self._grid.ranges_m[self._grid.cell[cells]]
-        return ranges_m
+        return self._grid.ranges_m[self._grid.cell[cells]]
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
@@ -510,8 +506,7 @@ def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) 
     total = np.add.reduceat(np.exp(relative), firsts)
     # No point after one is heavier.
     n_left = np.repeat(firsts + counts, counts) - np.arange(len(phases))
-    kept: np.ndarray = relative + np.log(n_left) > np.repeat(np.log(total), counts) - margin
-    return kept
+    return relative + np.log(n_left) > np.repeat(np.log(total), counts) - margin
 
 
 def _are_maxima(values: np.ndarray) -> np.ndarray:

@@ -80,7 +80,7 @@ class Resolution(NamedTuple):
         """Derive the lengths from a scenario."""
         elements = element_positions(scenario)
         wavenumber = subband_wavenumbers(scenario).max()
-        bounds = cls.thick_bounds(scenario)
+        bounds = _thick_bounds(scenario)
         low, high = bounds
         nearest, farthest = np.clip(0.0, low, high), np.maximum(np.abs(low), np.abs(high))
         directions = np.empty((2, 2))
@@ -97,17 +97,6 @@ class Resolution(NamedTuple):
             SPEED_OF_LIGHT_MPS / (np.pi * scenario.n_subbands * scenario.subband_width_hz),
             max(float(np.linalg.norm(nearest)), _MIN_RANGE * farthest_m), farthest_m, directions,
             bounds)
-
-    @staticmethod
-    def thick_bounds(scenario: Scenario) -> np.ndarray:
-        """Return the bounds of the region, at least a fraction of a wavelength apart, [2, 3]."""
-        bounds = scenario.roi_bounds_m
-        thickness_m = _MIN_THICKNESS * SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-        center = np.array(scenario.roi_center_m)
-        thick = np.stack([center - thickness_m / 2, center + thickness_m / 2])
-        result: np.ndarray = np.where(
-            np.array(scenario.roi_size_m) < thickness_m, thick, bounds)
-        return result
 
     @property
     def volume_m3(self) -> float:
@@ -139,14 +128,21 @@ class Resolution(NamedTuple):
         """Curvature of the log-likelihood in (r, u, v) to add everywhere, [3]."""
         extent = np.array([self.farthest_m - self.nearest_m,
                            *(self.directions[:, 1] - self.directions[:, 0])])
-        floor: np.ndarray = 12 * _FLOOR / np.maximum(
+        return 12 * _FLOOR / np.maximum(
             extent, _MIN_RANGE * np.array([self.farthest_m, 1.0, 1.0]))**2
-        return floor
 
     @property
     def tolerance_m(self) -> float:
         """Distance in range below which a point is in the region."""
         return _TOLERANCE_WAVELENGTHS * self.wavelength_m
+
+
+def _thick_bounds(scenario: Scenario) -> np.ndarray:
+    """Return the bounds of the region, at least a fraction of a wavelength apart, [2, 3]."""
+    thickness_m = _MIN_THICKNESS * SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+    center = np.array(scenario.roi_center_m)
+    thick = np.stack([center - thickness_m / 2, center + thickness_m / 2])
+    return np.where(np.array(scenario.roi_size_m) < thickness_m, thick, scenario.roi_bounds_m)
 
 
 def subband_wavenumbers(scenario: Scenario) -> np.ndarray:

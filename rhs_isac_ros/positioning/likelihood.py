@@ -183,13 +183,11 @@ class NuisancePrior:
         """
         operators = self._multiplying(root, whitener)
         both = operators + np.conj(np.swapaxes(operators, 2, 3))
-        information: np.ndarray = np.einsum('aimn,binm->ab', both, both, optimize=True).real
-        return information
+        return np.einsum('aimn,binm->ab', both, both, optimize=True).real
 
     def _multiplying(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
         """Compute W P W^-1, which multiplies whitened signals, [Q, N_B, N_SB F, N_SB F]."""
-        operators: np.ndarray = np.matmul(whitener * self.patterns[:, :, None], root)
-        return operators
+        return np.matmul(whitener * self.patterns[:, :, None], root)
 
     def sources(self, mean: np.ndarray, divided: np.ndarray) -> np.ndarray:
         """Choose the signals whose derivatives contain the information about the parameters.
@@ -198,25 +196,30 @@ class NuisancePrior:
         whitening; returns [M, Q, N_B, N_SB F]. A parameter that moves the multipath is visible in
         the multipath that was received; the information about it varies from phase to phase.
         """
-        chosen: np.ndarray = np.where(
+        return np.where(
             self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
-        return chosen
 
     def slopes(self, whitened: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
         slopes = np.einsum('qimn,kin->kqim', self._operators, whitened, optimize=True)
-        result: np.ndarray = slopes.reshape(*slopes.shape[:2], -1)
-        return result
+        return slopes.reshape(*slopes.shape[:2], -1)
 
     def band_angles(self, values: np.ndarray) -> np.ndarray:
         """Return the phases of the bands for parameters [M, Q], float64 [M, N_B] [rad]."""
-        result: np.ndarray = values @ self.phases.T
-        return result
+        return values @ self.phases.T
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
         """Logarithm of prior and volume of parameters [M, Q], float64 [M]."""
-        result: np.ndarray = -(values**2 @ self.precision / 2 + values @ self.volume)
-        return result
+        return -(values**2 @ self.precision / 2 + values @ self.volume)
+
+    def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
+        """Integrate over the parameters that move the multipath by Laplace's method.
+
+        Takes the values [Q] that the signals alone reveal, relative to which the result is.
+        """
+        (moves,) = np.nonzero(self.moves_multipath)
+        curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
+        return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
         """Sum the outputs of the bands' matched filters in their most likely phases.
@@ -227,8 +230,7 @@ class NuisancePrior:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
                  for output, std in zip(outputs, self.phase_std_rad, strict=True)]
-        total: np.ndarray = np.sum(parts, axis=0)
-        return total
+        return np.sum(parts, axis=0)
 
     def over_gain(self, amplitude: np.ndarray, energy: float, n_rows: int
                   ) -> tuple[np.ndarray, np.ndarray]:
@@ -265,8 +267,7 @@ class NuisancePrior:
         """Turn every band by the angle of its filter's output [M, N_B], if phases are uniform."""
         change = np.zeros_like(values)
         change[:, -outputs.shape[1]:] = np.angle(outputs) / _UNIFORM_EQUIVALENT
-        result: np.ndarray = values + change
-        return result
+        return values + change
 
 
 class Likelihood:
@@ -343,8 +344,7 @@ class Likelihood:
     def outputs(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Compute the outputs of the bands' matched filters, complex128 [M, N_B]."""
         mean = self.model.whiten(self.model.mean(to_positions(points)))
-        result: np.ndarray = np.sum(mean.conj() * self.whitened(values, signals), axis=2)
-        return result
+        return np.sum(mean.conj() * self.whitened(values, signals), axis=2)
 
     @functools.cached_property
     def log_volume(self) -> float:
@@ -400,8 +400,7 @@ def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
 
 def log_determinant(roots: np.ndarray) -> np.ndarray:
     """Logarithm of the determinants from Cholesky factors [..., S, S], float64 [...]."""
-    result: np.ndarray = 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
-    return result
+    return 2 * np.log(np.diagonal(roots, axis1=-2, axis2=-1).real).sum(axis=-1)
 
 
 class DispersedLikelihood:
@@ -575,9 +574,7 @@ class Alignment:
         if prior.gain_std:
             cost = received.size * np.log(cost)
         cost += candidates**2 @ prior.precision / 2
-        result: np.ndarray = candidates[np.argmin(cost)]
-        return result
+        return candidates[np.argmin(cost)]
 
     def _whitened(self, signals: np.ndarray) -> np.ndarray:
-        result: np.ndarray = np.einsum('irs,nis->nir', self._whitener, self._model.whiten(signals))
-        return result
+        return np.einsum('irs,nis->nir', self._whitener, self._model.whiten(signals))

@@ -260,8 +260,7 @@ def _moved(mixture: Mixture, time_s: float) -> tuple[np.ndarray, np.ndarray]:
 def _isotropic(points: np.ndarray) -> np.ndarray:
     """Covariance of (r, u, v) for the unit covariance of the position, float64 [C, 3, 3]."""
     inverse = np.linalg.inv(jacobian(points))
-    covariance: np.ndarray = np.matmul(inverse, np.swapaxes(inverse, 1, 2))
-    return covariance
+    return np.matmul(inverse, np.swapaxes(inverse, 1, 2))
 
 
 def _in_front(positions: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model.files import ArchiveError, read_archive, write_archive
 from rhs_isac_ros.positioning.estimate import stack_parts
+from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 _FORMAT = 1
 # Keys of the file that differ from the names of the fields.
@@ -17,8 +17,7 @@ _FILE_KEYS = {'max_energy': 'loudest'}
 
 def magnitudes(signals: np.ndarray) -> np.ndarray:
     """Flatten complex signals [N, N_B, N_SB F] to their magnitudes, float64 [N, N_B N_SB F]."""
-    flat: np.ndarray = np.abs(signals.reshape(len(signals), -1))
-    return flat
+    return np.abs(signals.reshape(len(signals), -1))
 
 
 # Inputs of a network as functions of the received signals. The paper does not specify them.
@@ -91,8 +90,7 @@ class Network:
         """Map received signals, complex128 [N, N_B, N_SB F], to positions, float64 [N, 3] [m]."""
         inputs = (INPUTS[self.inputs](received) - self.input_mean) / self.input_scale
         hidden = np.maximum(inputs @ self.w_in + self.b_in, 0.0)
-        positions: np.ndarray = hidden @ self.w_out + self.b_out + self.center
-        return positions
+        return hidden @ self.w_out + self.b_out + self.center
 
     def save(self, path: str | Path) -> None:
         """Write the model to a file of NumPy's format ``.npz``, without pickled objects.

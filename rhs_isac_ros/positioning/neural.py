@@ -7,10 +7,10 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.positioning.fit import FitTest
 from rhs_isac_ros.positioning.network import ModelError, Network
+from rhs_isac_ros.support.threads import one_blas_thread
 
 
 class NeuralEstimator:

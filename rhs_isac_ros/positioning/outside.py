@@ -14,12 +14,14 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, to_positions
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
 
+# Probability of a user outside above which there is no fix.
+OUTSIDE_LIMIT = 0.99
 # Relative to the nearest range of the region: distance from it up to which a user may be located
 # at its border, and nearest range outside.
 _BORDER = 0.1
@@ -88,6 +90,10 @@ class Outside:
         The arrays that `tabulate_outside` returns for the scenario and a codebook.
     """
 
+    name, reason, limit = 'outside', 'position outside of the region', OUTSIDE_LIMIT
+    # As many users are outside as inside.
+    log_odds = 0.0
+
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
         self._filters, index = arrays['outer_filters'], arrays['outer_index']
         self._index = index
@@ -103,18 +109,9 @@ class Outside:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
                         ) -> float:
-        """Compute the logarithm of the evidence with the nuisance parameters integrated out.
+        """Compute the evidence, as `Alternative` describes.
 
-        Parameters that move the multipath are integrated by Laplace's method, and the gain
-        numerically. Phases have no effect.
-
-        Parameters
-        ----------
-        whitened
-            Whitened signals of one phase without the aligned parameters, complex128
-            [N_B, N_SB F].
-        aligned
-            Parameters that the signals alone reveal, float64 [Q]; 0 for the others.
+        The gain is integrated numerically; phases have no effect.
         """
         gain = np.zeros(1)
         if prior.gain_std:
@@ -122,12 +119,8 @@ class Outside:
             gain = prior.gain_std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
         evidence = self.log_evidence(whitened, np.exp(-gain)) - 2 * whitened.size * gain
         weights = -gain**2 / (2 * (prior.gain_std or 1.0)**2)
-        total = _log_sum(evidence + weights) - _log_sum(weights)
-        (moves,) = np.nonzero(prior.moves_multipath)
-        if len(moves):
-            curvature = prior.information[np.ix_(moves, moves)] + np.diag(prior.precision[moves])
-            total -= prior.precision @ aligned**2 / 2 + np.linalg.slogdet(curvature)[1] / 2
-        return float(total)
+        return (_log_sum(evidence + weights) - _log_sum(weights)
+                + prior.log_evidence_of_aligned(aligned))
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
         """Compute the logarithm of the likelihood averaged over the prior, for each scale.
@@ -145,12 +138,12 @@ class Outside:
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
         # Whatever the range, the log-likelihood is at most that of outputs in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
-        chosen = np.flatnonzero(bound >= bound.max() - _MARGIN)
-        filtered, offset = filtered[:, :, chosen], self._offset[:, chosen]
         values = []
         for scale in scales:
-            argument = filtered[:, self._index] * (np.float32(scale) * self._scale)
-            log_likelihood = np.sum(_log_bessel(argument), axis=0) + offset
+            # Small factors make directions more alike.
+            chosen = np.flatnonzero(bound >= bound.max() - _MARGIN / scale**2)
+            argument = filtered[:, :, chosen][:, self._index] * (np.float32(scale) * self._scale)
+            log_likelihood = np.sum(_log_bessel(argument), axis=0) + self._offset[:, chosen]
             values.append(_log_sum(log_likelihood) - scale**2 * energy)
         return np.array(values)
 
@@ -168,8 +161,7 @@ class Outside:
         """Magnitude of the filtered signals for templates and directions, [N_B, T, V] [m]."""
         signals = whitened.astype(np.complex64)[..., None]
         filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
-        by_node: np.ndarray = filtered.reshape(len(filtered), -1, self._energy.shape[1])
-        return by_node
+        return filtered.reshape(len(filtered), -1, self._energy.shape[1])
 
 
 def _log_sum(values: np.ndarray) -> float:
@@ -194,8 +186,7 @@ def _ranges(scenario: Scenario) -> np.ndarray:
     nearest_m = max(_NEAREST * resolution.nearest_m, _MIN_APERTURES * aperture_m)
     ratio = _MAX_RANGE_FACTOR * resolution.farthest_m / nearest_m
     n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(_RANGE_RATIO))))
-    ranges: np.ndarray = nearest_m * _RANGE_RATIO**np.arange(n_ranges)
-    return ranges
+    return nearest_m * _RANGE_RATIO**np.arange(n_ranges)
 
 
 def _directions(scenario: Scenario) -> np.ndarray:
@@ -206,8 +197,7 @@ def _directions(scenario: Scenario) -> np.ndarray:
     counts = np.ceil(0.5 / (max(_DIRECTION_RAD, fewest) * direction)).astype(int)
     lines = [(np.arange(2 * n) + 0.5) / n - 1 for n in counts.tolist()]
     grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
-    result: np.ndarray = grid[np.hypot(*grid.T) < _MAX_SINE]
-    return result
+    return grid[np.hypot(*grid.T) < _MAX_SINE]
 
 
 def _points(ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -234,9 +224,7 @@ def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray
     The phase of a template errs by the curvature of the wavefront, proportional to 1 / r, and by
     the delay across the sub-bands, proportional to r.
     """
-    aperture = np.max(np.sum(element_positions(scenario)**2, axis=1))
-    by_inverse = np.pi * max(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS * aperture
-    by_range = np.pi * scenario.n_subbands * scenario.subband_width_hz / SPEED_OF_LIGHT_MPS
+    resolution = Resolution.of(scenario)
     nodes: list[float] = []
     index = np.empty(len(ranges), np.int64)
     first = 0
@@ -245,8 +233,8 @@ def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray
         for end in range(first, len(ranges)):
             # Halfway in 1 / r, both ends have the same error from the curvature.
             node = 2 / (1 / ranges[first] + 1 / ranges[end])
-            errors = (by_inverse * np.abs(1 / ranges[[first, end]] - 1 / node)
-                      + by_range * np.abs(ranges[[first, end]] - node))
+            errors = (resolution.curvature_m * np.abs(1 / ranges[[first, end]] - 1 / node)
+                      + np.abs(ranges[[first, end]] - node) / resolution.delay_m)
             if end > first and errors.max() > _MAX_PHASE_ERROR:
                 break
             last = end

@@ -146,9 +146,8 @@ class WeightedSamples(NamedTuple):
 
     def log_evidence(self, volume_m3: float) -> np.ndarray:
         """Likelihood averaged over a region of this volume, as its logarithm, float64 [N]."""
-        result: np.ndarray = (self.log_totals - np.log(self.weights.shape[1])
+        return (self.log_totals - np.log(self.weights.shape[1])
                 + 1.5 * np.log(2 * np.pi) - np.log(volume_m3))
-        return result
 
     def average(self, values: np.ndarray) -> np.ndarray:
         """Average values of the modes, float64 [M, ...], over each posterior, [N, ...]."""
@@ -213,9 +212,8 @@ def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
     squares += np.einsum('ma,ma->m', means, spread) - 2 * points @ spread.T
     exponent = -squares / (2 * _SPREAD**2)
     exponent += np.linalg.slogdet(modes.curvature)[1] / 2
-    result: np.ndarray = (np.logaddexp.reduce(exponent, axis=1)
+    return (np.logaddexp.reduce(exponent, axis=1)
             - 3 * np.log(_SPREAD) - 1.5 * np.log(2 * np.pi))
-    return result
 
 
 class BandPhases:
@@ -282,8 +280,7 @@ class BandPhases:
 
         concentration = 2 * np.maximum(magnitude, 1e-9)
         variance = self._std**2 - 2 * np.log(i1e(concentration) / i0e(concentration))
-        result: np.ndarray = np.minimum(np.sqrt(variance), _MAX_STD_RAD)
-        return result
+        return np.minimum(np.sqrt(variance), _MAX_STD_RAD)
 
 
 def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
@@ -304,6 +301,5 @@ def _log_density(angle: np.ndarray, std: np.ndarray) -> np.ndarray:
     ratio = np.exp(-2 * np.pi**2 / std**2)
     slope = 2 * np.pi / std**2 * angle
     wraps = ratio * (np.exp(slope) + np.exp(-slope))
-    density: np.ndarray = (
+    return (
         np.log(np.sqrt(2 * np.pi) / std) - angle**2 / (2 * std**2) + np.log1p(wraps))
-    return density

@@ -14,7 +14,6 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.impairments import ElementErrors
-from rhs_isac_ros.model.threads import one_blas_thread
 from rhs_isac_ros.positioning.coordinates import to_polar
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received, stack_parts
 from rhs_isac_ros.positioning.estimators import BayesEstimator
@@ -29,6 +28,7 @@ from rhs_isac_ros.positioning.likelihood import (
 )
 from rhs_isac_ros.positioning.posterior import BandPhases
 from rhs_isac_ros.positioning.search import Modes, marginal_at
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Points evaluated at a time.
 _BLOCK = 4096
@@ -115,8 +115,7 @@ class _Posterior:
             doubled = np.stack([prior.over_gain(one, float(energy), self._whitened[0].size)[0]
                                 for one, energy in zip(amplitude, energies, strict=True)])
             means = np.swapaxes(means, 0, 1)
-        result: np.ndarray = doubled - np.sum(np.abs(means)**2, axis=(1, 2))
-        return result
+        return doubled - np.sum(np.abs(means)**2, axis=(1, 2))
 
     def moments(self, phase: int, points: np.ndarray, profile: np.ndarray
                 ) -> tuple[np.ndarray, np.ndarray]:
@@ -180,9 +179,8 @@ class _Posterior:
             value[:, column] = local.value + one @ one / 2
         highest = value.max(axis=1)
         average = highest + np.log(np.mean(np.exp(value - highest[:, None]), axis=1))
-        result: np.ndarray = (average + n_values * np.log(_SPREAD)
+        return (average + n_values * np.log(_SPREAD)
                 - np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1))
-        return result
 
 def posterior_with_truth(
         scenario: Scenario, codebook: Codebook, received: np.ndarray,

@@ -69,14 +69,12 @@ class Modes(NamedTuple):
     @property
     def roi_log_likelihood(self) -> np.ndarray:
         """Log-likelihood at `roi_points`, float64 [M]."""
-        result: np.ndarray = self.log_likelihood - likelihood_loss(self.roi_offset, self.curvature)
-        return result
+        return self.log_likelihood - likelihood_loss(self.roi_offset, self.curvature)
 
     @property
     def roi_points(self) -> np.ndarray:
         """For each mode, its most likely point inside the region, (r [m], u, v), [M, 3]."""
-        result: np.ndarray = self.points + self.roi_offset
-        return result
+        return self.points + self.roi_offset
 
     def select(self, chosen: np.ndarray | slice) -> 'Modes':
         """Return the modes with the given indices or mask."""
@@ -189,8 +187,7 @@ def _step(conditional: Conditional, likelihood: Likelihood, starts: Starts, sign
 def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
     """Compute the marginal log-likelihood after a Gauss-Newton step, float64 [M]."""
     marginal, _, rise = _newton(local, likelihood)
-    result: np.ndarray = local.value + marginal.log_volume + rise
-    return result
+    return local.value + marginal.log_volume + rise
 
 
 def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray, np.ndarray]:
@@ -227,6 +224,5 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     order = order[heaviest(phases, np.minimum(relative, 0.0), margin)]
     phases = modes.phases[order]
     radii = likelihood.resolution.separation(likelihood.nuisance.is_coarse)
-    chosen: np.ndarray = order[separate(
+    return order[separate(
         phases, modes.roi_points[order], radii, modes.curvature[order])]
-    return chosen

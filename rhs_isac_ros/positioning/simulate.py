@@ -3,8 +3,9 @@
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario, streams
-from rhs_isac_ros.model.threads import map_blocks
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.threads import map_blocks
 
 # Pairs that share a random generator and every matrix product. A different size changes the pairs
 # of every seed.

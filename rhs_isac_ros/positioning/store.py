@@ -12,8 +12,8 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import grid, outside
+from rhs_isac_ros.support.files import write_whole
 
 # Maximum number of tables in a folder; the least recently used ones beyond it are deleted.
 _MAX_TABLES = 16

@@ -11,14 +11,16 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import time_correlation
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
 from rhs_isac_ros.positioning.coordinates import is_inside, jacobian
 from rhs_isac_ros.positioning.estimate import Estimate
 from rhs_isac_ros.positioning.estimators import SearchEstimator
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
 from rhs_isac_ros.positioning.motion import Mixture, Motion, concatenate, reduce
+from rhs_isac_ros.positioning.posterior import Posterior
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes
+from rhs_isac_ros.support.threads import one_blas_thread
 
 # Maximum number of components between phases.
 MAX_COMPONENTS = 48
@@ -59,12 +61,15 @@ class TrackEstimate(Estimate):
         Float64 [3, 3] [m^2/s^2]; NaN without a position.
     n_phases
         Number of phases that contribute to the estimate; 0 without a position.
+    is_predicted
+        Whether the position is a prediction, because the user is blocked.
     """
 
     velocity: np.ndarray = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
     velocity_covariance: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full((3, 3), np.nan))
     n_phases: int = 0
+    is_predicted: bool = False
 
 
 class Tracker:
@@ -72,10 +77,10 @@ class Tracker:
 
     The first position of a track is that of the estimator. A track ends with a gap of more than
     `MAX_GAP_S`; signals without a position do not change it, and neither do those whose multipath
-    is almost that of the phase before.
+    is almost that of the phase before. While the user is blocked, the position is a prediction.
 
-    Positions of the track are inside the region of interest. The probability of a user outside is
-    that of the estimator.
+    Positions of the track are inside the region of interest. The probabilities of a user outside
+    and of a blocked one are those of the estimator.
 
     Parameters
     ----------
@@ -114,10 +119,7 @@ class Tracker:
         """
         posterior = self.estimator.posterior(received)
         if posterior.modes is None:
-            found = posterior.estimate
-            return TrackEstimate(
-                found.mean, found.covariance, found.reason, found.residual,
-                found.expected_residual, found.outside_probability)
+            return self._predicted(time_s, posterior.estimate)
         if time_s <= self._latest_s:
             return _described(posterior.estimate, self._start(posterior.modes), 1)
         self._latest_s = time_s
@@ -129,8 +131,7 @@ class Tracker:
         mixture = self._motion.predict(self._mixture, elapsed_s)
         share = independent_share(self.estimator.scenario, elapsed_s)
         if share >= _MIN_SHARE:
-            mixture = self._updated(
-                mixture, posterior.modes, posterior.signals, share, elapsed_s)
+            mixture = self._updated(mixture, posterior, share, elapsed_s)
         mixture, mean, covariance = self._inside(mixture)
         if share >= _MIN_SHARE:
             self._mixture, self._time_s = mixture, time_s
@@ -138,6 +139,19 @@ class Tracker:
         found = posterior.estimate
         estimate = dataclasses.replace(found, mean=mean, covariance=covariance)
         return _described(estimate, mixture, self._n_phases)
+
+    def _predicted(self, time_s: float, found: Estimate) -> TrackEstimate:
+        """Continue the track of a blocked user without a change; other users get no position."""
+        elapsed_s = time_s - self._time_s
+        if (self._mixture is None or not 0 < elapsed_s <= MAX_GAP_S
+                or not found.blocked_probability > BLOCKED_LIMIT):
+            return TrackEstimate(**vars(found))
+        self._latest_s = max(time_s, self._latest_s)
+        mixture, mean, covariance = self._inside(
+            self._motion.predict(self._mixture, elapsed_s))
+        estimate = dataclasses.replace(found, mean=mean, covariance=covariance, reason='')
+        return dataclasses.replace(
+            _described(estimate, mixture, self._n_phases), is_predicted=True)
 
     def _start(self, modes: Modes, share: float = 1.0) -> Mixture:
         """Return the mixture of a user anywhere in the region, weighted with its likelihood."""
@@ -150,12 +164,23 @@ class Tracker:
             share * modes.roi_log_likelihood + log_mass - np.log(volume_m3))
 
     def _updated(
-            self, predicted: Mixture, modes: Modes, signals: Signals, share: float,
-            elapsed_s: float) -> Mixture:
-        updated = update(predicted, modes, share, self.estimator.exact_likelihood, signals)
+            self, predicted: Mixture, posterior: Posterior, share: float, elapsed_s: float
+    ) -> Mixture:
+        modes, estimate = posterior.modes, posterior.estimate
+        assert modes is not None
+        parts = [update(
+            predicted, modes, share, self.estimator.exact_likelihood, posterior.signals)]
         lost = self._start(modes, share)
+        blocked, outside = np.nan_to_num([
+            estimate.blocked_probability, estimate.outside_probability])
+        if blocked:
+            # Signals without a direct path say nothing. The probability is relative to that of a
+            # user anywhere in the region.
+            odds = share * np.log(blocked / max(1 - blocked - outside, 1e-12))
+            weight = np.logaddexp.reduce(lost.log_weights) + odds
+            parts.append(predicted._replace(log_weights=predicted.log_weights + weight))
         lost = lost._replace(log_weights=lost.log_weights + np.log(_LOSS_RATE_HZ * elapsed_s))
-        return reduce(concatenate(updated, lost), MAX_COMPONENTS).normalised()
+        return reduce(concatenate(*parts, lost), MAX_COMPONENTS).normalised()
 
     def _inside(self, mixture: Mixture) -> tuple[Mixture, np.ndarray, np.ndarray]:
         """Return the components that reach the region, and mean and covariance inside."""
@@ -183,8 +208,7 @@ class Tracker:
 def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEstimate:
     velocity, covariance = mixture.velocity()
     return TrackEstimate(
-        estimate.mean, estimate.covariance, estimate.reason, estimate.residual,
-        estimate.expected_residual, estimate.outside_probability, velocity, covariance, n_phases)
+        **vars(estimate), velocity=velocity, velocity_covariance=covariance, n_phases=n_phases)
 
 
 def independent_share(scenario: Scenario, elapsed_s: float) -> float:
@@ -274,8 +298,7 @@ def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
     precision = np.linalg.inv(updated.covariances[:, :3, :3])
     distance = np.einsum('abp,apq,abq->ab', offsets, precision, offsets)
     same = (distance < _SAME_MAXIMUM) & (component[:, None] == component)
-    first: np.ndarray = ~np.tril(same, -1).any(axis=1)
-    return first
+    return ~np.tril(same, -1).any(axis=1)
 
 
 def _evidence(

@@ -17,11 +17,12 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario, streams
-from rhs_isac_ros.model.optional import optional_import
-from rhs_isac_ros.model.threads import one_blas_thread
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning.network import INPUTS, Network
 from rhs_isac_ros.positioning.simulate import simulate_pairs
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.optional import optional_import
+from rhs_isac_ros.support.threads import one_blas_thread
 
 DEFAULT_PAIRS = 100_000
 DEFAULT_HIDDEN = 256
@@ -98,8 +99,7 @@ def train(
 
     def residuals(subset: slice) -> np.ndarray:
         errors: np.ndarray = regressor.predict(scaled[subset]) - targets[subset]
-        errors_m: np.ndarray = errors.astype(float) * unit_m
-        return errors_m
+        return errors.astype(float) * unit_m
 
     def after_epoch(number: int, best_mse: float) -> float:
         mse = _mean_square(residuals(validation))

@@ -1,22 +1,23 @@
-"""The emulated channel: line of sight, multipath, surface and propagation on the surface."""
+"""The emulated channel: line of sight, multipath, surface, and losses and delays of messages."""
 
 import dataclasses
+import heapq
 import itertools
+from collections.abc import Mapping
 
 import numpy as np
 
 from rhs_isac_ros.link import Beam, actual_capacity
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.impairments import DeclaredElements, draw_factors, draw_surface
-from rhs_isac_ros.model.los import direct_gain
+from rhs_isac_ros.model.los import direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, Event, Send, SettingsOffered
-from rhs_isac_ros.protocol.impairments import Impairments
-from rhs_isac_ros.protocol.newest import NewestDict
-from rhs_isac_ros.protocol.outcomes import Outcome
-from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.events import Action, Event, Outcome, Send, SettingsOffered, Timeout
+from rhs_isac_ros.protocol.role import NewestDict, PlainRole, Role
+from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
+from rhs_isac_ros.support import streams
 
 # Number of users whose multipath is kept. With more, the time between two cycles of a user is far
 # longer than the coherence time.
@@ -90,6 +91,11 @@ class _Drawn:
             None if DeclaredElements(scenario).is_exact
             else draw_surface(scenario, streams.generator(seed, streams.SURFACE)))
 
+    def blocked(self, truth: m.GroundTruth) -> np.ndarray | None:
+        """Return whether the user has no direct path, bool [1]; None if no user is blocked."""
+        return draw_blocked(self._scenario, 1, streams.generator(
+            self._seed, streams.BLOCKAGE, truth.user))
+
     def factors(self, truth: m.GroundTruth) -> np.ndarray | None:
         """Return the factors of the signals of a cycle [N_B, N_SB, F], or None if all are 1."""
         scenario, seed = self._scenario, self._seed
@@ -110,6 +116,8 @@ class _Cycle:
         [N_SB, N_E].
     multipath
         Multipath gains of each band, complex128 [N_SB, F, N_E].
+    blocked
+        Whether the user has no direct path, bool [1]; None if no user is blocked.
     surface
         Errors of the elements; None if there are none.
     factors
@@ -120,7 +128,8 @@ class _Cycle:
                  drawn: _Drawn) -> None:
         self.truth, self.multipath = truth, multipath
         # Computed here rather than on the first pilot, while other roles prepare the cycle.
-        self.los = [direct_gain(scenario, truth.position[None], band)[0]
+        self.blocked = drawn.blocked(truth)
+        self.los = [direct_gain(scenario, truth.position[None], band, self.blocked)[0]
                     for band in range(scenario.n_bands)]
         self.surface, self.factors = drawn.surface, drawn.factors(truth)
 
@@ -203,7 +212,7 @@ class Channel(PlainRole):
             return
         self._begun.put(key, None)
         multipath = self._fading.gains(
-            truth.user, truth.cycle_id, now_s, memory=self._has_memory)
+            truth.user, truth.cycle_id, truth.time_s(now_s), memory=self._has_memory)
         self._cycle = _Cycle(self._scenario, truth, multipath, self._drawn)
         stale = [serial for serial, event in self._pending.items()
                  if event.cycle_id != truth.cycle_id]
@@ -257,8 +266,8 @@ class Channel(PlainRole):
         if cycle.factors is not None:
             feeds = feeds * cycle.factors[band].T[:, :, None]
         return m.FeedSignals(
-            cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender, band=band,
-            signals=feeds)
+            cycle_id=pilot.cycle_id, stamp_ns=pilot.stamp_ns, user=pilot.user,
+            user_instance=pilot.sender, band=band, signals=feeds)
 
     def _deliver(self, data: m.Data, cycle: _Cycle) -> m.Data | None:
         """Return the data within the capacity of the true channel; the rest is lost."""
@@ -276,7 +285,8 @@ class Channel(PlainRole):
             # Only the magnitude, the gain of the user, changes the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
         used = Beam(configuration, digital, beam.band)
-        rate_bps = float(actual_capacity(self._scenario, used, truth.position[None])[0])
+        rate_bps = float(actual_capacity(
+            self._scenario, used, truth.position[None], cycle.blocked)[0])
         bits = min(data.bits, rate_bps * data.duration_s // 1)
         return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)
 
@@ -286,3 +296,89 @@ def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bo
     if isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK:
         return False
     return not m.same_instance(event.sender, truth.sender)
+
+
+class ImpairedChannel(PlainRole):
+    """A channel role whose outgoing messages are subject to impairments.
+
+    The role receives new impairments as `SettingsOffered`, for the deviations of its signals.
+
+    New impairments take effect at the start of the next cycle, when its true position arrives.
+
+    Parameters
+    ----------
+    role
+        A role without states and deadlines.
+    impairments
+        Initial impairments.
+    rng
+        Random source of losses, duplicates and delays.
+
+    Attributes
+    ----------
+    counters
+        The counters of the role, and ``emulated_loss`` and ``emulated_double``.
+    """
+
+    def __init__(self, role: Role, impairments: Impairments, rng: np.random.Generator) -> None:
+        super().__init__()
+        self.counters, self.SENDS, self.RECEIVES = role.counters, role.SENDS, role.RECEIVES
+        self._role, self._settings, self._rng = role, PendingSettings(impairments), rng
+        self._cycle_id = 0
+        self._serial = itertools.count()
+        # Time of arrival, serial number as a tie-break, message.
+        self._in_flight: list[tuple[float, int, Send]] = []
+
+    def handle(self, event: Event, now_s: float) -> list[Action]:
+        """Pass an event to the role and return the messages that arrive by `now_s` [s]."""
+        arriving: list[Action] = []
+        actions: list[Action] = []
+        match event:
+            case Timeout():
+                pass
+            case SettingsOffered(impairments):
+                self._settings.latest = impairments
+            case _:
+                arriving += self._begin_cycle(event, now_s)
+                actions = self._role.handle(event, now_s)
+        for action in actions:
+            if isinstance(action, Send):
+                self._send(action, now_s)
+            else:
+                arriving.append(action)
+        while self._in_flight and self._in_flight[0][0] <= now_s:
+            arriving.append(heapq.heappop(self._in_flight)[2])
+        return arriving
+
+    def status(self) -> Mapping[str, str]:
+        """Return the impairments in use and pending, by name."""
+        return self._settings.describe()
+
+    def next_deadline(self) -> float | None:
+        """Return when the next message arrives [s], or None if no message is in flight."""
+        return self._in_flight[0][0] if self._in_flight else None
+
+    def _begin_cycle(self, event: Event, now_s: float) -> list[Action]:
+        if not isinstance(event, m.GroundTruth) or event.cycle_id in (0, self._cycle_id):
+            return []
+        self._cycle_id = event.cycle_id
+        notes = self._settings.apply()
+        if notes:
+            self._role.handle(SettingsOffered(self._settings.in_use), now_s)
+        return [*notes]
+
+    def _send(self, action: Send, now_s: float) -> None:
+        impairments = self._settings.in_use
+        # The number of draws is fixed, so that the impairments of one message do not affect
+        # those of others.
+        loss, duplication, *delays = self._rng.random(4)
+        if loss < impairments.loss_probability:
+            self.counters['emulated_loss'] += 1
+            return
+        copies = 1
+        if duplication < impairments.double_probability:
+            copies = 2
+            self.counters['emulated_double'] += 1
+        for delay in delays[:copies]:
+            arrival_s = now_s + impairments.delay_s + impairments.jitter_s * delay
+            heapq.heappush(self._in_flight, (arrival_s, next(self._serial), action))

@@ -172,11 +172,19 @@ class Message:
         unknown, as in messages sent by hand.
     scenario_id
         `Scenario.id` of that node; empty if unknown.
+    stamp_ns
+        Time of the header, on the clock of the emulated world [ns]: that of the measurement for
+        signals and what follows from them. 0 if unknown; the adapter then sends the present time.
     """
 
     cycle_id: int
     sender: int = 0
     scenario_id: str = ''
+    stamp_ns: int = 0
+
+    def time_s(self, now_s: float) -> float:
+        """Return the time of the message [s], by default the time of its arrival."""
+        return 1e-9 * self.stamp_ns if self.stamp_ns else now_s
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return sizes that depend on the content, by symbol.
@@ -195,10 +203,10 @@ def same_instance(one: int, other: int) -> bool:
 
 
 def same(one: Message, other: Message) -> bool:
-    """Return whether two messages have the same class and equal fields; NaN != NaN."""
+    """Return whether two messages have the same class and fields but for stamps; NaN != NaN."""
     return type(one) is type(other) and all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name))
-        for field in dataclasses.fields(one))
+        for field in dataclasses.fields(one) if field.name != 'stamp_ns')
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -300,6 +308,7 @@ class PositionEstimate(Message):
     estimator: str
     latency_s: float = number(0, 3600)
     outside_probability: float = number(0, 1, default=0.0)
+    blocked_probability: float = number(0, 1, default=0.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -388,7 +397,7 @@ class GroundTruths(Message):
                 self.users.tolist(), self.position, self.velocity, strict=True):
             yield GroundTruth(
                 cycle_id=self.cycle_id, sender=self.sender, scenario_id=self.scenario_id,
-                user=user, position=position, velocity=velocity)
+                stamp_ns=self.stamp_ns, user=user, position=position, velocity=velocity)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,8 +1,10 @@
-"""The positioner, which estimates positions from received signals."""
+"""The positioner, which estimates positions from received signals, and the tracks of users."""
 
 import collections
+import dataclasses
+import enum
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,12 +14,19 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import (
     Estimate,
     Estimator,
+    Motion,
+    SearchEstimator,
     SignalError,
+    Tracker,
     TrackEstimate,
     surface_of,
 )
+from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
+from rhs_isac_ros.positioning.diagnosis import Diagnosis
 from rhs_isac_ros.positioning.innovation_test import InnovationTest
+from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_memory import MAX_NAMED, MAX_USERS
 from rhs_isac_ros.protocol.events import (
     Action,
     BuildEstimator,
@@ -26,18 +35,91 @@ from rhs_isac_ros.protocol.events import (
     EstimatorReady,
     Event,
     LogMessage,
+    Outcome,
     PublishTrack,
     RevertSettings,
     Send,
     SettingsOffered,
 )
-from rhs_isac_ros.protocol.newest import CodebookCache
-from rhs_isac_ros.protocol.outage_log import MAX_NAMED
-from rhs_isac_ros.protocol.outcomes import Outcome
-from rhs_isac_ros.protocol.role import PendingSettings, PlainRole
-from rhs_isac_ros.protocol.settings import TRACK, PositionerSettings
-from rhs_isac_ros.protocol.tracks import Tracks
-from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
+from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, PlainRole
+from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
+
+
+@dataclasses.dataclass
+class _Track:
+    """A track, and the latest signals that continued it with the time of their arrival [s]."""
+
+    tracker: Tracker
+    latest: m.ReceivedSignals
+    time_s: float
+
+    def is_late(self, received: m.ReceivedSignals) -> bool:
+        """Return whether signals belong to an earlier cycle; base stations number their own."""
+        return received.sender == self.latest.sender and (
+            received.cycle_id <= self.latest.cycle_id)
+
+    def is_of(self, received: m.ReceivedSignals) -> bool:
+        """Return whether signals come from the instance of the user that has the track."""
+        return m.same_instance(received.user_instance, self.latest.user_instance)
+
+
+class Tracks:
+    """A track for each user, started and ended by the signals alone.
+
+    A track ends with a gap, with another instance of the user, or if thousands of other users have
+    been located since. Signals of an earlier cycle are located without the track.
+    """
+
+    def __init__(self) -> None:
+        self._tracks: NewestDict[int, _Track] = NewestDict(MAX_USERS)
+
+    def __len__(self) -> int:
+        """Return the number of tracks."""
+        return len(self._tracks)
+
+    def clear(self) -> None:
+        """End all tracks."""
+        self._tracks.clear()
+
+    def locate(
+            self, received: m.ReceivedSignals, estimator: Estimator, speed_mps: float,
+            now_s: float) -> Estimate:
+        """Estimate the position of a user; a `TrackEstimate` if the signals continue its track.
+
+        Parameters
+        ----------
+        speed_mps
+            Typical speed of the users [m/s], for new tracks.
+        now_s
+            Time of the signals [s].
+
+        Raises
+        ------
+        SignalError
+            If the signals cannot be used.
+        """
+        signals = received.signals.reshape(len(received.signals), -1)
+        self._end_old(now_s)
+        track = self._tracks.get(received.user)
+        if not isinstance(estimator, SearchEstimator) or track and track.is_late(received):
+            return estimator.estimate(signals)
+        if track is None or not track.is_of(received) or now_s < track.time_s - MAX_GAP_S:
+            track = _Track(Tracker(estimator, Motion(speed_mps)), received, now_s)
+        track.tracker.estimator = estimator
+        estimate = track.tracker.update(now_s, signals)
+        if estimate.fix:
+            track.latest, track.time_s = received, now_s
+            self._tracks.put(received.user, track)
+        return estimate
+
+    def _end_old(self, now_s: float) -> None:
+        # The oldest track comes first.
+        while self._tracks:
+            user, track = next(iter(self._tracks.items()))
+            if now_s <= track.time_s + MAX_GAP_S:
+                return
+            del self._tracks[user]
+
 
 # Number of residuals in the mean of a user, which bounds the memory.
 _USER_WINDOW = 100
@@ -55,12 +137,14 @@ class ResidualWatch:
         self._all = InnovationTest()
         self._users: collections.OrderedDict[int, InnovationTest] = collections.OrderedDict()
         self._warning = ''
+        self._diagnosis = Diagnosis()
 
     def add(self, user: int, codebook_id: str, estimate: Estimate) -> list[LogMessage]:
-        """Add the residual of an estimate; return a message if a warning begins or ends."""
+        """Add an estimate; return a message if a warning begins or ends."""
         if codebook_id != self._codebook_id:
             self.clear()
             self._codebook_id = codebook_id
+        self._diagnosis.add(estimate)
         own = self._users.setdefault(user, InnovationTest(_USER_WINDOW))
         self._users.move_to_end(user)
         # Beyond the limit, the least recent user is forgotten.
@@ -76,8 +160,9 @@ class ResidualWatch:
         return []
 
     def clear(self) -> None:
-        """Forget all residuals, because the estimator or the codebook has changed."""
+        """Forget all estimates, because the estimator or the codebook has changed."""
         self._all.clear()
+        self._diagnosis.clear()
         self._users.clear()
         self._warning = ''
 
@@ -90,11 +175,13 @@ class ResidualWatch:
             ``residual.ratio``, the mean energy of the residuals relative to the expectation;
             ``residual.spread``, the variance of the energy relative to the expectation;
             ``residual.fixes``, the number of fixes in the mean; and ``warning.residual`` during a
-            warning. Empty before the first residual.
+            warning. Before the first residual, only the values of `Diagnosis.status`, which are
+            always present.
         """
+        values = self._diagnosis.status(bool(self._warning))
         if not self._all.n_fixes:
-            return {}
-        values = {'residual.ratio': f'{self._all.ratio:.3f}',
+            return values
+        values |= {'residual.ratio': f'{self._all.ratio:.3f}',
                   'residual.spread': f'{self._all.spread:.3f}',
                   'residual.fixes': str(self._all.n_fixes)}
         return values | ({'warning.residual': self._warning} if self._warning else {})
@@ -114,6 +201,13 @@ class ResidualWatch:
 def _deviation(prefix: str, monitor: InnovationTest) -> str:
     return (f'{prefix}residuals {monitor.ratio:.3g} times as strong as expected, with '
             f'{monitor.spread:.3g} times the variance, over {monitor.n_fixes} cycles')
+
+
+class _Loss(enum.Enum):
+    """Why the signals of a user yield no position, with the text when they do so again."""
+
+    NO_FIX = 'has a position again'
+    BLOCKED = 'is in sight again'
 
 
 class _Job(NamedTuple):
@@ -174,9 +268,9 @@ class Positioner(PlainRole):
         # Signals that wait for it, and the time of their arrival [s].
         self._waiting: tuple[m.ReceivedSignals, float] | None = None
         self._tracks = Tracks()
-        # Users whose last signals yielded no position; only the first of consecutive failures is
-        # logged. Bounded, because signals may name any user.
-        self._without_fix: collections.OrderedDict[int, None] = collections.OrderedDict()
+        # Users whose last signals yielded no position; only changes are logged. Bounded, because
+        # signals may name any user.
+        self._lost: NewestDict[int, _Loss] = NewestDict(MAX_USERS)
         self._residuals = ResidualWatch()
         # The last signals that were answered, and the answer.
         self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
@@ -291,42 +385,50 @@ class Positioner(PlainRole):
              latency_s: float) -> list[Action]:
         _, model, estimator = self._estimators.take(received.codebook_id)
         bound = float(crlb_of(model, estimate.mean[None])[0])
+        probabilities: dict[str, Any] = {
+            f'{name}_probability': value for name, value in probabilities_of(estimate).items()}
         actions: list[Action] = [Send(m.PositionEstimate(
-            cycle_id=received.cycle_id, user=received.user,
+            cycle_id=received.cycle_id, stamp_ns=received.stamp_ns, user=received.user,
             user_instance=received.user_instance, codebook_id=received.codebook_id,
             position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
             crlb_m2=bound, estimator=estimator.name, latency_s=latency_s,
-            outside_probability=float(np.nan_to_num(estimate.outside_probability))))]
+            **probabilities))]
+        loss = None
         if isinstance(estimate, TrackEstimate):
-            actions.append(PublishTrack(received.user, estimate))
-        if received.user in self._without_fix:
-            del self._without_fix[received.user]
-            actions.append(LogMessage(
-                f'cycle {received.cycle_id}: user {received.user} has a position again'))
-        return actions
+            actions.append(PublishTrack(received.user, estimate, received.stamp_ns))
+            loss = _Loss.BLOCKED if estimate.is_predicted else None
+        return [*actions, *self._log(
+            received, loss, f'the track of user {received.user} predicts its position: '
+            f'{describe_doubts(estimate)}')]
 
     def _estimate(
             self, received: m.ReceivedSignals, estimator: Estimator, settings: PositionerSettings,
             now_s: float) -> Estimate:
         if settings.prior == TRACK:
-            return self._tracks.locate(received, estimator, settings.track_speed_mps, now_s)
+            return self._tracks.locate(
+                received, estimator, settings.track_speed_mps, received.time_s(now_s))
         self._tracks.clear()
         return estimator.estimate(received.signals.reshape(len(received.signals), -1))
 
     def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
         self.count(Outcome.NO_FIX)
         sent = Send(m.NoFix(
-            cycle_id=received.cycle_id, user=received.user, codebook_id=received.codebook_id,
-            reason=reason))
-        is_known = received.user in self._without_fix
-        self._without_fix[received.user] = None
-        self._without_fix.move_to_end(received.user)
-        if is_known:
-            return [sent]
-        if len(self._without_fix) > MAX_USERS:
-            self._without_fix.popitem(last=False)
-        text = f'cycle {received.cycle_id}: no fix of user {received.user}: {reason}'
-        return [sent, LogMessage(text, warning=True)]
+            cycle_id=received.cycle_id, stamp_ns=received.stamp_ns, user=received.user,
+            codebook_id=received.codebook_id, reason=reason))
+        return [sent, *self._log(
+            received, _Loss.NO_FIX, f'no fix of user {received.user}: {reason}')]
+
+    def _log(self, received: m.ReceivedSignals, loss: _Loss | None, text: str = ''
+             ) -> list[LogMessage]:
+        """Log a change of whether the signals of a user yield a position."""
+        before = self._lost.pop(received.user, None)
+        if loss:
+            self._lost.put(received.user, loss)
+        elif before:
+            text = f'user {received.user} {before.value}'
+        if before is loss:
+            return []
+        return [LogMessage(f'cycle {received.cycle_id}: {text}', warning=loss is _Loss.NO_FIX)]
 
 
 def build_estimator(

@@ -7,7 +7,7 @@ from typing import Any
 
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import started
-from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.role import NewestDict
 
 # Maximum number of nodes in conflict with this one, which bounds the memory.
 _MAX_OTHERS = 64

@@ -1,15 +1,19 @@
 """The RHS controller, which applies configurations to the surface and reports them."""
 
-import dataclasses
 import enum
 from collections.abc import Mapping
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, LogMessage, Send
-from rhs_isac_ros.protocol.newest import CodebookCache, NewestDict
-from rhs_isac_ros.protocol.outcomes import Outcome
-from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
+from rhs_isac_ros.protocol.events import Action, CodebookOffered, LogMessage, Outcome, Send
+from rhs_isac_ros.protocol.role import (
+    ANY,
+    CodebookCache,
+    EventT,
+    NewestDict,
+    StateMachine,
+    Transition,
+)
 
 # Number of cycles kept to recognise late and repeated messages.
 _MAX_REMEMBERED = 8
@@ -23,8 +27,23 @@ class State(enum.Enum):
     TRANSMITTING = 'transmitting'  # applies the configuration of a beam
 
 
-class RhsControllerSteps(StateMachine[State]):
-    """The memory of an RHS controller, and the guards and actions of its table."""
+class Row(Transition[State, 'RhsController', EventT]):
+    """A row of the table."""
+
+
+class RhsController(StateMachine[State]):
+    """The role of the RHS controller.
+
+    It holds the latest codebooks; the commands of the base station select the one to apply.
+    """
+
+    SENDS = (m.RhsConfiguration,)
+    RECEIVES = (m.Grant, m.RhsCommand, m.Beam)
+
+    STATES = State
+    EVENT_NAMES = {CodebookOffered: 'codebook', m.Grant: 'grant', m.RhsCommand: 'command',
+                   m.Beam: 'beam'}
+
 
     def __init__(self) -> None:
         super().__init__(State.IDLE, {})
@@ -118,48 +137,24 @@ class RhsControllerSteps(StateMachine[State]):
             f'codebook {event.codebook_id!r} rejected; in use: {self._codebooks.in_use!r}, '
             f'available: {self._codebooks.ids()}', warning=True)]
 
+    # Messages that are dropped in every state, before the rows of the table.
+    DROPS = {m.Beam: {wrong_cycle: Outcome.WRONG_CYCLE, wrong_user: Outcome.WRONG_USER,
+                      wrong_instance: Outcome.WRONG_INSTANCE}}
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Row(Transition[State, RhsControllerSteps, EventT]):
-    """A row of the RHS controller's table."""
+    TABLE = (
+        Row(ANY, CodebookOffered, actions=(store_codebook, log_codebook)),
+        Row(ANY, m.Grant, actions=(store_grant,)),
 
+        Row(ANY, m.RhsCommand, guard=unknown_codebook, actions=(log_unknown_codebook,),
+            outcome=Outcome.WRONG_CODEBOOK),
+        # The base station repeats a command if it may have missed the report.
+        Row(ANY, m.RhsCommand, guard=repeats_command, actions=(apply_band,),
+            outcome=Outcome.DUPLICATE),
+        Row(ANY, m.RhsCommand, guard=stale_command, outcome=Outcome.STALE_COMMAND),
+        Row(ANY, m.RhsCommand, actions=(apply_band,), target=State.POSITIONING),
 
-Steps = RhsControllerSteps
-
-TABLE = (
-    Row(event=CodebookOffered, actions=(Steps.store_codebook, Steps.log_codebook)),
-    Row(event=m.Grant, actions=(Steps.store_grant,)),
-
-    Row(event=m.RhsCommand, guard=Steps.unknown_codebook, actions=(Steps.log_unknown_codebook,),
-        outcome=Outcome.WRONG_CODEBOOK),
-    # The base station repeats a command if it may have missed the report.
-    Row(event=m.RhsCommand, guard=Steps.repeats_command, actions=(Steps.apply_band,),
-        outcome=Outcome.DUPLICATE),
-    Row(event=m.RhsCommand, guard=Steps.stale_command, outcome=Outcome.STALE_COMMAND),
-    Row(event=m.RhsCommand, actions=(Steps.apply_band,), target=State.POSITIONING),
-
-    Row(event=m.Beam, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
-    Row(event=m.Beam, guard=Steps.wrong_user, outcome=Outcome.WRONG_USER),
-    Row(event=m.Beam, guard=Steps.wrong_instance, outcome=Outcome.WRONG_INSTANCE),
-    Row(event=m.Beam, guard=Steps.wrong_codebook, actions=(Steps.log_unknown_codebook,),
-        outcome=Outcome.WRONG_CODEBOOK),
-    Row(source=(State.POSITIONING,), event=m.Beam, actions=(Steps.apply_beam,),
-        target=State.TRANSMITTING),
-    Row(source=(State.TRANSMITTING,), event=m.Beam, actions=(Steps.apply_beam,),
-        outcome=Outcome.DUPLICATE),
-)
-
-
-class RhsController(RhsControllerSteps):
-    """The role of the RHS controller.
-
-    It holds the latest codebooks; the commands of the base station select the one to apply.
-    """
-
-    SENDS = (m.RhsConfiguration,)
-    RECEIVES = (m.Grant, m.RhsCommand, m.Beam)
-
-    STATES = State
-    TABLE = TABLE
-    EVENT_NAMES = {CodebookOffered: 'codebook', m.Grant: 'grant', m.RhsCommand: 'command',
-                   m.Beam: 'beam'}
+        Row(ANY, m.Beam, guard=wrong_codebook, actions=(log_unknown_codebook,),
+            outcome=Outcome.WRONG_CODEBOOK),
+        Row((State.POSITIONING,), m.Beam, actions=(apply_beam,), target=State.TRANSMITTING),
+        Row((State.TRANSMITTING,), m.Beam, actions=(apply_beam,), outcome=Outcome.DUPLICATE),
+    )

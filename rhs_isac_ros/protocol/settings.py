@@ -5,11 +5,13 @@ range and description from here.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from rhs_isac_ros.model import plugins
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
-from rhs_isac_ros.protocol.user_scheduler import MAX_USERS, POLICIES, parse_users
+from rhs_isac_ros.protocol.base_station_memory import MAX_USERS, POLICIES, parse_users
+from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.support import plugins
 
 # Priors of the position.
 REGION, TRACK = PRIORS = ('region', 'track')
@@ -151,3 +153,78 @@ def describe_settings(in_use: Any, latest: Any) -> dict[str, str]:
 def shown(value: Any) -> str:
     """Return a parameter value as ROS prints it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _of_scenario(name: str) -> Any:
+    """Declare a setting that replaces a field of the scenario."""
+    declared = {field.name: field for field in dataclasses.fields(Scenario)}[name].metadata
+    first_sentence = declared['text'].partition('. ')[0].rstrip('.')
+    return setting(
+        -1.0, f'{first_sentence}; negative: the value of the scenario.', unit=declared['unit'],
+        low=-1.0, high=declared['high'])
+
+
+@dataclasses.dataclass(frozen=True)
+class Impairments:
+    """Impairments of the air interface, and deviations from the model of the signals.
+
+    The network does not learn of deviations that replace those of the scenario.
+    """
+
+    loss_probability: float = setting(
+        0.0, 'Probability that a message is lost.', low=0.0, high=1.0)
+    double_probability: float = setting(
+        0.0, 'Probability that a message that arrives is duplicated.', low=0.0, high=1.0)
+    delay_s: float = setting(
+        0.0, 'Minimum delay of each message.', unit='s', low=0.0, high=10.0)
+    jitter_s: float = setting(
+        0.0, 'Maximum additional random delay; messages may be reordered.', unit='s',
+        low=0.0, high=10.0)
+    multipath_memory: bool = setting(
+        True, 'Whether the multipath of a user is correlated over its cycles by Eq. (4); '
+        'otherwise it is independent, and depends on the seed and not on times.')
+    user_gain_std_db: float = _of_scenario('user_gain_std_db')
+    phase_std_rad: float = _of_scenario('phase_std_rad')
+    band_phase_std_rad: float = _of_scenario('band_phase_std_rad')
+    timing_std_s: float = _of_scenario('timing_std_s')
+    carrier_offset_std_hz: float = _of_scenario('carrier_offset_std_hz')
+    element_error_rms: float = _of_scenario('element_error_rms')
+    blocked_probability: float = _of_scenario('blocked_probability')
+    failed_element_share: float = _of_scenario('failed_element_share')
+
+    def applied_to(self, scenario: Scenario) -> Scenario:
+        """Return the scenario with the deviations that are set."""
+        known = {field.name for field in dataclasses.fields(Scenario)}
+        values = dataclasses.asdict(self)
+        return dataclasses.replace(scenario, **{
+            name: value for name, value in values.items() if name in known and value >= 0})
+
+
+SettingsT = TypeVar('SettingsT')
+
+
+class PendingSettings(Generic[SettingsT]):
+    """Holds new settings back until the role may apply them.
+
+    Attributes
+    ----------
+    in_use
+        The settings in use.
+    latest
+        The settings received last.
+    """
+
+    def __init__(self, settings: SettingsT) -> None:
+        self.in_use = settings
+        self.latest = settings
+
+    def apply(self) -> list[LogMessage]:
+        """Put the latest settings into use; return a message that lists changes, if any."""
+        changed = changes(self.in_use, self.latest)
+        self.in_use = self.latest
+        described = ', '.join(f'{name} {shown(value)!r}' for name, value in changed.items())
+        return [LogMessage(f'settings applied: {described}')] if described else []
+
+    def describe(self) -> dict[str, str]:
+        """Return the values in use and the pending ones, as `settings.describe_settings` does."""
+        return describe_settings(self.in_use, self.latest)

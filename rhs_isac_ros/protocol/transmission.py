@@ -19,19 +19,18 @@ from rhs_isac_ros.link import (
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol import outcomes
 from rhs_isac_ros.protocol.events import (
     Action,
     CodebookOffered,
     Event,
     LogMessage,
+    Outcome,
     Send,
     SettingsOffered,
     Timeout,
 )
-from rhs_isac_ros.protocol.newest import CodebookCache, NewestDict
-from rhs_isac_ros.protocol.role import PendingSettings, PlainRole
-from rhs_isac_ros.protocol.settings import TransmissionSettings
+from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, PlainRole
+from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
 # Fields of a report for which statistics are computed, named as in `CapacityStatistics`.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
@@ -117,7 +116,7 @@ class Transmission(PlainRole):
             case m.GroundTruth() if event.cycle_id:
                 self._truths.put((event.cycle_id, event.user, event.sender), event)
             case m.PositionEstimate() if event.codebook_id not in self._codebooks:
-                self.count(outcomes.Outcome.WRONG_CODEBOOK)
+                self.count(Outcome.WRONG_CODEBOOK)
             case m.PositionEstimate():
                 return self._steer(event)
             case m.RhsConfiguration(mode=m.Mode.TRANSMISSION):
@@ -147,11 +146,11 @@ class Transmission(PlainRole):
     def _steer(self, estimate: m.PositionEstimate) -> list[Action]:
         known = self._steered.get(estimate.cycle_id)
         if known and m.same(known.estimate, estimate):
-            self.count(outcomes.Outcome.DUPLICATE)
+            self.count(Outcome.DUPLICATE)
             return [Send(known.beam)]
         if known and not m.same_instance(known.estimate.sender, estimate.sender):
             # The first estimate of a cycle stands. A repeated answer is due all the same.
-            self.count(outcomes.Outcome.WRONG_INSTANCE)
+            self.count(Outcome.WRONG_INSTANCE)
             return [Send(known.beam)]
         self._codebooks.take(estimate.codebook_id)
         bands = known.bands if known else self._bands()
@@ -173,11 +172,11 @@ class Transmission(PlainRole):
     def _await_report(self, applied: m.RhsConfiguration, now_s: float) -> None:
         steered = self._steered.get(applied.cycle_id)
         if steered is None:
-            self.count(outcomes.Outcome.WRONG_CYCLE)
+            self.count(Outcome.WRONG_CYCLE)
         elif applied.codebook_id != steered.beam.codebook_id:
-            self.count(outcomes.Outcome.WRONG_CODEBOOK)
+            self.count(Outcome.WRONG_CODEBOOK)
         elif applied.band != steered.beam.band:
-            self.count(outcomes.Outcome.WRONG_BAND)
+            self.count(Outcome.WRONG_BAND)
         else:
             self._waiting.append(_Waiting(steered, applied, now_s + _MAX_DELAY_S))
 

@@ -1,19 +1,16 @@
 """The users of a node, which answer beacons, send pilots and exchange data."""
 
 import bisect
-import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, LogMessage, PeersChanged, Send, Timeout
+from rhs_isac_ros.protocol.events import Action, LogMessage, Outcome, PeersChanged, Send, Timeout
 from rhs_isac_ros.protocol.messages import started
-from rhs_isac_ros.protocol.newest import NewestDict
-from rhs_isac_ros.protocol.outcomes import Outcome
-from rhs_isac_ros.protocol.state_machine import EventT, StateMachine, Transition
+from rhs_isac_ros.protocol.role import ANY, EventT, NewestDict, StateMachine, Transition
 
 # Number of cycles kept; no message of an older cycle can still be in transit.
 _MAX_REMEMBERED = 8
@@ -51,17 +48,43 @@ def timeouts(step_s: float, beacon_s: float) -> dict[State, float]:
             State.GRANTED: _SILENT_STEPS * step_s}
 
 
-class UserSteps(StateMachine[State]):
-    """The memory of the role, and the guards and actions of its table."""
+class Row(Transition[State, 'User', EventT]):
+    """A row of the table."""
+
+
+class User(StateMachine[State]):
+    """The role of the users of a node, usually of one.
+
+    A cycle serves one user, so that one state is enough for all users of the node.
+
+    Parameters
+    ----------
+    mobilities
+        By id, from 1: the position of each user as a function of time.
+    timeouts_s
+        Timeouts by state [s].
+    instance
+        Instance of the node; only the instance that a grant names answers it.
+    world_s
+        Returns the time of the mobilities [s]; by default it is that of `handle`.
+    """
+
+    SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
+    RECEIVES = (m.Beacon, m.Grant, m.PilotRequest, m.Data)
+
+    STATES = State
+    EVENT_NAMES = {PeersChanged: 'peers', Timeout: 'timeout', m.Beacon: 'beacon', m.Grant: 'grant',
+                   m.PilotRequest: 'pilot_request', m.Data: 'downlink'}
+    BLOCKED_STATES = frozenset({State.DISCONNECTED, State.NO_BEACON})
 
     def __init__(
             self, mobilities: Mapping[int, Mobility], timeouts_s: Mapping[State, float],
-            instance: int = 0) -> None:
+            instance: int = 0, world_s: Callable[[], float] | None = None) -> None:
         super().__init__(State.DISCONNECTED, timeouts_s)
         self.users, self._instance = tuple(sorted(mobilities)), instance
         # By user: describes the node with the same number that is served instead.
         self._conflicts: dict[int, str] = {}
-        self._mobilities = mobilities
+        self._mobilities, self._world_s = mobilities, world_s
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
         # Cycle and bands of the last pilot request answered.
@@ -81,15 +104,18 @@ class UserSteps(StateMachine[State]):
         cycle_id
             The cycle to which the position applies; 0 for none.
         """
-        position, velocity = self._mobilities[user].state(now_s)
+        position, velocity = self._mobilities[user].state(self._time_s(now_s))
         return m.GroundTruth(
             cycle_id=cycle_id, user=user, position=position, velocity=velocity)
 
     def ground_truths(self, now_s: float) -> m.GroundTruths:
         """Return the positions and velocities of all users at a time on the clock of `handle`."""
-        position, velocity = self._crowd.states(now_s)
+        position, velocity = self._crowd.states(self._time_s(now_s))
         return m.GroundTruths(
             cycle_id=0, users=np.array(self.users), position=position, velocity=velocity)
+
+    def _time_s(self, now_s: float) -> float:
+        return self._world_s() if self._world_s else now_s
 
     def status(self) -> Mapping[str, str]:
         """Return ``conflict.user_<n>`` while another node with the same number is served."""
@@ -213,109 +239,66 @@ class UserSteps(StateMachine[State]):
             cycle_id=event.cycle_id, user=event.user, direction=m.Direction.UPLINK,
             stage=m.Stage.OFFERED, duration_s=event.duration_s, bits=event.bits))]
 
+    # Messages that are dropped in every state, before the rows of the table.
+    DROPS = {
+        m.PilotRequest: {other_user: None, other_instance: None,
+                         wrong_cycle: Outcome.WRONG_CYCLE, other_granted: Outcome.WRONG_USER},
+        m.Data: {not_delivered_downlink: None, other_user: None,
+                 wrong_cycle: Outcome.WRONG_CYCLE, not_granted: None}}
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Row(Transition[State, UserSteps, EventT]):
-    """A row of the table."""
+    TABLE = (
+        Row(ANY, PeersChanged, guard=peers_missing, actions=(log_missing_peers,),
+            target=State.DISCONNECTED),
+        Row((State.DISCONNECTED,), PeersChanged, actions=(log_connected,), target=State.LISTENING),
+        Row(ANY, PeersChanged),
 
+        Row((State.LISTENING,), Timeout, actions=(log_no_beacon,), target=State.NO_BEACON,
+            outcome=Outcome.NO_BEACON),
+        Row((State.ACKNOWLEDGED,), Timeout, target=State.LISTENING, outcome=Outcome.NOT_GRANTED),
+        Row((State.GRANTED,), Timeout, target=State.LISTENING, outcome=Outcome.BS_SILENT),
 
-Steps = UserSteps
+        Row(ANY, m.Beacon, guard=stale_beacon, outcome=Outcome.STALE_BEACON),
+        Row((State.DISCONNECTED,), m.Beacon),
+        # A beacon to other users shows that the base station is active, and ends the cycle before.
+        Row((State.LISTENING,), m.Beacon, guard=invites_others, actions=(note_beacon,),
+            restart_timeout=True),
+        Row((State.NO_BEACON,), m.Beacon, guard=invites_others, actions=(log_resumed, note_beacon),
+            target=State.LISTENING),
+        Row((State.ACKNOWLEDGED,), m.Beacon, guard=invites_others, actions=(note_beacon,),
+            target=State.LISTENING),
+        Row((State.GRANTED,), m.Beacon, guard=invites_others, actions=(note_beacon,),
+            target=State.LISTENING, outcome=Outcome.ABANDONED),
+        Row((State.LISTENING,), m.Beacon, actions=(acknowledge,), target=State.ACKNOWLEDGED),
+        Row((State.NO_BEACON,), m.Beacon, actions=(log_resumed, acknowledge),
+            target=State.ACKNOWLEDGED),
+        Row((State.ACKNOWLEDGED,), m.Beacon, actions=(acknowledge,), restart_timeout=True),
+        Row((State.GRANTED,), m.Beacon, actions=(acknowledge,), target=State.ACKNOWLEDGED,
+            outcome=Outcome.ABANDONED),
 
-TABLE = (
-    Row(event=PeersChanged, guard=Steps.peers_missing, actions=(Steps.log_missing_peers,),
-        target=State.DISCONNECTED),
-    Row(source=(State.DISCONNECTED,), event=PeersChanged, actions=(Steps.log_connected,),
-        target=State.LISTENING),
-    Row(event=PeersChanged),
+        Row((State.ACKNOWLEDGED,), m.Grant, guard=other_user_granted, target=State.LISTENING),
+        Row(ANY, m.Grant, guard=other_user),
+        Row((State.ACKNOWLEDGED,), m.Grant, guard=other_instance_granted,
+            actions=(log_other_instance,), target=State.LISTENING, outcome=Outcome.NUMBER_TAKEN),
+        Row(ANY, m.Grant, guard=other_instance, actions=(log_other_instance,),
+            outcome=Outcome.NUMBER_TAKEN),
+        Row(ANY, m.Grant, guard=wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+        Row(ANY, m.Grant, guard=late_grant, outcome=Outcome.LATE_GRANT),
+        # The base station may wait for longer than the user did.
+        Row((State.LISTENING, State.ACKNOWLEDGED), m.Grant, actions=(publish_position,),
+            target=State.GRANTED),
+        Row((State.NO_BEACON,), m.Grant, actions=(log_resumed, publish_position),
+            target=State.GRANTED),
+        Row((State.GRANTED,), m.Grant),
 
-    Row(source=(State.LISTENING,), event=Timeout, actions=(Steps.log_no_beacon,),
-        target=State.NO_BEACON, outcome=Outcome.NO_BEACON),
-    Row(source=(State.ACKNOWLEDGED,), event=Timeout, target=State.LISTENING,
-        outcome=Outcome.NOT_GRANTED),
-    Row(source=(State.GRANTED,), event=Timeout, target=State.LISTENING,
-        outcome=Outcome.BS_SILENT),
+        # A request that overtakes the grant implies it.
+        Row((State.ACKNOWLEDGED,), m.PilotRequest, guard=new_request,
+            actions=(publish_position, send_pilots), target=State.GRANTED),
+        Row((State.GRANTED,), m.PilotRequest, guard=new_request, actions=(send_pilots,),
+            restart_timeout=True),
+        # The channel may have missed the pilots or the position.
+        Row((State.GRANTED,), m.PilotRequest, actions=(publish_position, send_pilots),
+            outcome=Outcome.ASKED_AGAIN, restart_timeout=True),
 
-    Row(event=m.Beacon, guard=Steps.stale_beacon, outcome=Outcome.STALE_BEACON),
-    Row(source=(State.DISCONNECTED,), event=m.Beacon),
-    # A beacon to other users shows that the base station is active, and ends the cycle before.
-    Row(source=(State.LISTENING,), event=m.Beacon, guard=Steps.invites_others,
-        actions=(Steps.note_beacon,), restart_timeout=True),
-    Row(source=(State.NO_BEACON,), event=m.Beacon, guard=Steps.invites_others,
-        actions=(Steps.log_resumed, Steps.note_beacon), target=State.LISTENING),
-    Row(source=(State.ACKNOWLEDGED,), event=m.Beacon, guard=Steps.invites_others,
-        actions=(Steps.note_beacon,), target=State.LISTENING),
-    Row(source=(State.GRANTED,), event=m.Beacon, guard=Steps.invites_others,
-        actions=(Steps.note_beacon,), target=State.LISTENING, outcome=Outcome.ABANDONED),
-    Row(source=(State.LISTENING,), event=m.Beacon, actions=(Steps.acknowledge,),
-        target=State.ACKNOWLEDGED),
-    Row(source=(State.NO_BEACON,), event=m.Beacon,
-        actions=(Steps.log_resumed, Steps.acknowledge), target=State.ACKNOWLEDGED),
-    Row(source=(State.ACKNOWLEDGED,), event=m.Beacon, actions=(Steps.acknowledge,),
-        restart_timeout=True),
-    Row(source=(State.GRANTED,), event=m.Beacon, actions=(Steps.acknowledge,),
-        target=State.ACKNOWLEDGED, outcome=Outcome.ABANDONED),
-
-    Row(source=(State.ACKNOWLEDGED,), event=m.Grant, guard=Steps.other_user_granted,
-        target=State.LISTENING),
-    Row(event=m.Grant, guard=Steps.other_user),
-    Row(source=(State.ACKNOWLEDGED,), event=m.Grant, guard=Steps.other_instance_granted,
-        actions=(Steps.log_other_instance,), target=State.LISTENING, outcome=Outcome.NUMBER_TAKEN),
-    Row(event=m.Grant, guard=Steps.other_instance, actions=(Steps.log_other_instance,),
-        outcome=Outcome.NUMBER_TAKEN),
-    Row(event=m.Grant, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
-    Row(event=m.Grant, guard=Steps.late_grant, outcome=Outcome.LATE_GRANT),
-    # The base station may wait for longer than the user did.
-    Row(source=(State.LISTENING, State.ACKNOWLEDGED), event=m.Grant,
-        actions=(Steps.publish_position,), target=State.GRANTED),
-    Row(source=(State.NO_BEACON,), event=m.Grant,
-        actions=(Steps.log_resumed, Steps.publish_position), target=State.GRANTED),
-    Row(source=(State.GRANTED,), event=m.Grant),
-
-    Row(event=m.PilotRequest, guard=Steps.other_user),
-    Row(event=m.PilotRequest, guard=Steps.other_instance),
-    Row(event=m.PilotRequest, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
-    Row(event=m.PilotRequest, guard=Steps.other_granted, outcome=Outcome.WRONG_USER),
-    # A request that overtakes the grant implies it.
-    Row(source=(State.ACKNOWLEDGED,), event=m.PilotRequest, guard=Steps.new_request,
-        actions=(Steps.publish_position, Steps.send_pilots), target=State.GRANTED),
-    Row(source=(State.GRANTED,), event=m.PilotRequest, guard=Steps.new_request,
-        actions=(Steps.send_pilots,), restart_timeout=True),
-    # The channel may have missed the pilots or the position.
-    Row(source=(State.GRANTED,), event=m.PilotRequest,
-        actions=(Steps.publish_position, Steps.send_pilots), outcome=Outcome.ASKED_AGAIN,
-        restart_timeout=True),
-
-    Row(event=m.Data, guard=Steps.not_delivered_downlink),
-    Row(event=m.Data, guard=Steps.other_user),
-    Row(event=m.Data, guard=Steps.wrong_cycle, outcome=Outcome.WRONG_CYCLE),
-    Row(event=m.Data, guard=Steps.not_granted),
-    Row(source=(State.GRANTED,), event=m.Data, actions=(Steps.send_uplink,),
-        target=State.LISTENING),
-    Row(source=(State.LISTENING,), event=m.Data, actions=(Steps.send_uplink,),
-        outcome=Outcome.ASKED_AGAIN),
-)
-
-
-class User(Steps):
-    """The role of the users of a node, usually of one.
-
-    A cycle serves one user, so that one state is enough for all users of the node.
-
-    Parameters
-    ----------
-    mobilities
-        By id, from 1: the position of each user as a function of time.
-    timeouts_s
-        Timeouts by state [s].
-    instance
-        Instance of the node; only the instance that a grant names answers it.
-    """
-
-    SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
-    RECEIVES = (m.Beacon, m.Grant, m.PilotRequest, m.Data)
-
-    STATES = State
-    TABLE = TABLE
-    EVENT_NAMES = {PeersChanged: 'peers', Timeout: 'timeout', m.Beacon: 'beacon', m.Grant: 'grant',
-                   m.PilotRequest: 'pilot_request', m.Data: 'downlink'}
-    BLOCKED_STATES = frozenset({State.DISCONNECTED, State.NO_BEACON})
+        Row((State.GRANTED,), m.Data, actions=(send_uplink,), target=State.LISTENING),
+        Row((State.LISTENING,), m.Data, actions=(send_uplink,), outcome=Outcome.ASKED_AGAIN),
+    )

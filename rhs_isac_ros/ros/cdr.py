@@ -239,7 +239,7 @@ class Codec:
         except (struct.error, ValueError) as error:
             raise MessageError(f'{self._kind.__name__}: invalid CDR data of {len(data)} bytes: '
                                f'{error}') from None
-        values = {}
+        values = {'stamp_ns': _NANOSECONDS * items[0] + items[1]}
         for name, first, last, encode, decode in self._fields:
             if decode is None:
                 values[name] = items[first]

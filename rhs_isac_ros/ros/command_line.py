@@ -8,11 +8,13 @@ from collections.abc import Iterator, Sequence
 
 from rclpy.utilities import remove_ros_args
 
-from rhs_isac_ros.model.arguments import ArgumentParser
-from rhs_isac_ros.ros.parameters import CODEBOOK, NODES, Parameter
+from rhs_isac_ros.ros.parameters import CODEBOOK, NODES, Parameter, hint, known_names
+from rhs_isac_ros.support.arguments import ArgumentParser
 
 # The highest domain whose ports exist.
 _MAX_DOMAIN = 232
+# Parameters that rclpy declares for each node.
+_OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 # Options that ROS accepts only after --ros-args.
 _ROS_OPTIONS = {'-p', '--param', '-r', '--remap', '--params-file', '--log-level'}
 
@@ -71,11 +73,13 @@ def check_parameters(
         parser: argparse.ArgumentParser, executable: str, arguments: Sequence[str]) -> None:
     """Exit with a usage error if ``-p`` sets a parameter that only other executables have.
 
-    A parameter file may set it, because several nodes may share the file. Parameters that no
-    executable has are left to `parameters.check_overrides`.
+    Likewise if no executable has it. A parameter file may set both, because several nodes may
+    share the file; `parameters.check_overrides` warns of the latter.
     """
     accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
     for name in _assigned(arguments):
+        if name not in known_names() and not name.startswith(_OF_RCLPY):
+            parser.error(f'argument -p: {name}: unknown parameter{hint(name)}; see --help')
         owners = [owner for owner in NODES if name in _names(owner)]
         if owners and name not in accepted:
             parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '

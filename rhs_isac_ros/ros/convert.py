@@ -17,10 +17,12 @@ from std_msgs.msg import Header
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import TrackEstimate
+from rhs_isac_ros.protocol.events import PublishTrack
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import cdr
-from rhs_isac_ros.ros.topics import MAP_FRAME, NAMES, USER_FRAME
+from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 
 # Variance of an unknown angular velocity [rad^2/s^2], the value that ROS drivers use.
 _UNKNOWN_ROTATION_VARIANCE = 1e6
@@ -52,7 +54,8 @@ def to_ros(
 
 
 def to_bytes(
-        message: Message, stamp_ns: int, identity: tuple[int, str] | None = None) -> bytes:
+        message: Message, stamp_ns: int, identity: tuple[int, str] | None = None,
+        frame: str = RHS_FRAME) -> bytes:
     """Serialize a message (CDR), as a publisher of `ros_type` accepts it.
 
     Parameters
@@ -61,6 +64,8 @@ def to_bytes(
         Time for the header [ns].
     identity
         Sender and id of the scenario; by default those of the message.
+    frame
+        Frame of the surface.
 
     Raises
     ------
@@ -68,7 +73,7 @@ def to_bytes(
         If a string has no UTF-8 encoding.
     """
     sender, scenario_id = identity or (message.sender, message.scenario_id)
-    return _CODECS[type(message)].encode(message, MAP_FRAME, stamp_ns, sender, scenario_id)
+    return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)
 
 
 def from_ros(kind: type[Message], message: Any) -> Message:
@@ -118,7 +123,7 @@ def codebook_to_ros(
         codebook: Codebook, stamp: Time, sender: int = 0, scenario_id: str = '') -> ros.Codebook:
     """Convert a codebook to ROS; `sender` and `scenario_id` are as in `Message`."""
     return ros.Codebook(
-        header=Header(stamp=stamp, frame_id=MAP_FRAME), sender=sender, scenario_id=scenario_id,
+        header=Header(stamp=stamp, frame_id=RHS_FRAME), sender=sender, scenario_id=scenario_id,
         codebook_id=codebook.id,
         analog=_encode_real(codebook.analog), digital=_encode_complex(codebook.digital),
         average_crlb_m2=float(codebook.average_crlb_m2))
@@ -164,29 +169,51 @@ def presence_from_ros(message: ros.Presence) -> Presence:
     return Presence(message.sender, message.scenario_id, message.role, message.node, scenario)
 
 
-def pose(estimate: PositionEstimate, stamp: Time) -> PoseWithCovarianceStamped:
-    """Return a position estimate as a pose with unknown orientation.
+def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
+    """Return the stamp of a message; the present time of a node if it is unknown."""
+    if not message.stamp_ns:
+        return node.get_clock().now().to_msg()
+    return Time(sec=message.stamp_ns // 10**9, nanosec=message.stamp_ns % 10**9)
+
+
+def pose(
+        estimate: PositionEstimate, stamp: Time, frame: Frame | None = None
+) -> PoseWithCovarianceStamped:
+    """Return a position estimate as a pose with unknown orientation in a frame.
 
     Each rotation has the variance of an angle that is uniform from -pi to pi.
     """
-    result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=MAP_FRAME))
-    result.pose.pose.position = _encode_vector(Point, estimate.position)
-    result.pose.covariance = _with_rotation(estimate.covariance_m2, math.pi**2 / 3)
+    frame = frame or Frame()
+    result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
+    result.pose.pose.position = _encode_vector(Point, frame.from_surface(estimate.position))
+    result.pose.covariance = _with_rotation(
+        frame.covariance(estimate.covariance_m2), math.pi**2 / 3)
     return result
 
 
-def odometry(user: int, estimate: TrackEstimate, stamp: Time) -> Odometry:
+def odometry(
+        user: int, estimate: TrackEstimate, stamp: Time, frame: Frame | None = None) -> Odometry:
     """Return position and velocity of a track; orientation and angular velocity are unknown.
 
-    The axes of the child frame, in which the velocity is given, are those of the map.
+    The axes of the child frame, in which the velocity is given, are those of the frame.
     """
-    result = Odometry(header=Header(stamp=stamp, frame_id=MAP_FRAME),
-                      child_frame_id=USER_FRAME.format(user=user))
-    result.pose.pose.position = _encode_vector(Point, estimate.mean)
-    result.pose.covariance = _with_rotation(estimate.covariance, math.pi**2 / 3)
-    result.twist.twist.linear = _encode_vector(Vector3, estimate.velocity)
+    frame = frame or Frame()
+    result = true_odometry(user, estimate.mean, estimate.velocity, stamp, frame)
+    result.pose.covariance = _with_rotation(
+        frame.covariance(estimate.covariance), math.pi**2 / 3)
     result.twist.covariance = _with_rotation(
-        estimate.velocity_covariance, _UNKNOWN_ROTATION_VARIANCE)
+        frame.covariance(estimate.velocity_covariance), _UNKNOWN_ROTATION_VARIANCE)
+    return result
+
+
+def true_odometry(
+        user: int, position: np.ndarray, velocity: np.ndarray, stamp: Time, frame: Frame
+) -> Odometry:
+    """Return a true position [3] [m] and velocity [3] [m/s] in a frame, without covariances."""
+    result = Odometry(header=Header(stamp=stamp, frame_id=frame.name),
+                      child_frame_id=frame.user(user))
+    result.pose.pose.position = _encode_vector(Point, frame.from_surface(position))
+    result.twist.twist.linear = _encode_vector(Vector3, frame.rotation @ velocity)
     return result
 
 
@@ -194,8 +221,7 @@ def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
     """Return the 36 elements of a covariance with independent rotations of a variance."""
     both = variance * np.eye(6)
     both[:3, :3] = covariance
-    elements: np.ndarray = both.ravel()
-    return elements
+    return both.ravel()
 
 
 def _encode_real(values: np.ndarray) -> ros.RealArray:

@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import qos, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
 
 _PERIOD_S = 1.0
 
@@ -33,12 +33,23 @@ def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
     return DiagnosticArray(header=Header(stamp=stamp), status=[status])
 
 
-def from_ros(message: DiagnosticArray) -> Iterator[tuple[str, Report]]:
-    """Yield the fully qualified name of each node, without its first slash, and its report."""
+def from_ros(message: DiagnosticArray, namespace: str) -> Iterator[tuple[str, Report]]:
+    """Yield the name of each node of a namespace, without its first slash, and its report."""
     for status in message.status:
-        yield status.name, Report(
-            status.level != DiagnosticStatus.OK, status.message,
-            {pair.key: pair.value for pair in status.values})
+        if status.name.rpartition('/')[0] == namespace.strip('/'):
+            yield status.name, Report(
+                status.level != DiagnosticStatus.OK, status.message,
+                {pair.key: pair.value for pair in status.values})
+
+
+def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> None:
+    """Subscribe to the reports of the nodes in the namespace of a node; the topic is common."""
+    namespace = node.get_namespace()
+
+    def receive(message: DiagnosticArray) -> None:
+        for name, report in from_ros(message, namespace):
+            on_report(name, report)
+    subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, qos.EXCHANGE)
 
 
 class Diagnostics:

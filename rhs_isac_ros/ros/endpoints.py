@@ -19,6 +19,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 
 from rhs_isac_ros.protocol import messages as m
@@ -70,17 +71,29 @@ class _NoPublisher(Publisher):
         return 0
 
 
-def create_publisher(node: Node, kind: type, name: str, profile: QoSProfile) -> Publisher:
-    """Create a publisher of a ROS type on a topic; one that was refused publishes nothing."""
+def _overriding(overridable: bool) -> QoSOverridingOptions | None:
+    return QoSOverridingOptions.with_default_policies() if overridable else None
+
+
+def create_publisher(
+        node: Node, kind: type, name: str, profile: QoSProfile, overridable: bool = False
+) -> Publisher:
+    """Create a publisher of a ROS type on a topic; one that was refused publishes nothing.
+
+    Parameters
+    ----------
+    overridable
+        Whether parameters ``qos_overrides.*`` change its quality of service.
+    """
     publisher = create_or_refuse(node, f'publisher of {name}', lambda: node.create_publisher(
-        kind, name, profile,
+        kind, name, profile, qos_overriding_options=_overriding(overridable),
         event_callbacks=PublisherEventCallbacks(use_default_callbacks=False)))
     return publisher or _NoPublisher(node.resolve_topic_name(name))
 
 
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
-        raw: bool = False) -> None:
+        raw: bool = False, overridable: bool = False) -> None:
     """Subscribe to a topic.
 
     Parameters
@@ -91,9 +104,12 @@ def subscribe(
         Name of the topic.
     callback
         Called with each message, or with its serialized bytes (CDR) if `raw`.
+    overridable
+        Whether parameters ``qos_overrides.*`` change its quality of service.
     """
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
         kind, name, callback, profile, raw=raw,
+        qos_overriding_options=_overriding(overridable),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False)))
 
 
@@ -159,7 +175,8 @@ class UserTopics:
             return ()
         if user not in self._publishers:
             self._publishers[user] = tuple(
-                create_publisher(self._node, kind, name.format(user=user), qos.EXCHANGE)
+                create_publisher(
+                    self._node, kind, name.format(user=user), qos.EXCHANGE, overridable=True)
                 for name, kind in self._kinds.items())
         return self._publishers[user]
 

@@ -1,4 +1,7 @@
-"""The scene of a network as markers for RViz, in metres in the frame ``map``."""
+"""The scene of a network as markers for RViz, in metres in the frame of the surface.
+
+`place` moves a marker to the frame of standard messages.
+"""
 
 from collections.abc import Iterable
 
@@ -12,9 +15,10 @@ from visualization_msgs.msg import Marker
 from rhs_isac_ros.link import BeamPattern
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions
-from rhs_isac_ros.monitoring.entities import ellipsoid_95, lobe_m, user_colour
+from rhs_isac_ros.monitoring.shapes import ellipsoid_95, lobe_m, user_colour
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.topics import MAP_FRAME
+from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.topics import RHS_FRAME
 
 _USER_SIZE_M = 0.25
 # RViz rejects bodies without extent [m].
@@ -97,16 +101,23 @@ def deletion(namespace: str, number: int, stamp: Time) -> Marker:
     return marker
 
 
-def path(positions: Iterable[np.ndarray], stamp: Time) -> Path:
-    """Return positions, float64 [3] [m] each, as a path with unknown orientation."""
-    header = Header(stamp=stamp, frame_id=MAP_FRAME)
+def place(marker: Marker, frame: Frame) -> Marker:
+    """Return a marker in the frame of standard messages; its points are relative to its pose."""
+    marker.header.frame_id = frame.name
+    marker.pose = frame.pose(marker.pose)
+    return marker
+
+
+def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
+    """Return positions, float64 [3] [m] each, as a path in a frame, with unknown orientation."""
+    header = Header(stamp=stamp, frame_id=frame.name)
     return Path(header=header, poses=[
-        PoseStamped(header=header, pose=Pose(position=_point(position)))
+        PoseStamped(header=header, pose=Pose(position=_point(frame.from_surface(position))))
         for position in positions])
 
 
 def _marker(namespace: str, number: int, kind: int, stamp: Time) -> Marker:
-    marker = Marker(header=Header(stamp=stamp, frame_id=MAP_FRAME), ns=namespace, type=kind,
+    marker = Marker(header=Header(stamp=stamp, frame_id=RHS_FRAME), ns=namespace, type=kind,
                     # Marker ids are signed, user numbers are unsigned.
                     id=number & 0x7fffffff, action=Marker.ADD)
     marker.pose.orientation.w = 1.0

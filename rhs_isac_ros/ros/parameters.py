@@ -14,13 +14,14 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
-from rhs_isac_ros.model import Scenario, mobility, plugins
-from rhs_isac_ros.model.arguments import ArgumentParser
+from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
 from rhs_isac_ros.protocol.settings import BaseStationSettings
-from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.arguments import ArgumentParser
 
 
 class ParameterError(ValueError):
@@ -150,10 +151,22 @@ _USER_TOPICS = Parameter(
     'user_topics', 64, 'Highest number of a user that has topics of its own.', low=0,
     high=MAX_USERS)
 
+# Mobilities of robots, beside those of the library.
+ODOMETRY, TF = ROBOTS = ('odometry', 'tf')
+_FRAME = (
+    Parameter('frame_id', topics.MAP_FRAME,
+              'Frame of poses, odometry, paths and transforms; messages of the protocol are in '
+              'the frame of the surface.'),
+    Parameter('surface_pose', [],
+              'Pose of the surface in frame_id: x, y, z in metres, roll, pitch, yaw in radians; '
+              'empty: at the origin, with the same axes.', '', -1e6, 1e6),
+)
+
 # Parameters of roles that are not settings.
 _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
         _SEED,
+        *_FRAME,
         Parameter('first_cycle', 0,
                   'Id of the first cycle; 0: derived from the clock, so that no id is reused '
                   'after a restart.', low=0, high=2**53),
@@ -164,8 +177,16 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
                   high=MAX_USERS),
         Parameter('user_count', 1, 'Number of users of the node, with consecutive ids.', low=1,
                   high=MAX_USERS),
-        Parameter('mobility', 'static', 'Mobility model.', choices=mobility.KINDS,
-                  plugins=plugins.MOBILITIES),
+        Parameter('mobility', 'static', 'Mobility model, or a robot.',
+                  choices=(*mobility.KINDS, *ROBOTS), plugins=plugins.MOBILITIES),
+        Parameter('odometry_topic', 'odom',
+                  'Odometry of the robot in frame_id, for the mobility odometry.'),
+        Parameter('robot_frame', 'base_link', 'Frame of the robot, for the mobility tf.'),
+        Parameter('robot_timeout_s', 1.0,
+                  'Time without a position of the robot after which the user does not answer '
+                  'beacons.', 's', 0.05, 3600.0),
+        *_FRAME,
+        _USER_TOPICS,
         Parameter('position_m', [],
                   'Initial position x, y, z of each user; empty: random points of the region of '
                   'interest.',
@@ -183,6 +204,7 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'positioner': (
         Parameter('table_folder', '',
                   'Directory in which tables are cached; empty: the cache directory of the user.'),
+        *_FRAME,
         _USER_TOPICS,
     ),
     topics.OPTIMIZER_NODE: (
@@ -195,6 +217,7 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
        for name, member in sorted(ROSTER.items())},
     'visualizer': (
         _SCENARIO,
+        *_FRAME,
         _USER_TOPICS,
         Parameter('period_s', 0.2, 'Period at which the scene is published.', 's', 0.01, 60.0),
         Parameter('forget_s', 10.0, 'Time without a message after which a user is removed.', 's',
@@ -231,24 +254,30 @@ def declare(node: Node, executable: str) -> types.SimpleNamespace:
 
 
 def check_overrides(node: Node) -> None:
-    """Check that the values given to a node at its start belong to known parameters.
+    """Warn once of values given to a node at its start that belong to no known parameter.
 
-    Values of parameters that only other executables declare are permitted, because several nodes
-    may share a parameter file; `command_line.check_parameters` rejects them after ``-p``.
-
-    Raises
-    ------
-    ParameterError
-        If neither the node nor any executable declares a parameter.
+    Robots share one parameter file among all their nodes; `command_line.check_parameters` rejects
+    unknown names after ``-p``.
     """
-    known = {parameter.name for parameters in NODES.values() for parameter in parameters}
-    known.update(CODEBOOK)
+    known = known_names()
     # rclpy has no public access to all overrides. Publishers declare qos_overrides when created.
-    for name in node._parameter_overrides:
-        if not (name in known or node.has_parameter(name) or name.startswith('qos_overrides.')):
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f'; the closest is {close[0]}' if close else ''
-            raise ParameterError(f'{name}: unknown parameter{hint}; see --help')
+    foreign = [f'{name}{hint(name)}' for name in sorted(node._parameter_overrides)
+               if not (name in known or node.has_parameter(name)
+                       or name.startswith('qos_overrides.'))]
+    if foreign:
+        node.get_logger().warning(f'unknown parameters are ignored: {", ".join(foreign)}')
+
+
+def known_names() -> set[str]:
+    """Return the names of the parameters of all executables."""
+    known = {parameter.name for parameters in NODES.values() for parameter in parameters}
+    return known.union(CODEBOOK)
+
+
+def hint(name: str) -> str:
+    """Return the known parameter closest to a name, as text; empty if none is close."""
+    close = difflib.get_close_matches(name, known_names(), 1)
+    return f' (the closest is {close[0]})' if close else ''
 
 
 def _declare_one(node: Node, parameter: Parameter) -> Any:

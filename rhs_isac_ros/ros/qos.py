@@ -8,7 +8,7 @@ from rclpy.qos import (
 )
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
+from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
 
 # For handshakes and signals, which must all arrive and are useless to late joiners. The depth
 # holds the acks of the users of a beacon, and messages that arrive during a computation.
@@ -36,6 +36,11 @@ LATCHED = QoSProfile(
 PRESENCES = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# For the positions of robots, whose drivers and simulators often publish best effort.
+SENSOR = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE)
 
 _LATCHED_MESSAGES = {m.CapacityStatistics}
 

@@ -20,9 +20,9 @@ from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
 _SEPARATOR = '=' * 80

@@ -5,6 +5,7 @@ import functools
 import time
 from typing import Any, Generic, TypeVar
 
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
@@ -15,6 +16,7 @@ from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     Event,
     LogMessage,
+    Outcome,
     PeersChanged,
     RevertSettings,
     Send,
@@ -22,21 +24,74 @@ from rhs_isac_ros.protocol.events import (
     Timeout,
 )
 from rhs_isac_ros.protocol.messages import started
-from rhs_isac_ros.protocol.outcomes import Outcome
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros.frames import surface_frame
 from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
 from rhs_isac_ros.ros.parameters import scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.roster import ROSTER
 
+# Period at which the end of a state of the emulated world is awaited [s].
+_WORLD_POLL_S = 0.002
 # Maximum number of senders whose wrong scenario is logged, which bounds the log.
 _MAX_LOGGED = 16
 
 _RoleT = TypeVar('_RoleT', bound=Role)
+
+
+class Clocks:
+    """Two clocks of a node, which begin at the same time and never go back.
+
+    The world moves with the clock of ROS if the node uses the time of a simulation, otherwise with
+    the steady clock. The clock of the roles is steady, but for the states of a role that belong to
+    the world, such as the rest between cycles.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._clock = node.get_clock()
+        self._steady_s = self._world_s = self._role_s = time.monotonic()
+        self._simulated_s: float | None = None
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether the node uses the time of a simulation."""
+        return bool(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
+
+    def world_s(self) -> float:
+        """Return the time in the emulated world [s]."""
+        self._advance(False)
+        return self._world_s
+
+    def role_s(self, in_world: bool) -> float:
+        """Return the time of the roles [s].
+
+        Parameters
+        ----------
+        in_world
+            Whether the time since the last call belongs to the world.
+        """
+        self._advance(in_world)
+        return self._role_s
+
+    def _advance(self, in_world: bool) -> None:
+        steady_s = time.monotonic()
+        elapsed_s, self._steady_s = steady_s - self._steady_s, steady_s
+        if not self.is_simulated:
+            self._simulated_s = None
+            self._world_s += elapsed_s
+            self._role_s += elapsed_s
+            return
+        simulated_s = 1e-9 * self._clock.now().nanoseconds
+        before_s = simulated_s if self._simulated_s is None else self._simulated_s
+        self._simulated_s = simulated_s
+        # A simulation that starts again goes back; the world then stands still once.
+        world_s = max(simulated_s - before_s, 0.0)
+        self._world_s += world_s
+        self._role_s += world_s if in_world else elapsed_s
 
 
 class RoleNode(ParameterizedNode, Generic[_RoleT]):
@@ -59,6 +114,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         Scenario of the parameter ``scenario_file``.
     instance
         Instance of the node; see `Message.sender`.
+    clocks
+        Clocks of the node.
 
     Raises
     ------
@@ -77,6 +134,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._sizes = self.scenario.sizes
         self.instance = new_instance()
         self._identity = self.instance, self.scenario.id
+        self._surface_frame = surface_frame(self.get_namespace())
+        self.clocks = Clocks(self)
+        self._missing: dict[str, str] | None = None
+        self._lacking = ''
         self._foreign: set[int] = set()
         self._is_advertised = self._stands_by = False
         self._has_optimizer = True
@@ -160,10 +221,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _on_missing(self, missing: dict[str, str]) -> None:
         if self._stands_by:
             return
-        self._statistics.missing = tuple(missing.values())
-        if ROSTER[self._executable].requires:
-            self.dispatch(PeersChanged(tuple(
-                text for role, text in missing.items() if role != topics.OPTIMIZER_NODE)))
+        self._missing = missing
+        self._report_missing(missing)
         has_optimizer = topics.OPTIMIZER_NODE not in missing
         if has_optimizer == self._has_optimizer:
             return
@@ -174,6 +233,22 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self.get_logger().warning(  # type: ignore[no-untyped-call]
                 'optimizer is not present; the codebook in use is '
                 f'{self._codebook_client.codebook_id or "none"}')
+
+    def set_lacking(self, text: str) -> None:
+        """Set what the role lacks besides other roles; empty: nothing."""
+        if text != self._lacking:
+            self._lacking = text
+            # What is missing is not known before discovery.
+            if self._missing is not None:
+                self._report_missing(self._missing)
+
+    def _report_missing(self, missing: dict[str, str]) -> None:
+        lacking = (self._lacking,) if self._lacking else ()
+        self._statistics.missing = (*missing.values(), *lacking)
+        if ROSTER[self._executable].requires:
+            self.dispatch(PeersChanged((*(
+                text for role, text in missing.items() if role != topics.OPTIMIZER_NODE),
+                *lacking)))
 
     def _on_rival(self, stands_by: bool) -> None:
         if stands_by == self._stands_by:
@@ -203,10 +278,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self.advertise()
             self.subscribe()
 
-    @staticmethod
-    def now_s() -> float:
+    def now_s(self) -> float:
         """Return the time on the monotonic clock of the roles [s], which has no epoch."""
-        return time.monotonic()
+        return self.clocks.role_s(self._in_world())
+
+    def _in_world(self) -> bool:
+        return self.role.state in self.role.WORLD_STATES
 
     def dispatch(self, event: Event) -> None:
         """Pass an event to the role, then a `Timeout` for each deadline that has passed."""
@@ -225,10 +302,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """
         if self._stands_by:
             return False
-        stamp_ns = self.get_clock().now().nanoseconds
+        stamp_ns = message.stamp_ns or self.get_clock().now().nanoseconds
         try:
             m.check(message, self._sizes)
-            content = convert.to_bytes(message, stamp_ns, self._identity)
+            content = convert.to_bytes(
+                message, stamp_ns, self._identity, self._surface_frame)
         except m.MessageError as error:
             self._log_error('not sent', error)
             return False
@@ -295,6 +373,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._log_once.error(f'{consequence} {field}', f'{consequence}: {error}')
 
     def _set_timer(self, delay_s: float, due_s: float) -> None:
+        # The timer is steady, and the pace of a simulation is unknown.
+        if self.clocks.is_simulated and self._in_world():
+            delay_s = min(delay_s, _WORLD_POLL_S)
         self._timer.timer_period_ns = max(int(delay_s * 1e9), 1)
         self._timer.reset()
         self._timer_due_s = due_s

@@ -10,11 +10,11 @@ from typing import Any
 
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.positioner import Positioner
 from rhs_isac_ros.protocol.rhs_controller import RhsController
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
+    Impairments,
     PositionerSettings,
     TransmissionSettings,
 )
@@ -79,7 +79,9 @@ ROSTER: Mapping[str, Member] = {
     'transmission': Member(role=Transmission, settings=TransmissionSettings, has_codebook=True),
     topics.OPTIMIZER_NODE: Member(publishes=(topics.CODEBOOK,)),
     'channel': Member(role=Channel, settings=Impairments),
-    'user': Member(role=User, requires=('channel', 'bs'), is_unique=False),
+    'user': Member(
+        role=User, publishes=(topics.TRUE_ODOMETRY,), requires=('channel', 'bs'),
+        is_unique=False),
     'bs': Member(
         role=BaseStation, settings=BaseStationSettings, has_codebook=True,
         requires=('rhs_controller', 'channel', 'positioner', 'transmission')),

@@ -26,6 +26,11 @@ class SecurityError(RuntimeError):
     """DDS security is requested and cannot be used."""
 
 
+def is_enabled() -> bool:
+    """Return whether the environment switches DDS security on."""
+    return os.environ.get(_ENABLE) == 'true'
+
+
 def prepare(args: Sequence[str]) -> list[str]:
     """Return a command line that names an enclave, if DDS security is enabled.
 
@@ -49,7 +54,7 @@ def prepare(args: Sequence[str]) -> list[str]:
         if os.environ.get(name, '') not in values:
             raise SecurityError(
                 f'{name}: {os.environ[name]!r}, expected {" or ".join(values[1:])}')
-    if os.environ.get(_ENABLE) != 'true':
+    if not is_enabled():
         return list(args)
     enclave = os.environ.get(OVERRIDE) or _enclave(args)
     try:
@@ -95,7 +100,7 @@ def _check_enclave(enclave: str) -> None:
 
 @contextlib.contextmanager
 def one_line() -> Iterator[None]:
-    """Convert the error of a node that DDS security prevents from starting.
+    """Convert the error of a node or an endpoint that DDS security refuses.
 
     Raises
     ------
@@ -108,7 +113,7 @@ def one_line() -> Iterator[None]:
             warnings.simplefilter('ignore', RuntimeWarning)
             yield
     except rclpy_implementation.RCLError as error:
-        if os.environ.get(_ENABLE) != 'true':
+        if not is_enabled():
             raise
         text = str(error).splitlines()[0]
         if 'security libraries' in text:

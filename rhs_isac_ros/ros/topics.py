@@ -1,4 +1,4 @@
-"""The names of all topics. They are relative, so that namespaces and remapping apply."""
+"""The names of all topics. Most are relative, so that namespaces and remapping apply."""
 
 from collections.abc import Mapping
 
@@ -28,13 +28,15 @@ NAMES: Mapping[type[m.Message], str] = {
 # Topics without a message of the protocol.
 POSITION = 'position'
 CODEBOOK = 'codebook'
-DIAGNOSTICS = 'diagnostics'
+# Absolute, as the aggregator of the diagnostics expects it.
+DIAGNOSTICS = '/diagnostics'
 MARKERS = 'markers'
 PRESENCE = 'presence'
 
-# Pose, odometry, estimated path and true path of a user.
+# Pose, odometry, true odometry, estimated path and true path of a user.
 POSE = 'users/user_{user}/pose'
 ODOMETRY = 'users/user_{user}/odometry'
+TRUE_ODOMETRY = 'users/user_{user}/true_odometry'
 PATH = 'users/user_{user}/path'
 TRUE_PATH = 'users/user_{user}/true_path'
 
@@ -42,16 +44,18 @@ TRUE_PATH = 'users/user_{user}/true_path'
 TF = '/tf'
 TF_STATIC = '/tf_static'
 
-# Services of the base station.
+# Action of the base station, and its services.
+LOCATE = 'locate'
 PAUSE = '~/pause'
 RESUME = '~/resume'
 STEP = '~/step'
 
 # Node whose parameters are the codebook.
 OPTIMIZER_NODE = 'optimizer'
-# Frame of all positions: the origin is the centre of the surface, x points outward, z up.
+# Frame of standard messages, unless the parameter frame_id names another.
 MAP_FRAME = 'map'
-# Frame of the surface, with the same origin and axes.
+# Frame of the messages of the protocol: the origin is the centre of the surface, x points outward,
+# z up. A namespace precedes this name and the next.
 RHS_FRAME = 'rhs_link'
-# Frame at the estimated position of a user, with the axes of the map.
+# Frame at the estimated position of a user, with the axes of the frame of standard messages.
 USER_FRAME = 'user_{user}'

@@ -1,4 +1,4 @@
-"""Transforms from the frame ``map`` to the frames of the surface and of the users, for tf2."""
+"""Transforms from the frame of standard messages to those of the surface and the users."""
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -8,25 +8,34 @@ from std_msgs.msg import Header
 
 from rhs_isac_ros.ros import qos
 from rhs_isac_ros.ros.endpoints import create_publisher
-from rhs_isac_ros.ros.topics import MAP_FRAME, RHS_FRAME, TF, TF_STATIC, USER_FRAME
+from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.topics import TF, TF_STATIC
+
+_NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def surface(stamp: Time) -> TransformStamped:
-    """Return the transform of the surface, which is at the origin."""
-    return _transform(RHS_FRAME, np.zeros(3), stamp)
+def surface(frame: Frame, stamp: Time) -> TransformStamped:
+    """Return the transform of the surface."""
+    return _transform(frame, frame.surface, frame.origin, frame.orientation, stamp)
 
 
-def user(number: int, position: np.ndarray, stamp: Time) -> TransformStamped:
-    """Return the transform of a user at a position, float64 [3] [m], of unknown orientation."""
-    return _transform(USER_FRAME.format(user=number), position, stamp)
+def user(frame: Frame, number: int, position: np.ndarray, stamp: Time) -> TransformStamped:
+    """Return the transform of a user at a position, float64 [3] [m], of unknown orientation.
+
+    The position is in the frame of the surface.
+    """
+    return _transform(frame, frame.user(number), frame.from_surface(position), _NO_TURN, stamp)
 
 
-def _transform(child: str, position: np.ndarray, stamp: Time) -> TransformStamped:
+def _transform(
+        frame: Frame, child: str, position: np.ndarray, orientation: np.ndarray, stamp: Time
+) -> TransformStamped:
     x, y, z = position.tolist()
+    qx, qy, qz, qw = orientation.tolist()
     return TransformStamped(
-        header=Header(stamp=stamp, frame_id=MAP_FRAME), child_frame_id=child,
+        header=Header(stamp=stamp, frame_id=frame.name), child_frame_id=child,
         transform=Transform(
-            translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)))
+            translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw)))
 
 
 class TransformPublisher:
@@ -40,7 +49,7 @@ class TransformPublisher:
         Whether ``tf2_msgs`` is installed; if not, nothing is published.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, frame: Frame) -> None:
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
@@ -50,7 +59,8 @@ class TransformPublisher:
         self._message = TFMessage
         self._dynamic = create_publisher(node, TFMessage, TF, qos.EXCHANGE)
         self._static = create_publisher(node, TFMessage, TF_STATIC, qos.LATCHED)
-        self._static.publish(TFMessage(transforms=[surface(node.get_clock().now().to_msg())]))
+        self._static.publish(TFMessage(transforms=[
+            surface(frame, node.get_clock().now().to_msg())]))
 
     def publish(self, transform: TransformStamped) -> None:
         """Publish a transform that changes."""

@@ -18,7 +18,7 @@ from rclpy.node import Node
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import (
-    Calibration,
+    CalibrationError,
     Pilots,
     SurfacePrior,
     SurveyWarning,
@@ -30,11 +30,18 @@ from rhs_isac_ros.calibration import (
     survey_report,
 )
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.executables import exit_code_of, print_error
-from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
+from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
+from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    check_distinct,
     input_file,
     integer,
     nonnegative_float,
@@ -42,17 +49,9 @@ from rhs_isac_ros.model.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.model.files import ArchiveError, read_arrays
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.command_line import parse
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
-from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
-from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.tools.republish import topic_prefix
+from rhs_isac_ros.support.files import ArchiveError, read_arrays
+from rhs_isac_ros.tools.command import ToolError, run_command
+from rhs_isac_ros.tools.replay import topic_prefix
 
 # Messages that the log needs.
 RECEIVES = (m.GroundTruth, m.ReceivedSignals)
@@ -152,40 +151,16 @@ class CalibratorNode(Node):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Calibrate, print the result and write the file.
+    """Calibrate, print the result and write the file; 1 if there were too few pilots in time."""
+    return run_command(
+        _calibrate, _parser(), arguments, ['file', '--config', '--codebook', '--calibration'],
+        ['--output'])
 
-    Parameters
-    ----------
-    arguments
-        Command line including ROS arguments; by default that of the process.
 
-    Returns
-    -------
-    int
-        Exit code: 0; 1 if there were too few pilots in time; 2 if an argument or a file is
-        invalid.
-    """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    parser = _parser()
-    options = parse(parser, arguments)
-    check_distinct(parser, {'file': options.file, '--config': options.config,
-                            '--codebook': options.codebook,
-                            '--calibration': options.calibration}, {'--output': options.output})
+def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
     try:
         scenario = _scenario(options)
-        if options.file and options.file.suffix == '.npz':
-            pilots = [_arrays(options)]
-        else:
-            log = PilotLog(scenario, options.user)
-            if options.file:
-                _read(options, scenario, log)
-            elif not _listen(options, scenario, log, arguments):
-                print_error(
-                    f'{log.n_pilots} pilots within {options.timeout:g} s, expected '
-                    f'{options.cycles}, in the domain {os.environ.get("ROS_DOMAIN_ID", "0")} and '
-                    'this namespace', parser.prog)
-                return 1
-            pilots = _checked(log, options)
+        pilots = _pilots(options, scenario, arguments)
         if options.multipath:
             _survey(scenario, pilots, options)
             return 0
@@ -193,16 +168,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(report(calibration, scenario), flush=True)
         for text, surface in (('before', None), ('after', calibration.surface)):
             print(f'position error of the pilots {text}: {_error(scenario, pilots, surface)}')
-        _write(calibration, options.output)
-    except (RecordingError, ScenarioError, CodebookError, ValueError, OSError) as error:
-        print_error(error, parser.prog)
-        return 2
+        calibration.save(options.output)
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+    print(f'{options.output}: calibration {calibration.id}')
     return 0
 
 
-def _write(calibration: Calibration, output: Path) -> None:
-    calibration.save(output)
-    print(f'{output}: calibration {calibration.id}')
+def _pilots(
+        options: argparse.Namespace, scenario: Scenario, arguments: list[str]) -> list[Pilots]:
+    """Return the pilots of a file, or of a running network."""
+    if options.file and options.file.suffix == '.npz':
+        return [_arrays(options)]
+    log = PilotLog(scenario, options.user)
+    if options.file:
+        _read(options, scenario, log)
+    elif not _listen(options, scenario, log, arguments):
+        raise ToolError(
+            f'{log.n_pilots} pilots within {options.timeout:g} s, expected '
+            f'{options.cycles}, in the domain {os.environ.get("ROS_DOMAIN_ID", "0")} and '
+            'this namespace')
+    return _checked(log, options)
 
 
 def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
@@ -271,7 +257,7 @@ def _listen(options: argparse.Namespace, scenario: Scenario, log: PilotLog,
             arguments: Sequence[str]) -> bool:
     """Collect pilots of a running network; return whether there are enough."""
     end_s = time.monotonic() + options.timeout
-    run(lambda: [CalibratorNode(log, scenario)], ['calibrate', *arguments],
+    run(lambda: [CalibratorNode(log, scenario)], arguments,
         lambda: log.n_signals >= options.cycles and log.n_pilots >= options.cycles
         or time.monotonic() > end_s)
     return log.n_pilots >= int(options.cycles)

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import math
 import os
 import sys
 import tempfile
@@ -9,6 +10,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
@@ -16,17 +18,10 @@ from rclpy.utilities import try_shutdown
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import STARTED_S, exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import (
-    ArgumentParser,
-    check_distinct,
-    integer,
-    output_file,
-    picture_file,
-    positive_int,
-)
-from rhs_isac_ros.monitoring.cycle_log import CycleLog
+from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
+from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
+from rhs_isac_ros.protocol.messages import Phase
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
-from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
 from rhs_isac_ros.ros.command_line import check_domain
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
 from rhs_isac_ros.ros.observer import CycleObserver
@@ -37,9 +32,15 @@ from rhs_isac_ros.ros.processes import (
 )
 from rhs_isac_ros.ros.recording import Recorder, RecordingError
 from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
-from rhs_isac_ros.tools.demo_picture import draw, prepare_drawing
-from rhs_isac_ros.tools.demo_report import summary, table
-from rhs_isac_ros.tools.demo_times import Parts, process_age_s
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    check_distinct,
+    integer,
+    output_file,
+    picture_file,
+    positive_int,
+)
+from rhs_isac_ros.tools.pictures import draw_cycles, prepare_drawing
 from rhs_isac_ros.tools.process_network import (
     add_network_options,
     load_files,
@@ -48,6 +49,87 @@ from rhs_isac_ros.tools.process_network import (
     start_network,
     watch,
 )
+
+_PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
+
+
+def table(cycles: Sequence[CompleteCycle]) -> str:
+    """Return a table with one line for each cycle."""
+    head = ('cycle user  true position [m]      estimate [m]           error  '
+            '√CRLB   beacon   sound  locate    data   capacity     loss\n'
+            '                                                            [m]    '
+            '[m]     [ms]    [ms]    [ms]    [ms]   [Mbit/s]      [%]')
+    return '\n'.join([head, *(_row(cycle) for cycle in cycles)])
+
+
+def _row(cycle: CompleteCycle) -> str:
+    durations = cycle.durations_s()
+    times = ''.join(f'{1e3 * durations.get(phase, math.nan):8.1f}' for phase in _PHASES)
+    return (f'{cycle.cycle_id:5d} {cycle.user:4d}  {_coordinates(cycle.truth.position):22s}'
+            f' {_coordinates(cycle.estimate.position):22s}{cycle.error_m:6.2f} '
+            f'{math.sqrt(cycle.estimate.crlb_m2):6.2f} {times}'
+            f' {cycle.capacity.actual_bps / 1e6:10.3f} {cycle.capacity.loss_percent:8.3f}')
+
+
+def _coordinates(position: np.ndarray) -> str:
+    return ' '.join(f'{coordinate:6.2f}' for coordinate in position)
+
+
+def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) -> str:
+    """Return statistics of at least one complete cycle, and a line for each that was given up."""
+    errors = np.array([cycle.error_m for cycle in cycles])
+    bounds = np.sqrt([cycle.estimate.crlb_m2 for cycle in cycles])
+    lengths = np.array([cycle.duration_s for cycle in cycles])
+    losses = np.array([cycle.capacity.loss_percent for cycle in cycles])
+    users = len({cycle.user for cycle in cycles})
+    lines = [
+        f'{len(cycles)} cycles of {users} users served, {len(given_up)} given up',
+        f'position error: median {np.median(errors):.2f} m, root mean square '
+        f'{np.sqrt(np.mean(errors**2)):.2f} m; median √CRLB {np.median(bounds):.2f} m',
+        f'cycle: median {1e3 * np.nanmedian(lengths):.1f} ms; estimator: median '
+        f'{1e3 * np.median([cycle.estimate.latency_s for cycle in cycles]):.1f} ms',
+        f'capacity: median {np.median([c.capacity.actual_bps for c in cycles]) / 1e6:.2f} '
+        f'Mbit/s; loss: median {np.median(losses):.3f} %, worst {losses.max():.3f} %']
+    lines += [f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
+              for record in given_up]
+    return '\n'.join(lines)
+
+
+_STAT_FILE = Path('/proc/self/stat')
+# Index of the time of the start among the fields that follow the name of the program.
+_START_FIELD = 19
+
+
+def process_age_s() -> float | None:
+    """Return the time since the start of this process [s]; None if the system does not provide it.
+
+    A script that ends with ``exec`` is part of the process.
+    """
+    try:
+        # The name of the program, in parentheses, may have spaces.
+        fields = _STAT_FILE.read_text(encoding='utf-8').rpartition(')')[2].split()
+        started_s = int(fields[_START_FIELD]) / os.sysconf('SC_CLK_TCK')
+        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started_s, 0.0)
+    except (OSError, ValueError, IndexError, AttributeError):
+        return None
+
+
+class Parts:
+    """Consecutive parts of a duration; times are those of `time.monotonic` [s]."""
+
+    def __init__(self, begin_s: float) -> None:
+        self._begin_s = self._last_s = begin_s
+        self._parts: list[tuple[str, float]] = []
+
+    def end(self, part: str, now_s: float) -> None:
+        """End a part, which began at the end of the previous one."""
+        self._parts.append((part, now_s - self._last_s))
+        self._last_s = now_s
+
+    def text(self) -> str:
+        """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.4, ...)``."""
+        parts = ', '.join(f'{name} {duration_s:.2f}' for name, duration_s in self._parts)
+        return f'time: {self._last_s - self._begin_s:.2f} s ({parts})'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -189,7 +271,7 @@ def _report(
     if complete:
         print(table(complete))
         print(summary(complete, given_up))
-        draw(complete, scenario, options.picture)
+        draw_cycles(complete, scenario, options.picture)
         print(f'picture: {options.picture}')
     if options.record:
         print(f'recording: {options.record}')

@@ -20,9 +20,11 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.tools.session import Session, ToolError, print_now, run_tool
+from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
+from rhs_isac_ros.tools.command import Session, ToolError, print_now, run_tool
 
+# Maximum time to discover a node [s]. With DDS security, keys are exchanged first.
+_DISCOVERY_TIMEOUT_S = 10.0
 # Maximum time to discover a node's services, and for a response [s].
 _SERVICE_TIMEOUT_S = 5.0
 # Label of a value, and name of the type for ``--param-type``.
@@ -215,8 +217,10 @@ def _parser() -> argparse.ArgumentParser:
             subparser.add_argument('parameter_name')
         subparser.add_argument('--include-hidden-nodes', action='store_true',
                                help='include hidden nodes')
-        subparser.add_argument('--timeout', type=nonnegative_float, default=3.0, metavar='S',
-                               help='maximum time to discover the node (default: 3 s)')
+        subparser.add_argument('--timeout', type=nonnegative_float, default=_DISCOVERY_TIMEOUT_S,
+                               metavar='S',
+                               help='maximum time to discover the node '
+                                    f'(default: {_DISCOVERY_TIMEOUT_S:g} s)')
     subparsers['load'].add_argument('parameter_file', help='parameter file')
     subparsers['load'].add_argument('--no-use-wildcard', action='store_true',
                                     help="ignore the parameters of the node '/**'")

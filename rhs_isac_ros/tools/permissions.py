@@ -13,11 +13,11 @@ from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.model.arguments import ArgumentParser, integer
-from rhs_isac_ros.monitoring.scene_state import RECEIVES as SCENE_RECEIVES
+from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.recording import recorded_topics
 from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.support.arguments import ArgumentParser, integer
 
 # Topics that every rclpy node publishes, and services that it offers.
 _RCLPY_TOPICS = ('/parameter_events', '/rosout')
@@ -27,6 +27,9 @@ _PARAMETER_SERVICES = (
 _OFFERED_SERVICES = tuple(
     f'~/{service}' for service in (*_PARAMETER_SERVICES, 'get_type_description'))
 _CYCLE_SERVICES = (topics.PAUSE, topics.RESUME, topics.STEP)
+_LOCATE_TOPICS = tuple(f'{topics.LOCATE}/_action/{name}' for name in ('feedback', 'status'))
+_LOCATE_SERVICES = tuple(
+    f'{topics.LOCATE}/_action/{name}' for name in ('cancel_goal', 'get_result', 'send_goal'))
 _GET_CODEBOOK = f'{topics.OPTIMIZER_NODE}/get_parameters'
 _VERSION = '0.2.0'
 
@@ -63,20 +66,27 @@ def permissions(users: int) -> dict[str, Permissions]:
     dict
         Permissions by node. ``users`` is a node with all users, ``network`` the process of all
         nodes of `ROSTER`. ``operator`` stands for all tools, which may read every topic, set
-        parameters and pause cycles, except for ``replay``, which may publish every topic.
+        parameters and pause cycles, except for ``replay``, which may publish every topic and
+        take the place of the optimizer.
     """
+    numbers = range(1, users + 1)
     nodes = {
-        name if member.is_unique else f'{name}_{number}': _of_member(name, users)
+        name if member.is_unique else f'{name}_{number}': _of_member(
+            name, numbers if member.is_unique else [number])
         for name, member in sorted(ROSTER.items())
-        for number in range(1, 2 if member.is_unique else users + 1)}
-    nodes['users'] = _of_member('user', users)
+        for number in ((1,) if member.is_unique else numbers)}
+    nodes['users'] = _of_member('user', numbers)
     nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
     nodes['visualizer'] = Permissions(
         publish=(*sorted((topics.MARKERS, topics.TF, topics.TF_STATIC,
-                          *_of_users(users, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
+                          *_of_users(numbers, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
         subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
-    replay = Permissions(publish=(*sorted(recorded_topics()), *_RCLPY_TOPICS), reply=())
-    return {**nodes, 'operator': _operator(nodes, users), 'replay': replay}
+    optimizer = topics.OPTIMIZER_NODE
+    # It provides the recorded codebook, as an optimizer or to the one that is present.
+    replay = _together({optimizer: nodes[optimizer], 'replay': Permissions(
+        publish=tuple(recorded_topics()), reply=(),
+        request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
+    return {**nodes, 'operator': _operator(nodes, numbers), 'replay': replay}
 
 
 def _together(nodes: Mapping[str, Permissions]) -> Permissions:
@@ -86,34 +96,38 @@ def _together(nodes: Mapping[str, Permissions]) -> Permissions:
                       for name in getattr(allowed, right)})) for right in Permissions._fields))
 
 
-def _of_member(name: str, users: int) -> Permissions:
-    """Return the permissions of the nodes of a role."""
+def _of_member(name: str, users: Iterable[int]) -> Permissions:
+    """Return the permissions of a node of a role that serves some users."""
     member = ROSTER[name]
-    sent = {full for topic in member.sent for full in _of_users(
-        users if '{user}' in topic else 1, topic)}
+    sent = {name for topic in member.sent for name in (
+        _of_users(users, topic) if '{user}' in topic else (topic,))}
     return Permissions(
-        publish=(*sorted(sent), *_RCLPY_TOPICS), subscribe=tuple(sorted(member.received)),
-        reply=(*_OFFERED_SERVICES, *(_CYCLE_SERVICES if name == 'bs' else ())),
+        publish=(*sorted(sent), *_RCLPY_TOPICS, *(_LOCATE_TOPICS if name == 'bs' else ())),
+        subscribe=tuple(sorted(member.received)),
+        reply=(*_OFFERED_SERVICES,
+               *((*_CYCLE_SERVICES, *_LOCATE_SERVICES) if name == 'bs' else ())),
         request=(_GET_CODEBOOK,) if member.has_codebook else ())
 
 
-def _of_users(users: int, *names: str) -> tuple[str, ...]:
+def _of_users(users: Iterable[int], *names: str) -> tuple[str, ...]:
     """Return the names of topics of each user."""
-    return tuple(name.format(user=number) for number in range(1, users + 1) for name in names)
+    return tuple(name.format(user=number) for number in users for name in names)
 
 
-def _operator(nodes: Iterable[str], users: int) -> Permissions:
+def _operator(nodes: Iterable[str], users: Iterable[int]) -> Permissions:
     """Return the permissions to subscribe to all topics and to set the parameters of all nodes.
 
     The nodes of ``ros2``, whose names end in a number or a type, offer services.
     """
     readable = {*recorded_topics(), topics.MARKERS, topics.TF, topics.TF_STATIC,
-                *_of_users(users, topics.POSE, topics.ODOMETRY, topics.PATH, topics.TRUE_PATH)}
+                *_of_users(users, topics.POSE, topics.ODOMETRY, topics.PATH, topics.TRUE_PATH,
+                           topics.TRUE_ODOMETRY)}
     return Permissions(
-        publish=_RCLPY_TOPICS, subscribe=(*sorted(readable), *_RCLPY_TOPICS),
+        publish=_RCLPY_TOPICS, subscribe=(*sorted(readable), *_RCLPY_TOPICS, *_LOCATE_TOPICS),
         reply=tuple(service.replace('~', '/_ros2cli_*') for service in _OFFERED_SERVICES),
         request=(*(f'{node}/{service}' for node in nodes for service in _PARAMETER_SERVICES),
-                 *(service.replace('~', 'bs') for service in _CYCLE_SERVICES)))
+                 *(service.replace('~', 'bs') for service in _CYCLE_SERVICES),
+                 *_LOCATE_SERVICES))
 
 
 def policy(namespace: str = '/', users: int = 2) -> str:

@@ -11,13 +11,12 @@ import rclpy
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arguments import input_file, seed
-from rhs_isac_ros.protocol.impairments import Impairments
-from rhs_isac_ros.protocol.settings import REGION
+from rhs_isac_ros.protocol.settings import REGION, Impairments
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, max_processes
 from rhs_isac_ros.ros.roster import ROSTER, UNIQUE
+from rhs_isac_ros.support.arguments import input_file, seed
 
 # Maximum time between two complete cycles [s].
 _CYCLE_TIMEOUT_S = 60.0

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import exit_code_of, print_error
-from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import ArgumentParser, check_distinct, input_file, output_file
-from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.recording import Recorder, RecordingError
+from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file
+from rhs_isac_ros.tools.command import ToolError, run_command
 
 
 class RecorderNode(Node):
@@ -39,37 +39,20 @@ class RecorderNode(Node):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Record until a signal arrives.
+    """Record until a signal arrives, see `run_command`; 1 if the file cannot be completed."""
+    return run_command(_record, _parser(), arguments, ['--config'], ['file'])
 
-    Parameters
-    ----------
-    arguments
-        Command line including ROS arguments; by default that of the process.
 
-    Returns
-    -------
-    int
-        Exit code: 0 after a signal; 1 if the file cannot be written to its end; 2 if an argument
-        or a file is invalid.
-    """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    parser = _parser()
-    options = parse(parser, arguments)
-    check_distinct(parser, {'--config': options.config}, {'file': options.file})
+def _record(options: argparse.Namespace, arguments: list[str]) -> int:
+    scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
+    recorder = Recorder(options.file, scenario)
     try:
-        scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
-        recorder = Recorder(options.file, scenario)
-    except (ScenarioError, RecordingError) as error:
-        print_error(error, parser.prog)
-        return 2
-    try:
-        code = run(lambda: [RecorderNode(recorder)], ['record', *arguments],
+        code = run(lambda: [RecorderNode(recorder)], arguments,
                    done=lambda: bool(recorder.failure))
     finally:
         recorder.close()
     if recorder.failure:
-        print_error(recorder.failure, parser.prog)
-        return 1
+        raise ToolError(recorder.failure)
     print(f'{recorder.count} messages in {options.file}')
     return code
 

@@ -1,40 +1,290 @@
 """``scripts/replay FILE``: feeds the received signals of a recording to estimators.
 
 With ``--publish``, they are published again to running nodes; see
-`rhs_isac_ros.tools.republish`.
+`rhs_isac_ros.tools.replay`.
 """
 
 import argparse
 import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
+import tempfile
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.calibration import CalibrationError, load_surface
-from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.executables import exit_code_of, print_error
-from rhs_isac_ros.model import Scenario, ScenarioError, plugins
-from rhs_isac_ros.model.arguments import ArgumentParser, input_file, positive_float
+from rhs_isac_ros.calibration import load_surface
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
+from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     BayesEstimator,
     Estimator,
-    ModelError,
     Motion,
     file_options,
     make_estimator,
 )
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.tracks import Tracks
+from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
+from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
-from rhs_isac_ros.tools.republish import RepublishError, republish, topic_prefix
+from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
+from rhs_isac_ros.tools.command import ToolError, run_command
+
+_SIGNALS = topics.NAMES[m.ReceivedSignals]
+_ESTIMATES = topics.NAMES[m.PositionEstimate]
+# Period of looking for subscribers; maximum time to discover an optimizer [s].
+_POLL_PERIOD_S = 0.05
+_DISCOVERY_TIMEOUT_S = 2.0
+# Time without a new endpoint after which the publishers and subscribers of a network are taken as
+# complete [s]. Another publisher may be discovered after the first subscriber.
+_SETTLING_TIME_S = 1.0
+_ACK_TIMEOUT = Duration(seconds=5)
+
+
+class RepublisherNode(Node):
+    """Publishes messages at their recorded times once all topics have subscribers.
+
+    Parameters
+    ----------
+    messages
+        Relative name of the topic, message and time [s], sorted by time; codebooks are passed to
+        the optimizer instead.
+    names
+        Relative names of the topics.
+    rate
+        Speed relative to the recording.
+
+    Attributes
+    ----------
+    optimizer
+        Provides the codebooks; None if another node does.
+    count
+        Number of messages published.
+    waits_for
+        First topic without subscribers; empty once messages are published.
+    finished
+        Whether all messages have been published.
+    """
+
+    def __init__(
+            self, messages: Iterable[tuple[str, Any, float]], names: Collection[str],
+            rate: float) -> None:
+        super().__init__('replay', **WITHOUT_SERVICES)
+        self.optimizer: OptimizerNode | None = None
+        self.count, self.finished, self.waits_for = 0, False, next(iter(names))
+        self._messages, self._rate = iter(messages), rate
+        self._next: tuple[str, Any, float] | None = None
+        # Time on the steady clock at the recorded time 0 [s]; None before the first message.
+        self._origin_s: float | None = None
+        # Endpoints at the last poll, and the time since when they are the same [s].
+        self._endpoints: list[tuple[int, int]] = []
+        self._unchanged_since_s = time.monotonic()
+        kinds = recorded_topics()
+        self._message_publishers = {
+            name: create_publisher(self, kinds[name][0], name, kinds[name][1]) for name in names}
+        self._timer = steady_timer(self, _POLL_PERIOD_S, self._poll_subscribers)
+
+    def _poll_subscribers(self) -> None:
+        self.waits_for = next(
+            (name for name in self._message_publishers if not self._has_subscribers(name)), '')
+        if self._endpoints_settled() and not self.waits_for:
+            self._timer.cancel()
+            self._next = next(self._messages, None)
+            self._timer = steady_timer(self, _POLL_PERIOD_S, self._publish_due)
+            self._publish_due()
+
+    def _endpoints_settled(self) -> bool:
+        """Return whether no endpoint of the topics has appeared or gone for some time."""
+        now_s = time.monotonic()
+        endpoints = [
+            (self.count_publishers(name), self.count_subscribers(name))
+            for name in (*self._message_publishers, _ESTIMATES)]
+        if endpoints != self._endpoints:
+            self._endpoints, self._unchanged_since_s = endpoints, now_s
+        return now_s >= self._unchanged_since_s + _SETTLING_TIME_S
+
+    def _has_subscribers(self, name: str) -> bool:
+        """Return whether the subscribers of a topic are present."""
+        publisher, n_expected = self._message_publishers[name], 1
+        if name == _SIGNALS:
+            # Observers may subscribe to the signals as well. Wait for the nodes that publish
+            # estimates, which subscribe to the signals only once their tables are complete.
+            estimators = {_full_name(endpoint) for endpoint in self.get_publishers_info_by_topic(
+                self.resolve_topic_name(_ESTIMATES))} - {self.get_fully_qualified_name()}
+            subscribers = {_full_name(endpoint) for endpoint in
+                           self.get_subscriptions_info_by_topic(publisher.topic_name)}
+            if not estimators or not estimators <= subscribers:
+                return False
+            n_expected = len(subscribers)
+        return publisher.get_subscription_count() >= n_expected
+
+    def _publish_due(self) -> None:
+        """Publish the messages that are due, and set the timer for the next one."""
+        while self._next:
+            name, message, time_s = self._next
+            now_s = time.monotonic()
+            if self._origin_s is None and name != topics.CODEBOOK:
+                self._origin_s = now_s - time_s / self._rate
+            due_s = now_s if self._origin_s is None else self._origin_s + time_s / self._rate
+            if (wait_s := due_s - now_s) > 0:
+                self._timer.timer_period_ns = max(int(wait_s * 1e9), 1)
+                self._timer.reset()
+                return
+            if name != topics.CODEBOOK:
+                self._message_publishers[name].publish(message)
+                self.count += 1
+            elif self.optimizer:
+                self.optimizer.set_parameters_atomically(
+                    _parameters(convert.codebook_from_ros(message)))
+            self._next = next(self._messages, None)
+        self._timer.cancel()
+        for publisher in self._message_publishers.values():
+            publisher.wait_for_all_acked(_ACK_TIMEOUT)
+        self.finished = True
+
+    def conflicts(self) -> list[str]:
+        """Return the relative names of the topics that another node publishes as well."""
+        return [name for name, publisher in self._message_publishers.items()
+                if self.count_publishers(publisher.topic_name) > 1]
+
+
+def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Publish a recording to running nodes.
+
+    Parameters
+    ----------
+    options
+        ``file``, ``namespace``, ``topic``, ``rate``, ``codebook``, ``config``, ``timeout``.
+    arguments
+        Name of the program and command line with the ROS arguments.
+
+    Returns
+    -------
+    int
+        Exit code: 0, including after a signal; 2 if a ROS argument is invalid.
+
+    Raises
+    ------
+    ToolError
+        If a topic has no subscribers, or another node publishes it as well.
+    RecordingError, ScenarioError, CodebookError
+        If a file is invalid.
+    """
+    names = options.topic or [_SIGNALS]
+    scenario = (Scenario.from_yaml(options.config) if options.config
+                else read_scenario(options.file) or Scenario())
+    first_codebook = _first_codebook(options, names)
+    if first_codebook:
+        first_codebook.check(scenario)
+    nodes: list[RepublisherNode] = []
+    end_s = time.monotonic() + options.timeout
+
+    def create() -> list[Node]:
+        node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names, options.rate)
+        nodes.append(node)
+        if first_codebook and not _optimizer_present(node):
+            node.optimizer = _optimizer(scenario, first_codebook)
+        return [node, *filter(None, [node.optimizer])]
+
+    def done() -> bool:
+        _check(nodes[0], end_s, options.timeout)
+        return nodes[0].finished
+    code = run(create, arguments, done)
+    if nodes:
+        print(f'{nodes[0].count} messages published')
+    return code
+
+
+def topic_prefix(namespace: str) -> str:
+    """Return the prefix of the full names of the topics in a namespace."""
+    return f'/{namespace.strip("/")}/'.replace('//', '/')
+
+
+def _messages(
+        options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, Any, float]]:
+    """Yield messages of a recording with the relative names of their topics."""
+    full_names = {f'{topic_prefix(options.namespace)}{name}': name for name in names}
+    for topic, message, time_s in read(options.file, full_names):
+        yield full_names[topic], message, time_s
+
+
+def _first_codebook(options: argparse.Namespace, names: Collection[str]) -> Codebook | None:
+    """Return the codebook of the first signals; None if no signals are to be published."""
+    used: list[str] = []
+    codebooks: dict[str, Any] = {}
+    for name, message, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):
+        if name == topics.CODEBOOK:
+            codebooks.setdefault(message.codebook_id, message)
+        else:
+            used.append(message.codebook_id)
+    if _SIGNALS not in names:
+        return None
+    if not used:
+        raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
+                             f'{options.namespace}')
+    if options.codebook:
+        codebook = Codebook.load(options.codebook)
+        if codebook.id != used[0]:
+            raise RecordingError(
+                f'{options.codebook}: codebook {codebook.id}, but the signals were received with '
+                f'{used[0]}: running nodes would drop them')
+        return codebook
+    if used[0] not in codebooks:
+        raise RecordingError(f'codebook {used[0]}: not in the recording, expected its file: '
+                             '--codebook FILE')
+    return convert.codebook_from_ros(codebooks[used[0]])
+
+
+def _check(node: RepublisherNode, end_s: float, timeout_s: float) -> None:
+    """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
+    if conflicts := node.conflicts():
+        raise ToolError(f'{conflicts[0]}: already published by another node')
+    if node.waits_for and time.monotonic() > end_s:
+        raise ToolError(f'{node.waits_for}: no subscriber within {timeout_s:g} s')
+
+
+def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
+    """Create an optimizer that provides a codebook; it reads the scenario from a file once."""
+    with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
+        file = Path(folder) / 'scenario.yaml'
+        file.write_text(yaml.safe_dump(scenario.changes()), encoding='utf-8')
+        return OptimizerNode(parameter_overrides=[
+            Parameter('scenario_file', value=str(file)), *_parameters(codebook)])
+
+
+def _optimizer_present(node: Node) -> bool:
+    present = AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
+        _DISCOVERY_TIMEOUT_S)
+    if present:
+        print(f'using the codebook of the {topics.OPTIMIZER_NODE} in the namespace',
+              file=sys.stderr)
+    return present
+
+
+def _parameters(codebook: Codebook) -> list[Parameter]:
+    return [Parameter(name, value=value) for name, value in codebook.to_parameters().items()]
+
+
+def _full_name(endpoint: Any) -> str:
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+
 
 # Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
 # and announcements of nodes would contradict those of the running nodes.
@@ -138,52 +388,33 @@ def tracked_errors_m(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the recorded position errors and those of estimators applied to the same signals.
+    """Print the recorded position errors and those of estimators applied to the same signals."""
+    return run_command(_replay, _parser(), arguments, conflict=_conflict)
 
-    Parameters
-    ----------
-    arguments
-        Command line including ROS arguments; by default that of the process.
 
-    Returns
-    -------
-    int
-        Exit code: 0, including after a signal; 1 if the signals cannot be published to running
-        nodes; 2 if an argument or a file is invalid.
-    """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    parser = _parser()
-    options = parse(parser, arguments)
+def _conflict(options: argparse.Namespace) -> str:
+    estimators = options.estimator or [BayesEstimator.name]
     if options.publish and (
             options.estimator or options.model or options.calibration or options.track):
-        parser.error('argument --publish: not allowed with --estimator, --model, --calibration or '
-                     '--track, because running nodes estimate')
-    if options.calibration and 'neural' in (options.estimator or ()):
-        parser.error('argument --calibration: not allowed with --estimator neural, whose model '
-                     'is trained for an ideal surface')
+        return ('argument --publish: not allowed with --estimator, --model, --calibration or '
+                '--track, because running nodes estimate')
+    if options.calibration and 'neural' in estimators:
+        return ('argument --calibration: not allowed with --estimator neural, whose model '
+                'is trained for an ideal surface')
     if not options.publish and (options.topic, options.rate, options.timeout) != (
             None, _RATE, _TIMEOUT_S):
-        parser.error('arguments --topic, --rate and --timeout: expected together with --publish')
-    if options.track and BayesEstimator.name not in (options.estimator or ['bayes']):
-        parser.error('argument --track: expected together with --estimator bayes')
-    if options.model and 'neural' not in (options.estimator or ()):
-        parser.error('argument --model: expected together with --estimator neural')
-    try:
-        if options.publish:
-            return republish(options, ['replay', *arguments])
-        _compare(options)
-    except (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
-            plugins.PluginError, OSError) as error:
-        print_error(error, parser.prog)
-        return 2
-    except RepublishError as error:
-        print_error(error, parser.prog)
-        return 1
-    return 0
+        return 'arguments --topic, --rate and --timeout: expected together with --publish'
+    if options.track and BayesEstimator.name not in estimators:
+        return 'argument --track: expected together with --estimator bayes'
+    if options.model and 'neural' not in estimators:
+        return 'argument --model: expected together with --estimator neural'
+    return ''
 
 
-def _compare(options: argparse.Namespace) -> None:
-    """Print a table of the recorded errors and of those of estimators."""
+def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
+    """Publish a recording, or print a table of its errors and of those of estimators."""
+    if options.publish:
+        return republish(options, arguments)
     scenario = Scenario.from_yaml(options.config) if options.config else None
     recording = load(options.file, options.namespace, scenario)
     codebooks = _codebooks(recording, options.codebook)
@@ -203,6 +434,7 @@ def _compare(options: argparse.Namespace) -> None:
         if options.track and name == BayesEstimator.name:
             print(_row('track', tracked_errors_m(
                 recording.cycles, estimators, options.track_speed)))
+    return 0
 
 
 def _row(name: str, errors: np.ndarray) -> str:

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
-from rhs_isac_ros.monitoring import charts, network_view
-from rhs_isac_ros.monitoring.entities import (
+from rhs_isac_ros.monitoring import network_view
+from rhs_isac_ros.monitoring.shapes import (
     Boxes,
     Ellipsoids,
     Entity,
@@ -24,6 +23,7 @@ from rhs_isac_ros.monitoring.entities import (
     Series,
     Text,
 )
+from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 if TYPE_CHECKING:
     import rerun.blueprint
@@ -177,7 +177,7 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
 
     scene = rrb.Spatial3DView(
         origin=network_view.WORLD, name='Scene (surface enlarged)', background=_BACKGROUND)
-    reach, height = charts.REACH_M, charts.HEIGHT_M
+    reach, height = network_view.REACH_M, network_view.HEIGHT_M
     modes = rrb.Spatial2DView(
         origin=network_view.MODES, background=_BACKGROUND,
         name='Modes: probability over range error [m]',
@@ -191,7 +191,7 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
     error, *others = (
         rrb.TimeSeriesView(origin=path, name=title, plot_legend=rrb.PlotLegend(
             rrb.Corner2D.LeftTop, visible=path != 'loss'))
-        for path, title in charts.TITLES.items())
+        for path, title in network_view.TITLES.items())
     log = rrb.TextLogView(origin=network_view.LOG, name='Cycles')
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -255,5 +255,4 @@ def _radius(width: float) -> float:
 
 def _colours(values: np.ndarray) -> np.ndarray:
     """Convert colours from 0 to 1 to uint8."""
-    colours: np.ndarray = np.rint(_MAX_COLOUR * values).astype(np.uint8)
-    return colours
+    return np.rint(_MAX_COLOUR * values).astype(np.uint8)

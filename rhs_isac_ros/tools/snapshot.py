@@ -9,22 +9,21 @@ from collections.abc import Sequence
 from rclpy.node import Node
 
 from rhs_isac_ros.executables import exit_code_of, print_error
-from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_memory import join_users
+from rhs_isac_ros.ros.early import WITHOUT_SERVICES
+from rhs_isac_ros.ros.endpoints import subscribe_messages
+from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    check_distinct,
     input_file,
     nonnegative_float,
     picture_file,
 )
-from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
-from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.outage_log import join_users
-from rhs_isac_ros.ros.command_line import parse
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import subscribe_messages
-from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.tools.scene_picture import draw
+from rhs_isac_ros.tools.command import run_command
+from rhs_isac_ros.tools.pictures import draw_scene
 
 _PROGRAM = 'snapshot'
 # Within this time [s], every user publishes its true position; within twice this time, the
@@ -49,7 +48,8 @@ class SnapshotNode(Node):
         self.mismatch = ''
         self._began_s: float | None = None
         self._drawable_s: float | None = None
-        subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
+        subscribe_messages(
+            self, SCENE_RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()
@@ -83,28 +83,12 @@ class SnapshotNode(Node):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the scene when it is complete, or after some time as far as it is known.
+    """Draw the scene when it is complete, or after some time as far as it is known."""
+    return run_command(_snapshot, _parser(), arguments, ['--config'], ['--output'])
 
-    Parameters
-    ----------
-    arguments
-        Command line including ROS arguments; by default that of the process.
 
-    Returns
-    -------
-    int
-        Exit code: 0, including after a signal; 1 if there is no network or the picture cannot be
-        written; 2 if an argument or a file is invalid.
-    """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    parser = _parser()
-    options = parse(parser, arguments)
-    check_distinct(parser, {'--config': options.config}, {'--output': options.output})
-    try:
-        scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
-    except ScenarioError as error:
-        print_error(error, _PROGRAM)
-        return 2
+def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
+    scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
     nodes: list[SnapshotNode] = []
     end_s = time.monotonic() + options.timeout
 
@@ -115,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def done() -> bool:
         return (nodes[0].is_ready(options.wait) or nodes[0].has_other_scenario
                 or time.monotonic() > end_s)
-    code = run(create, [_PROGRAM, *arguments], done)
+    code = run(create, arguments, done)
     if not nodes or not done():
         return code
     return write_picture(nodes[0].scene, nodes[0].mismatch, scenario, options)
@@ -149,7 +133,7 @@ def write_picture(
     if missing:
         print(f'{_PROGRAM}: not in the picture: {"; ".join(missing)}', file=sys.stderr)
     try:
-        draw(scene, scenario, options.output)
+        draw_scene(scene, scenario, options.output)
     except OSError as error:
         print_error(f'{options.output}: cannot be written: {error.strerror}', _PROGRAM)
         return 1

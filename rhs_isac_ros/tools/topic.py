@@ -4,11 +4,19 @@
 """
 
 import argparse
+import array
+import collections
+import dataclasses
 import importlib
+import itertools
+import re
+import statistics
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+import yaml
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.qos import (
@@ -21,11 +29,128 @@ from rclpy.qos import (
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float, positive_int
 from rhs_isac_ros.ros.endpoints import steady_timer
-from rhs_isac_ros.tools.message_text import Layout, as_csv, as_yaml
-from rhs_isac_ros.tools.rate import Rate
-from rhs_isac_ros.tools.session import Session, ToolError, print_now, run_tool
+from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, positive_int
+from rhs_isac_ros.tools.command import Session, ToolError, print_now, run_tool
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Options of the text.
+
+    Attributes
+    ----------
+    max_length
+        Maximum number of entries of an array or characters of a string; the rest is replaced by
+        dots. None: unlimited.
+    arrays, strings
+        Whether their values are written; otherwise only type and length.
+    flow
+        Whether collections are written on one line.
+    """
+
+    max_length: int | None = None
+    arrays: bool = True
+    strings: bool = True
+    flow: bool = False
+
+
+def as_yaml(message: Any, layout: Layout) -> str:
+    """Return a ROS message as YAML, ending with a newline."""
+    return yaml.dump(_mapping(message, layout), sort_keys=False, allow_unicode=True,
+                     width=sys.maxsize, default_flow_style=layout.flow)
+
+
+def as_csv(message: Any, layout: Layout) -> str:
+    """Return all fields of a ROS message and of nested messages, separated by commas."""
+    return ','.join(str(leaf) for leaf in _leaves(_mapping(message, layout)))
+
+
+def _mapping(message: Any, layout: Layout) -> dict[str, Any]:
+    types = message.get_fields_and_field_types()
+    return {name: _plain(getattr(message, name), kind, layout) for name, kind in types.items()}
+
+
+def _plain(value: Any, kind: str, layout: Layout) -> Any:
+    """Convert a value to types that YAML supports."""
+    max_length = layout.max_length
+    match value:
+        case bytes():
+            return _truncate(''.join(map(chr, value)), max_length)
+        case str():
+            return (_truncate(value, max_length) if layout.strings
+                    else f'<string length: <{len(value)}>>')
+        case list() | tuple() | array.array() | np.ndarray():
+            if kind and not layout.arrays:
+                return _array_summary(kind, len(value))
+            entries = [_plain(entry, '', layout) for entry in value[:max_length]]
+            return entries + ['...'] * (len(value) > len(entries))
+        case np.generic():
+            return value.item()
+        case bool() | int() | float():
+            return value
+    return _mapping(value, layout)
+
+
+def _truncate(text: str, max_length: int | None) -> str:
+    if max_length is None or len(text) <= max_length:
+        return text
+    return f'{text[:max_length]}...'
+
+
+def _array_summary(kind: str, length: int) -> str:
+    """Return type and length of an array, from the type as the message class names it."""
+    if sequence := re.fullmatch(r'sequence<(.+?)(?:, (\d+))?>', kind):
+        entry, bound = sequence.groups()
+    else:
+        entry, _, bound = kind.removesuffix(']').rpartition('[')
+    entry = entry.replace('/', '/msg/')
+    bound = f'[{bound}]' if bound else ''
+    return (f'<sequence type: {entry}{bound}, length: {length}>' if sequence
+            else f'<array type: {entry}{bound}>')
+
+
+def _leaves(value: Any) -> list[Any]:
+    if isinstance(value, dict | list):
+        entries = value.values() if isinstance(value, dict) else value
+        # An empty array takes one column.
+        return [leaf for entry in entries for leaf in _leaves(entry)] or ['']
+    return [value]
+
+
+class Rate:
+    """Intervals between the latest messages of a topic.
+
+    Parameters
+    ----------
+    window
+        Number of intervals to keep.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._times_ns: collections.deque[int] = collections.deque(maxlen=window + 1)
+        self._changed = False
+
+    def add(self, time_ns: int) -> None:
+        """Add a message that arrived at a time [ns]; discard the others if the clock went back."""
+        if self._times_ns and time_ns < self._times_ns[-1]:
+            self._times_ns.clear()
+        self._times_ns.append(time_ns)
+        self._changed = True
+
+    def report(self) -> str:
+        """Return the two lines that ``ros2 topic hz`` prints, or '' if nothing has arrived."""
+        intervals_s = [1e-9 * (after - before)
+                       for before, after in itertools.pairwise(self._times_ns)]
+        if not self._changed or not intervals_s:
+            return ''
+        self._changed = False
+        mean_s = statistics.fmean(intervals_s)
+        rate_hz = 1 / mean_s if mean_s else 0.0
+        return (f'average rate: {rate_hz:.3f}\n\tmin: {min(intervals_s):.3f}s '
+                f'max: {max(intervals_s):.3f}s std dev: {statistics.pstdev(intervals_s):.5f}s '
+                f'window: {len(intervals_s)}')
+
 
 _MAX_LENGTH = 128
 _RATE_WINDOW = 10000

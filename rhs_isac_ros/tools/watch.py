@@ -6,25 +6,130 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import discard_stdout, exit_code_of, print_error
-from rhs_isac_ros.model.arguments import ArgumentParser, nonnegative_float
-from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
-from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
-from rhs_isac_ros.ros import diagnostics, qos, topics
-from rhs_isac_ros.ros.command_line import parse
+from rhs_isac_ros.executables import exit_code_of
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES
+from rhs_isac_ros.monitoring.network_state import Fix, NodeStatus, Overview
+from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
+from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.tools.session import print_now
-from rhs_isac_ros.tools.watch_view import render
+from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
+from rhs_isac_ros.support.optional import optional_import
+from rhs_isac_ros.tools.command import ToolError, print_now, run_command
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.table import Table
+
+
+# Further users are counted, not shown.
+_MAX_USERS = 20
+_Justify = Literal['left', 'right']
+
+
+def render(overview: Overview, now_s: float) -> 'RenderableType':
+    """Return the view at a time [s], on the clock of the overview, for a console of rich.
+
+    Raises
+    ------
+    ImportError
+        If rich is not installed.
+    """
+    from rich.console import Group
+
+    return Group(_header(overview, now_s), _users(overview, now_s), _nodes(overview, now_s))
+
+
+def _header(overview: Overview, now_s: float) -> 'RenderableType':
+    from rich.text import Text
+
+    phase = State.PAUSED.value if overview.paused else overview.phase
+    if not overview.phase:
+        return Text(phase or 'waiting for a base station', style='yellow')
+    user = f' of user {overview.user}' if overview.user else ''
+    text = Text.assemble(
+        (phase, 'bold cyan'), f' for {now_s - overview.phase_began_s:.2f} s, cycle '
+        f'{overview.cycle_id}{user}\n{overview.rate_hz(now_s):.1f} cycles/s, ',
+        f'{overview.served} served, {overview.given_up} given up; ',
+        f'codebook {_printable(overview.codebook_id) or "not known yet"}')
+    if overview.last_failure:
+        text.append(f'\nlast given up: {_printable(overview.last_failure)}', style='yellow')
+    return text
+
+
+def _table(title: str, *columns: tuple[str, _Justify]) -> 'Table':
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title, title_justify='left', title_style='bold', box=box.SIMPLE_HEAD,
+                  pad_edge=False)
+    for name, justify in columns:
+        table.add_column(escape(name), justify=justify, no_wrap=justify == 'right')
+    return table
+
+
+def _users(overview: Overview, now_s: float) -> 'RenderableType':
+    table = _table(
+        'Users', ('user', 'right'), ('position\n[m]', 'right'), ('error\n[m]', 'right'),
+        ('sigma\n[m]', 'right'), ('capacity\n[Mbit/s]', 'right'), ('loss\n[%]', 'right'),
+        ('age\n[s]', 'right'))
+    # In order of their numbers, so that each user keeps its row.
+    for user, fix in sorted(overview.users.items())[:_MAX_USERS]:
+        table.add_row(*(_user_row(fix, now_s) if fix else (str(user), 'no fix yet', *[''] * 5)))
+    if len(overview.users) > _MAX_USERS:
+        table.caption = f'and {len(overview.users) - _MAX_USERS} more'
+    return table
+
+
+def _user_row(fix: Fix, now_s: float) -> list[str]:
+    cycle = fix.cycle
+    position = ' '.join(f'{x:6.2f}' for x in cycle.estimate.position)
+    return [str(cycle.user), position, f'{cycle.error_m:.2f}', f'{fix.sigma_m:.2f}',
+            _number(cycle.capacity.actual_bps / 1e6, 2),
+            _number(cycle.capacity.loss_percent, 3), f'{now_s - fix.received_s:.1f}']
+
+
+def _number(value: float, digits: int) -> str:
+    return '' if np.isnan(value) else f'{value:.{digits}f}'
+
+
+def _nodes(overview: Overview, now_s: float) -> 'RenderableType':
+    table = _table('Nodes', ('node', 'left'), ('phase', 'left'), ('state', 'left'),
+                   ('given up', 'left'), ('dropped', 'left'))
+    for name, status in sorted(overview.nodes.items()):
+        table.add_row(*_node_row(name, status, now_s))
+    return table
+
+
+def _node_row(name: str, status: NodeStatus, now_s: float) -> list['RenderableType']:
+    from rich.text import Text
+
+    state = Text(_printable(status.report.summary),
+                 style='yellow' if status.report.fault else 'green')
+    if status.silent(now_s):
+        state = Text(f'silent for {now_s - status.received_s:.0f} s', style='red')
+    given_up = {reason: n for reason, n in status.counts('cycles').items() if reason != 'served'}
+    # Received strings are not markup, so they are wrapped in Text.
+    phase = Text(_printable(status.report.values.get('phase', '')))
+    return [Text(_printable(name)), phase, state, Text(_counts(given_up)),
+            Text(_counts(status.counts('dropped')))]
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return _printable(', '.join(f'{n} {reason}' for reason, n in counts.items())) or '0'
+
+
+def _printable(text: str) -> str:
+    """Replace characters that would control the terminal."""
+    return ''.join(char if char.isprintable() else '?' for char in text)
+
 
 _PROGRAM = 'watch'
 _REFRESH_PERIOD_S = 0.25
@@ -50,41 +155,19 @@ class WatchNode(Node):
         subscribe_messages(
             self, RECEIVES, None,
             lambda message: self.overview.add(message, time.monotonic()), lambda error: None)
-        subscribe(self, DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.EXCHANGE)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for name, report in diagnostics.from_ros(message):
-            self.overview.add_report(name, report, time.monotonic())
+        subscribe_reports(self, lambda name, report: self.overview.add_report(
+            name, report, time.monotonic()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Show a network until a signal arrives, or once.
+    """Show a network until a signal arrives, or once; see `run_command`."""
+    return run_command(_watch, _parser(), arguments)
 
-    Parameters
-    ----------
-    arguments
-        Command line including ROS arguments; by default that of the process.
 
-    Returns
-    -------
-    int
-        Exit code: 0, including after a signal; 1 if rich is missing or, with ``--once``, no cycle
-        was complete in time.
-    """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = parse(_parser(), arguments)
-    try:
-        with optional_import('watch', extra=_PROGRAM):
-            import rich  # noqa: F401
-    except MissingLibraryError as error:
-        print_error(error, _PROGRAM)
-        return 1
-    arguments = [_PROGRAM, *arguments]
-    try:
-        return _print_once(options.timeout, arguments) if options.once else _show_live(arguments)
-    except BrokenPipeError:
-        discard_stdout()
-        return 0
+def _watch(options: argparse.Namespace, arguments: list[str]) -> int:
+    with optional_import('watch', extra=_PROGRAM):
+        import rich  # noqa: F401
+    return _print_once(options.timeout, arguments) if options.once else _show_live(arguments)
 
 
 def _show_live(arguments: Sequence[str]) -> int:
@@ -140,9 +223,8 @@ def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
     if nodes and nodes[0].overview.fixes:
         Console().print(render(nodes[0].overview, time.monotonic()))
     elif time.monotonic() - began_s > timeout_s:
-        print_error(f'no complete cycle within {timeout_s:g} s, in the domain '
-                    f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace', _PROGRAM)
-        return 1
+        raise ToolError(f'no complete cycle within {timeout_s:g} s, in the domain '
+                        f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
     return code
 
 

@@ -25,18 +25,18 @@ from scipy.stats import chi2
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.bounds.range_ambiguity import range_confusion_error
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.codebook.band_screening import raster, screen
+from rhs_isac_ros.codebook.band_plan import raster, screen
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError, simulate_received
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
     output_file,
     positive_int,
     seed,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 PLANS = {'Table I': ('table1.yaml', 'codebook_ambiguity.yaml'),

@@ -32,14 +32,14 @@ import numpy as np
 from parts.array_receiver import ArrayReceiver, posterior_means
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.codebook.directional import SCANS
+from rhs_isac_ros.codebook.starts import SCANS
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments import markdown_table
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int, seed
-from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import radiation_matrix
+from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int, seed
+from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 

@@ -32,8 +32,10 @@ from rhs_isac_ros.codebook import (
 )
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.model import Scenario, ScenarioError, streams
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
     integer,
@@ -41,8 +43,7 @@ from rhs_isac_ros.model.arguments import (
     positive_int,
     seed,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 PLANS = {'equal': (2.5e9, 2.667e9, 2.833e9, 3.0e9), 'unequal': (2.5e9, 2.55e9, 2.7e9, 3.0e9)}

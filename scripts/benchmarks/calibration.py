@@ -36,10 +36,10 @@ from rhs_isac_ros.model import (
     MeasurementModel,
     Scenario,
     draw_surface,
-    streams,
 )
-from rhs_isac_ros.model.arguments import ArgumentParser, input_file, positive_int, seed
 from rhs_isac_ros.positioning import Estimate, make_estimator
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_int, seed
 
 # Squared Mahalanobis radius of the 95 % region.
 REGION_RADIUS = float(chdtri(3, 0.05))

@@ -5,9 +5,12 @@ hall has walls. What do positions at known places teach it? Signals follow the t
 users in an empty hall and in one with reflections; other users of the same hall are the survey.
 `calibration.survey` estimates the covariance of the multipath from 10 to 300 of these, drawn
 several times, each time with other thermal noise in all signals. The 95 % region of an estimate is
-the ellipsoid of its covariance that contains 95 % of a Gaussian. Shares have Wilson's 95 %
-intervals over the users; of several surveys, the table lists the mean, and the range of the share
-in the region.
+the ellipsoid of its covariance that contains 95 % of a Gaussian; outside of it, an estimate is
+confidently wrong. Shares have Wilson's 95 % intervals over the users; of several surveys, the
+table lists the mean, and the range of the share in the region.
+
+With --blocked, a share of the users of the hall and of its surveys lacks the direct path. The
+estimator expects this of 10 % of the users, whatever the share.
 
 The folder contains empty_test.npz, hall_test.npz and hall_survey.npz with propagation paths.
 """
@@ -33,14 +36,22 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import Scenario, ScenarioError, simulate_received
-from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int, seed
-from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    output_file,
+    positive_int,
+    seed,
+    share,
+)
+from rhs_isac_ros.support.files import write_whole
 
 ROOT = Path(__file__).parents[2]
 SYSTEMS = {'table1': ('table1.yaml', 'codebook.yaml'),
            'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
 REGION_RADIUS = float(chi2.ppf(0.95, 3))
+# Assumed share of blocked users.
+PRIOR = 0.1
 
 
 class Result(NamedTuple):
@@ -53,9 +64,17 @@ class Result(NamedTuple):
 
     @property
     def shares(self) -> dict[str, float]:
-        """Shares of users with a fix, and of fixes in the region, and the error."""
+        """Shares of users with a fix, of fixes in the region, of users with one outside; error."""
         return {'fix': self.fixes / self.n, 'in_region': self.inside / max(self.fixes, 1),
-                'rms_m': self.rms_m}
+                'wrong': (self.fixes - self.inside) / self.n, 'rms_m': self.rms_m}
+
+
+class Received(NamedTuple):
+    """Users, [N, 3], their signals, [N, N_B, N_SB F], and whether they are blocked, bool [N]."""
+
+    users: np.ndarray
+    signals: np.ndarray
+    blocked: np.ndarray
 
 
 def main() -> None:
@@ -70,11 +89,13 @@ def main() -> None:
         help='random surveys of each size (default: %(default)s)')
     add('--positions', type=positive_int, nargs='+', default=[10, 30, 100, 300],
         help='sizes of the surveys (default: 10 30 100 300)')
+    add('--blocked', type=share, nargs='+', default=[], metavar='SHARE',
+        help='also measure with this share of users without direct path, from 0 to 1')
     add('--seed', type=seed, default=1, help='seed of all random numbers (default: %(default)s)')
     add('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     print('| hall | system | survey | fix [%] | in the 95 % region [%] | range over surveys [%] | '
-          'rms error [m] |\n|---|---|---|---|---|---|---|')
+          'confidently wrong [%] | rms error [m] |\n|---|---|---|---|---|---|---|---|')
     figures: dict[str, dict] = {'hall': {}, 'empty': {}}
     for name, (scenario_file, codebook_file) in SYSTEMS.items():
         scenario = Scenario.from_yaml(ROOT / 'config' / scenario_file)
@@ -84,60 +105,102 @@ def main() -> None:
             dataclasses.replace(scenario, channel=options.folder / f'{file}.npz')
             for file in ('empty_test', 'hall_test', 'hall_survey'))
         figures['empty'][name] = report('empty', name, 'none', [
-            measure(scenario, codebook, *receive(empty, codebook, rng))])
+            measure(scenario, codebook, receive(empty, codebook, rng))])['']
         figures['hall'][name] = {'shipped': report('hall', name, 'none', [
-            measure(scenario, codebook, *receive(hall, codebook, rng))])}
-        for n in options.positions:
-            results = []
-            for _ in range(options.surveys):
-                with warnings.catch_warnings():
-                    warnings.simplefilter('ignore', SurveyWarning)
-                    multipath = survey(scenario, codebook, *receive(known, codebook, rng, n))
-                measured = dataclasses.replace(scenario, multipath=multipath)
-                results.append(measure(measured, codebook, *receive(hall, codebook, rng)))
-            figures['hall'][name][str(n)] = report('hall', name, f'{n} positions', results)
+            measure(scenario, codebook, receive(hall, codebook, rng))])['']}
+        for hidden in (0.0, *options.blocked):
+            place = f'hall, {100 * hidden:g} % blocked' if hidden else 'hall'
+            for n in options.positions:
+                results = []
+                for _ in range(options.surveys):
+                    surveyed = receive(known, codebook, rng, n, hidden)
+                    with warnings.catch_warnings():
+                        warnings.simplefilter('ignore', SurveyWarning)
+                        multipath = survey(
+                            scenario, codebook, surveyed.users, surveyed.signals)
+                    measured = dataclasses.replace(
+                        scenario, multipath=multipath,
+                        blocked_probability=PRIOR if hidden else 0.0)
+                    results.append(measure(
+                        measured, codebook, receive(hall, codebook, rng, hidden=hidden)))
+                for users, found in report(place, name, f'{n} positions', results).items():
+                    key = f'{users}, {hidden:g} blocked' if users else 'hall'
+                    figures.setdefault(key, {}).setdefault(name, {})[str(n)] = found
     if options.json:
         write_whole(options.json, json.dumps(figures, indent=2) + '\n')
 
 
-def receive(traced: Scenario, codebook: Codebook, rng: np.random.Generator, n: int | None = None
-            ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the users of a channel, or n random ones of them, and their signals."""
+def receive(traced: Scenario, codebook: Codebook, rng: np.random.Generator,
+            n: int | None = None, hidden: float = 0.0) -> Received:
+    """Return the users of a channel, or n random ones, of whom a share has no direct path."""
     assert traced.channel
     users = traced.channel.users
     if n is not None:
         users = rng.permutation(users)[:n]
-    return users, simulate_received(traced, codebook, users, rng)
+    # A generator of its own leaves the other figures as they are without blocked users.
+    blocked = rng.spawn(1)[0].permutation(len(users)) < round(hidden * len(users))
+    signals = np.empty((len(users), *codebook_shape(codebook)), complex)
+    for state in (False, True):
+        if (chosen := blocked == state).any():
+            signals[chosen] = simulate_received(
+                dataclasses.replace(traced, blocked_probability=float(state)), codebook,
+                users[chosen], rng)
+    return Received(users, signals, blocked)
 
 
-def measure(scenario: Scenario, codebook: Codebook, positions: np.ndarray, received: np.ndarray
-            ) -> Result:
-    """Locate users with the estimator that also considers positions outside of the region."""
-    estimate = make_estimator('bayes', scenario, codebook, reject_outside=True).estimate(received)
+def codebook_shape(codebook: Codebook) -> tuple[int, int]:
+    """Return the numbers N_B of bands and N_SB F of measurements of each band."""
+    n_bands, n_subbands, n_frames, _, _ = codebook.shape
+    return n_bands, n_subbands * n_frames
+
+
+def measure(scenario: Scenario, codebook: Codebook, received: Received) -> dict[str, Result]:
+    """Locate users with the estimator that also considers positions outside of the region.
+
+    The results are those of all users, or if some are blocked, of those in sight and the others.
+    """
+    users, signals, blocked = received
+    estimate = make_estimator('bayes', scenario, codebook, reject_outside=True).estimate(signals)
     fix = estimate.fix
-    errors = (estimate.mean - positions)[fix]
-    distances = np.einsum(
-        'na,na->n', errors, np.linalg.solve(estimate.covariance[fix], errors[..., None])[..., 0])
-    rms_m = float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if fix.any() else np.nan
-    return Result(len(fix), int(fix.sum()), int(np.sum(distances <= REGION_RADIUS)), rms_m)
+    errors = np.where(fix[:, None], estimate.mean - users, 0.0)
+    covariance = np.where(fix[:, None, None], estimate.covariance, np.eye(3))
+    inside = fix & (np.einsum('na,na->n', errors, np.linalg.solve(
+        covariance, errors[..., None])[..., 0]) <= REGION_RADIUS)
+    squares = np.sum(errors**2, axis=1)
+    groups = {'in sight': ~blocked, 'blocked': blocked} if blocked.any() else {'': ~blocked}
+    return {name: Result(
+        int(chosen.sum()), int(fix[chosen].sum()), int(inside[chosen].sum()),
+        float(np.sqrt(squares[chosen & fix].mean())) if fix[chosen].any() else np.nan)
+        for name, chosen in groups.items() if chosen.any()}
 
 
-def report(hall: str, system: str, known: str, results: list[Result]) -> dict[str, float | list]:
-    """Print a row, and return its figures: means, and the worst share in the region."""
-    shares = [result.shares for result in results]
-    covered = [one['in_region'] for one in shares]
-    # A mean of several surveys has the interval of one, because they share the users.
-    fix, inside = (np.mean([
-        share_percent(getattr(result, key), total) for result, total in zip(
-            results, totals, strict=True)], axis=0) for key, totals in (
-                ('fixes', [result.n for result in results]),
-                ('inside', [max(result.fixes, 1) for result in results])))
-    rms_m = float(np.mean([one['rms_m'] for one in shares]))
-    print(f'| {hall} | {system} | {known} | {fix[0]:.1f} [{fix[1]:.1f}, {fix[2]:.1f}] | '
-          f'{inside[0]:.1f} [{inside[1]:.1f}, {inside[2]:.1f}] | {100 * min(covered):.1f} to '
-          f'{100 * max(covered):.1f} | {rms_m:.3f} |', flush=True)
-    return {'fix': float(np.mean([one['fix'] for one in shares])), 'in_region': min(covered),
-            'rms_m': rms_m, 'each': shares}
+def report(hall: str, system: str, known: str, results: list[dict[str, Result]]
+           ) -> dict[str, dict[str, float | list]]:
+    """Print a row for each group of users, and return its figures.
+
+    They are means, and the worst share in the region.
+    """
+    figures: dict[str, dict[str, float | list]] = {}
+    for users in results[0]:
+        found = [result[users] for result in results]
+        shares = [result.shares for result in found]
+        covered = [one['in_region'] for one in shares]
+        # A mean of several surveys has the interval of one, because they share the users.
+        fix, inside, wrong = (
+            '{:.1f} [{:.1f}, {:.1f}]'.format(*np.mean(
+                [share_percent(*pair) for pair in pairs], axis=0)) for pairs in (
+                    [(one.fixes, one.n) for one in found],
+                    [(one.inside, max(one.fixes, 1)) for one in found],
+                    [(one.fixes - one.inside, one.n) for one in found]))
+        rms_m = float(np.mean([one['rms_m'] for one in shares]))
+        place = f'{hall}: {users}' if users else hall
+        print(f'| {place} | {system} | {known} | {fix} | {inside} | {100 * min(covered):.1f} to '
+              f'{100 * max(covered):.1f} | {wrong} | '
+              f'{"" if np.isnan(rms_m) else f"{rms_m:.3f}"} |', flush=True)
+        figures[users] = {
+            'fix': float(np.mean([one['fix'] for one in shares])), 'in_region': min(covered),
+            'wrong': max(one['wrong'] for one in shares), 'rms_m': rms_m, 'each': shares}
+    return figures
 
 
 if __name__ == '__main__':

@@ -22,16 +22,17 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, CodebookError, directional_codebook, random_codebook
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments.resampling import reduction
-from rhs_isac_ros.model import Scenario, simulate_received, streams
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.model import Scenario, simulate_received
+from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
     output_file,
     positive_int,
     seed,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 BATCH = 50

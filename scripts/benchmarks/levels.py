@@ -20,16 +20,17 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, optimize
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.model import Scenario, ScenarioError, streams
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.model.surface import on_levels
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
     output_file,
     positive_int,
     seed,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.surface import on_levels
+from rhs_isac_ros.support.files import write_whole
 
 LEVELS = (2, 3, 4)
 HELD_OUT = 2000

@@ -25,9 +25,9 @@ from rhs_isac_ros.bounds import misspecified
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int, seed
-from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int, seed
+from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 LEVELS_DB = -25.0, -15.0, 0.0

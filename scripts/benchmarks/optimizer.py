@@ -28,12 +28,12 @@ from rhs_isac_ros.bounds import AverageCrlb, crlb
 from rhs_isac_ros.codebook import METHODS, random_codebook
 from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
-from rhs_isac_ros.codebook.problem import Problem
+from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
 from rhs_isac_ros.codebook.sampling import monte_carlo, sobol
-from rhs_isac_ros.codebook.search import BudgetSpent, Search
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.model import Scenario, streams
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
     integer,
@@ -41,8 +41,8 @@ from rhs_isac_ros.model.arguments import (
     picture_file,
     positive_float,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.pictures import write_picture
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.pictures import write_picture
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
 TARGET_M2 = 0.0415

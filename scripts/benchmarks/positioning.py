@@ -26,8 +26,6 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import ArgumentParser, input_file, integer, positive_int, seed
-from rhs_isac_ros.model.optional import optional_import
 from rhs_isac_ros.positioning import (
     ESTIMATORS,
     Estimate,
@@ -36,6 +34,8 @@ from rhs_isac_ros.positioning import (
     make_estimator,
     simulate_pairs,
 )
+from rhs_isac_ros.support.arguments import ArgumentParser, input_file, integer, positive_int, seed
+from rhs_isac_ros.support.optional import optional_import
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
 # Squared Mahalanobis radius of the 95 % region.

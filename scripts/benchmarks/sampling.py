@@ -22,9 +22,10 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
 from rhs_isac_ros.codebook.sampling import sobol
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.model import Scenario, streams
-from rhs_isac_ros.model.arguments import ArgumentParser, output_file, positive_int
-from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int
+from rhs_isac_ros.support.files import write_whole
 
 CHOICES = (('monte_carlo', 300), ('monte_carlo', 600), ('monte_carlo', 1200), ('sobol', 64),
            ('sobol', 128), ('sobol', 256), ('sobol', 1024))

@@ -28,8 +28,8 @@ from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, st
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import ArgumentParser, input_file, integer, positive_int, seed
 from rhs_isac_ros.model.surface import matched_configuration
+from rhs_isac_ros.support.arguments import ArgumentParser, input_file, integer, positive_int, seed
 
 # Standard deviations of the estimates around the true position [m].
 SPREADS_M = (0.01, 0.1, 0.3, 1.0, 3.0)

@@ -24,9 +24,10 @@ import numpy as np
 from rhs_isac_ros.bounds import average_crlb, crlb
 from rhs_isac_ros.codebook import Codebook, default_codebook_file, optimize
 from rhs_isac_ros.link import capacity, steer
-from rhs_isac_ros.model import Scenario, simulate_received, threads
-from rhs_isac_ros.model.arguments import ArgumentParser, positive_int
+from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.support import threads
+from rhs_isac_ros.support.arguments import ArgumentParser, positive_int
 
 VARIABLES = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 CONTENDERS = {'one thread': 'one', 'untouched': 'untouched', 'without the limit': 'unlimited'}

@@ -37,7 +37,8 @@ from rhs_isac_ros.codebook import Codebook, CodebookError, random_codebook
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.experiments import markdown_table
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.positioning import BayesEstimator, Motion, Tracker
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
     integer,
@@ -45,8 +46,7 @@ from rhs_isac_ros.model.arguments import (
     positive_int,
     seed,
 )
-from rhs_isac_ros.model.optional import MissingLibraryError, optional_import
-from rhs_isac_ros.positioning import BayesEstimator, Motion, Tracker
+from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
 # Squared Mahalanobis radius of the 95 % region.

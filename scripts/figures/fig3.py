@@ -46,9 +46,10 @@ from rhs_isac_ros.experiments import (
     run_command,
     run_jobs,
 )
-from rhs_isac_ros.model import Scenario, streams
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.pictures import PAGE_IN, look, new_panels, paper_style, write_picture
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.pictures import PAGE_IN, look, new_panels, paper_style, write_picture
 
 BANDS = (1, 2, 4, 8)
 TOTAL_FRAMES = 8

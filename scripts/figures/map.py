@@ -27,13 +27,13 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments import Job, markdown_table, parse_options, run_command, run_jobs
-from rhs_isac_ros.experiments.sweep import Sweep, run_blocks
-from rhs_isac_ros.experiments.sweep_jobs import BLOCK, plain_codebook
+from rhs_isac_ros.experiments.sweep import BLOCK, Sweep, plain_codebook, run_blocks
 from rhs_isac_ros.experiments.sweep_settings import Setting
-from rhs_isac_ros.model import Scenario, streams
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.pictures import PAGE_IN, new_figure, paper_style, write_picture
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import simulate_pairs
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.pictures import PAGE_IN, new_figure, paper_style, write_picture
 
 TRIALS, QUICK_TRIALS = 40, 4
 PHASES, QUICK_PHASES = 10_240, 1024

@@ -25,13 +25,12 @@ import numpy as np
 from parts.plans import SEED, Plan, add_plan_options, read_plans
 
 from rhs_isac_ros.experiments import markdown_table, parse_options, run_command
-from rhs_isac_ros.experiments.sweep import Point, Sweep, run_sweep, table
-from rhs_isac_ros.experiments.sweep_jobs import BLOCK
+from rhs_isac_ros.experiments.sweep import BLOCK, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import add_legend, draw_panel
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, Setting
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.pictures import PAGE_IN, new_panels, paper_style, write_picture
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.pictures import PAGE_IN, new_panels, paper_style, write_picture
 
 TRIALS, QUICK_TRIALS = 20, 1
 STEPS, QUICK_STEPS = 600, 100

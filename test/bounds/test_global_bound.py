@@ -33,6 +33,7 @@ def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
     assert bound.coarseness == 1
 
 
+@pytest.mark.slow
 def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
     # In a thin region, only the range is unknown. Its phases repeat every 0.6 m.
     scenario, codebook, bound = bound_and_codebook(
@@ -61,6 +62,7 @@ def crlb_of_range(model, truth):
     return np.mean(1 / (2 * np.sum(np.abs(slope)**2, axis=(1, 2))))
 
 
+@pytest.mark.slow
 def test_squared_errors_have_the_mean_of_the_bound():
     scenario, _, bound = bound_and_codebook(256)
     spread = np.std(bound.squared_errors) / np.sqrt(len(bound.squared_errors))
@@ -81,6 +83,7 @@ def test_too_few_phases_are_an_error():
         bound_and_codebook(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('height', [0.0, 1.2])
 def test_a_flat_region_is_the_limit_of_thin_ones(height):
     flat, thin = (bound_and_codebook(

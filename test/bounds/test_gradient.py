@@ -106,6 +106,7 @@ def test_gradients_for_an_estimated_surface_are_slopes(average, random_beams, na
     assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(slope, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_under_a_measured_covariance_are_difference_quotients(odd, random_beams):
     scenario, codebook = odd
     rng = np.random.default_rng(4)

@@ -33,6 +33,7 @@ def test_without_a_wrong_assumption_it_is_the_bound(plan, positions):
     assert result.valid.mean() > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('field', 'value', 'has_bias'), [
     ('angular_spread_deg', 14.0, False), ('angular_spread_deg', 5.0, False),
     ('multipath_to_los_db', -28.0, False), ('refractive_index', 2.102, True)])
@@ -73,6 +74,7 @@ def test_it_does_not_claim_validity_where_ranges_are_ambiguous(shipped):
     assert not misspecified(scenario, true, shipped, places).valid.any()
 
 
+@pytest.mark.slow
 def test_it_does_not_claim_validity_where_signals_are_refused(plan, positions):
     scenario, codebook = plan
     loud = dataclasses.replace(scenario, user_gain=2.0)

@@ -59,6 +59,7 @@ def test_the_report_lists_what_was_found(estimate):
     assert 'warning' not in text
 
 
+@pytest.mark.slow
 def test_estimates_after_a_survey_are_in_their_regions(shipped):
     """Directions of arrival that no fields describe, learnt from 100 positions."""
     rng = np.random.default_rng(4)
@@ -88,6 +89,7 @@ def test_estimates_after_a_survey_are_in_their_regions(shipped):
     assert min(shares['declared']) < 0.8
 
 
+@pytest.mark.slow
 def test_positions_behind_obstacles_are_left_out(shipped):
     """A third of the positions receives multipath alone, 6 dB weaker than that of the others."""
     positions, received = send(HALL, shipped, 60)
@@ -101,6 +103,7 @@ def test_positions_behind_obstacles_are_left_out(shipped):
                                atol=0.05 * np.abs(alone.excess).max())
 
 
+@pytest.mark.slow
 def test_impairments_are_estimated_with_the_multipath(shipped):
     impaired = {'user_gain_std_db': 3.0, 'phase_std_rad': 6.2832, 'timing_std_s': 5e-9}
     declared, hall = (dataclasses.replace(one, **impaired) for one in (DECLARED, HALL))
@@ -115,6 +118,7 @@ def test_impairments_are_estimated_with_the_multipath(shipped):
     assert np.median(errors) < 1.0
 
 
+@pytest.mark.slow
 def test_a_calibrated_surface_takes_part(shipped):
     """A gain of a band is not multipath if the surface explains it."""
     rng = np.random.default_rng(0)
@@ -135,6 +139,7 @@ def test_a_calibration_holds_in_every_hall(estimate, shipped, tmp_path):
     assert make_estimator('bayes', measured, shipped, surface=surface).surface is surface
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('n', [1, 3])
 def test_few_positions_yield_nearly_the_fields_and_a_warning(shipped, n):
     with pytest.warns(SurveyWarning, match='expected at least 20'):
@@ -144,6 +149,7 @@ def test_few_positions_yield_nearly_the_fields_and_a_warning(shipped, n):
     assert 1.2 < estimate.about['inflation'] < 2
 
 
+@pytest.mark.slow
 def test_a_survey_in_a_corner_causes_a_warning(shipped):
     positions, received = send(HALL, shipped, 200)
     corner = (positions[:, 1] < -2)
@@ -152,6 +158,7 @@ def test_a_survey_in_a_corner_causes_a_warning(shipped):
     assert len(estimate.about['warnings']) == 1
 
 
+@pytest.mark.slow
 def test_a_survey_of_the_region_causes_none(shipped):
     with warnings.catch_warnings():
         warnings.simplefilter('error')

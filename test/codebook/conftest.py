@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook.search import Search
+from rhs_isac_ros.codebook.problem import Search
 from rhs_isac_ros.model import Scenario
 
 N_ANALOG = 10

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import alternating
-from rhs_isac_ros.codebook.alternating import minimize_alternating
+from rhs_isac_ros.codebook import methods
+from rhs_isac_ros.codebook.methods import minimize_alternating
 
 
 class Phase:
@@ -18,7 +18,7 @@ class Phase:
 @pytest.fixture
 def phases(monkeypatch):
     """Record the sub-problems with the points evaluated in each."""
-    seen, minimize = [], alternating.minimize_interior_point
+    seen, minimize = [], methods.minimize_interior_point
 
     def spy(search, start, free, max_steps):
         phase = Phase(start, free, max_steps)
@@ -34,7 +34,7 @@ def phases(monkeypatch):
             phase.found = minimize(search, start, free, max_steps)
         return phase.found
 
-    monkeypatch.setattr(alternating, 'minimize_interior_point', spy)
+    monkeypatch.setattr(methods, 'minimize_interior_point', spy)
     return seen
 
 
@@ -104,7 +104,7 @@ def test_a_change_in_one_sub_problem_suffices_to_continue(
         seen.append(free)
         return start + 0.01 * free if len(seen) - 1 in changing else start
 
-    monkeypatch.setattr(alternating, 'minimize_interior_point', minimize)
+    monkeypatch.setattr(methods, 'minimize_interior_point', minimize)
     reason = minimize_alternating(search_of(flat, 80))
     assert len(seen) == calls
     assert reason == f'iteration {calls // 2} changed nothing'

@@ -13,9 +13,10 @@ from rhs_isac_ros.codebook.band_plan import (
     choose_bands,
     expected_error,
     optimize_band_plan,
+    raster,
+    screen,
     with_bands,
 )
-from rhs_isac_ros.codebook.band_screening import raster, screen
 from rhs_isac_ros.model import Scenario
 
 SPECTRUM = [(2.5e9, 2.7e9)]
@@ -108,6 +109,7 @@ def test_a_raster_with_few_plans_has_few_candidates(small, short):
     assert only.frequencies_hz == (2.5e9, 3e9)
 
 
+@pytest.mark.slow
 def test_the_result_has_the_lowest_expected_error_up_to_chance(small, short):
     plan = optimize_band_plan(small, SPECTRUM, 2, raster_hz=25e6, seed=1, max_steps=2)
     plan.result.codebook.check(plan.scenario)
@@ -153,6 +155,7 @@ def long_region():
                     roi_size_m=(6, 2, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('phase_std_rad', 'least', 'most'), [(0.0, 1.5, 100), (6.3, 0.85, 1.15)])
 def test_unequal_spacing_pays_only_if_phases_are_known(
         long_region, phase_std_rad, least, most):

@@ -17,7 +17,8 @@ from rhs_isac_ros.codebook import Codebook, Provenance, band_plan, command, dire
 from rhs_isac_ros.codebook.__main__ import main
 from rhs_isac_ros.codebook.optimize import INTERRUPTED, _PeriodicCall
 from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface, streams
+from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface
+from rhs_isac_ros.support import streams
 
 
 @pytest.fixture
@@ -331,6 +332,7 @@ def test_the_picture_is_drawn(call, files):
     assert (files / 'picture.png').read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.slow
 def test_the_package_is_executable(files):
     done = subprocess.run(
         [sys.executable, '-m', 'rhs_isac_ros.codebook', '--scenario', files / 'scenario.yaml',

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook.direct import minimize_direct
+from rhs_isac_ros.codebook.methods import minimize_direct
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import optimize
-from rhs_isac_ros.codebook.genetic import minimize_genetic
-from rhs_isac_ros.model.optional import MissingLibraryError
+from rhs_isac_ros.codebook.methods import minimize_genetic
+from rhs_isac_ros.support.optional import MissingLibraryError
 
 
 def test_without_pymoo_the_error_names_the_extra(scenario, monkeypatch):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook.interior_point import minimize_interior_point
+from rhs_isac_ros.codebook.methods import minimize_interior_point
 
 
 @pytest.mark.parametrize('seed', range(4))

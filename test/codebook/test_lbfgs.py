@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook.lbfgs import minimize_lbfgs
+from rhs_isac_ros.codebook.methods import minimize_lbfgs
 
 
 @pytest.mark.parametrize('seed', range(4))

@@ -12,7 +12,7 @@ from rhs_isac_ros.codebook import (
     optimize,
     random_codebook,
 )
-from rhs_isac_ros.codebook.lbfgs import run_lbfgs
+from rhs_isac_ros.codebook.methods import run_lbfgs
 from rhs_isac_ros.codebook.objective import OBJECTIVES
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario
@@ -72,7 +72,7 @@ def test_the_penalty_moves_the_amplitudes_to_the_levels(monkeypatch):
         rounds.append((objective, result.x))
         return result
 
-    monkeypatch.setattr('rhs_isac_ros.codebook.levels.run_lbfgs', recording)
+    monkeypatch.setattr('rhs_isac_ros.codebook.methods.run_lbfgs', recording)
     optimize(with_levels(3), POSITIONS, max_steps=100)
     n_analog = random_codebook(SCENARIO, np.random.default_rng(0)).analog.size
 
@@ -123,7 +123,7 @@ def test_the_limit_of_steps_holds_in_every_phase(max_steps):
 
 
 def test_the_reason_does_not_claim_exchanges_that_were_not_tried(monkeypatch):
-    monkeypatch.setattr('rhs_isac_ros.codebook.levels._MAX_FAILURES', 2)
+    monkeypatch.setattr('rhs_isac_ros.codebook.methods._MAX_FAILURES', 2)
     result = optimize(with_levels(2), POSITIONS[:4], max_steps=200)
     assert result.reason == 'none of the 2 most promising exchanges lowers the objective'
 

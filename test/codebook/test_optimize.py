@@ -24,8 +24,9 @@ from rhs_isac_ros.codebook import (
 )
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _PeriodicCall, _Report
 from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.model import Scenario, threads
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
+from rhs_isac_ros.support import threads
 
 STEPS = 30
 NO_PYMOO = importlib.util.find_spec('pymoo') is None

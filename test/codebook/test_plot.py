@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import Progress, directional_codebook, plot
-from rhs_isac_ros.codebook.directional import width_points
 from rhs_isac_ros.codebook.plot import beam_powers, plot_optimization
+from rhs_isac_ros.codebook.starts import width_points
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.optional import MissingLibraryError
-from rhs_isac_ros.model.pictures import PICTURE_FORMATS, write_picture
+from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
 
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
@@ -44,6 +44,7 @@ def test_axes_have_units_and_the_beams_one_legend():
     assert len({line.get_linestyle() for line in beams.lines}) == 4
 
 
+@pytest.mark.slow
 def test_repeated_runs_write_the_same_files(scenario, tmp_path):
     pytest.importorskip('matplotlib')
     for run in 'ab':

@@ -5,11 +5,10 @@ import sys
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import optimize, random_codebook, sampled
-from rhs_isac_ros.codebook.lbfgs import minimize_lbfgs
+from rhs_isac_ros.codebook import methods, optimize, random_codebook
+from rhs_isac_ros.codebook.methods import minimize_lbfgs
 from rhs_isac_ros.codebook.objective import ambiguity
-from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.codebook.search import BudgetSpent, Search
+from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
 
 # With 128 pairs each: 5120 pairs.
 N_POSITIONS = 40
@@ -35,12 +34,12 @@ def search_from(problem, scenario):
 
 @pytest.fixture
 def rounds(monkeypatch):
-    monkeypatch.setattr(sampled, '_ROUNDS', ((500, 15), (1000, 15)))
+    monkeypatch.setattr(methods, '_ROUNDS', ((500, 15), (1000, 15)))
 
 
 def test_samples_lead_to_the_value_that_all_pairs_lead_to(search_from, rounds):
     search, plain = search_from(120), search_from(60)
-    sampled.minimize_sampled(search)
+    methods.minimize_sampled(search)
     minimize_lbfgs(plain)
     start = search.history[0].value_m2
     assert plain.value_m2 < 0.6 * start
@@ -49,7 +48,7 @@ def test_samples_lead_to_the_value_that_all_pairs_lead_to(search_from, rounds):
 
 def test_the_value_is_that_of_all_pairs(search_from, problem, rounds):
     search = search_from(40)
-    assert sampled.minimize_sampled(search) == 'max_steps reached'
+    assert methods.minimize_sampled(search) == 'max_steps reached'
     assert search.value_m2 == problem.value(search.best)
     assert len(search.history) == 41
     # The value falls at the end of a round, of which there are three.
@@ -63,7 +62,7 @@ def test_the_value_is_that_of_all_pairs(search_from, problem, rounds):
 def test_the_last_evaluation_of_a_budget_is_with_all_pairs(search_from, rounds, budget, problem):
     search = search_from(1000, budget)
     with pytest.raises(BudgetSpent):
-        sampled.minimize_sampled(search)
+        methods.minimize_sampled(search)
     search.finish()
     assert search.history[-1].evaluations <= budget
     assert search.value_m2 == problem.value(search.best)
@@ -80,14 +79,14 @@ def test_ctrl_c_keeps_the_steps_of_an_unfinished_round(search_from, monkeypatch)
         return evaluate(self, *arguments, **options)
     monkeypatch.setattr(Problem, 'value_and_gradient', interrupted)
     with pytest.raises(KeyboardInterrupt):
-        sampled.minimize_sampled(search)
+        methods.minimize_sampled(search)
     assert search.value_m2 < search.history[0].value_m2
 
 
 def test_a_round_without_success_ends_the_search(search_from, monkeypatch):
-    monkeypatch.setattr(sampled, 'run_lbfgs', lambda *arguments: None)
+    monkeypatch.setattr(methods, 'run_lbfgs', lambda *arguments: None)
     search = search_from(1000)
-    assert 'no round' in sampled.minimize_sampled(search)
+    assert 'no round' in methods.minimize_sampled(search)
     assert len(search.history) == 1
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook.search import BudgetSpent, Progress
+from rhs_isac_ros.codebook.problem import BudgetSpent, Progress
 
 START = np.full(20, 0.5)
 

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 import diagram
 import pytest
 
-from rhs_isac_ros.protocol.state_machine import ANY, SAME, always
+from rhs_isac_ros.protocol.role import ANY, SAME, always
 
 SVG = '{http://www.w3.org/2000/svg}'
 each_role = pytest.mark.parametrize('role', diagram.ROLES)

@@ -15,10 +15,11 @@ from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.calibration import Pilots, calibrate
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.experiments.sweep_settings import parse_axis, settings_of
-from rhs_isac_ros.model import Scenario, draw_surface, mobility, plugins, simulate_received
+from rhs_isac_ros.model import Scenario, draw_surface, mobility, simulate_received
 from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import los_and_derivative
 from rhs_isac_ros.positioning import Tracker, make_estimator
+from rhs_isac_ros.support import plugins
 
 EXAMPLES = Path(__file__).parents[2] / 'docs' / 'examples'
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.experiments.measures import MEASURES, measured, names_of, parse_measures
+from rhs_isac_ros.experiments.sweep_settings import MEASURES, measured, names_of, parse_measures
 
 
 @pytest.fixture

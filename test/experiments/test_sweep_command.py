@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from rhs_isac_ros.experiments import __main__, sweep_command
+from rhs_isac_ros.experiments import __main__
 from rhs_isac_ros.experiments import sweep as sweep_module
 
 pytest.importorskip('joblib')
@@ -19,12 +19,14 @@ FILES = ('sweep.csv', 'sweep.png')
 def sweep(tmp_path, monkeypatch):
     """Callable that runs a sweep of two settings in a folder, and returns its exit code."""
     monkeypatch.chdir(tmp_path)
+    # Two blocks of positions, the second one shorter.
+    monkeypatch.setattr(sweep_module, 'BLOCK', 10)
     (tmp_path / 'small.yaml').write_text(SMALL, encoding='utf-8')
 
     def run(folder, *options):
         return __main__.main([
             'sweep', '--scenario', 'small.yaml', '--vary', 'n_frames=1,2', '--measure',
-            'crlb,mse', '--codebook', 'random', '--positions', '260', '--output', folder,
+            'crlb,mse', '--codebook', 'random', '--positions', '12', '--output', folder,
             *options])
     return run
 
@@ -33,6 +35,7 @@ def files(folder):
     return [(folder / name).read_bytes() for name in FILES]
 
 
+@pytest.mark.slow
 def test_processes_a_cluster_and_an_interrupted_run_write_the_same_files(
         sweep, tmp_path, monkeypatch, capsys):
     assert sweep('two', '--jobs', '2') == 0
@@ -81,8 +84,8 @@ def test_every_setting_and_measure_has_a_row(sweep, tmp_path):
 
 
 def test_without_matplotlib_the_table_is_written(sweep, tmp_path, monkeypatch, capsys):
-    find = sweep_command.importlib.util.find_spec
-    monkeypatch.setattr(sweep_command.importlib.util, 'find_spec', lambda name, *arguments: (
+    find = __main__.importlib.util.find_spec
+    monkeypatch.setattr(__main__.importlib.util, 'find_spec', lambda name, *arguments: (
         None if name == 'matplotlib' else find(name, *arguments)))
     assert sweep('folder', '--jobs', '1', '--measure', 'crlb') == 0
     assert 'needs matplotlib, which is not installed (pip install' in capsys.readouterr().out
@@ -118,7 +121,7 @@ def test_an_error_is_one_line_and_nothing_runs(options, expected, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'bad.yaml').write_text('colour: red\n', encoding='utf-8')
     with pytest.raises(SystemExit, match='2'):
-        sweep_command.main(options)
+        __main__.main(['sweep', *options])
     errors = capsys.readouterr().err
     assert expected in errors
     assert len(errors.splitlines()) == 1

@@ -8,8 +8,8 @@ import pytest
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, random_codebook
-from rhs_isac_ros.experiments import sweep_jobs
-from rhs_isac_ros.experiments.sweep_jobs import design, evaluate, families, with_power
+from rhs_isac_ros.experiments import sweep as sweep_jobs
+from rhs_isac_ros.experiments.sweep import design, evaluate, families, with_power
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs

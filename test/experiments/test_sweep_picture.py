@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.experiments.measures import Interval
 from rhs_isac_ros.experiments.sweep import Point
 from rhs_isac_ros.experiments.sweep_picture import draw, is_geometric, shown
-from rhs_isac_ros.experiments.sweep_settings import FIELDS, parse_axis, settings_of
+from rhs_isac_ros.experiments.sweep_settings import FIELDS, Interval, parse_axis, settings_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.pictures import write_picture
+from rhs_isac_ros.support.pictures import write_picture
 
 pytest.importorskip('matplotlib')
 

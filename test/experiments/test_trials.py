@@ -15,9 +15,7 @@ from rhs_isac_ros.experiments import (
     ResultStore,
     run_jobs,
 )
-from rhs_isac_ros.experiments import store as store_module
-from rhs_isac_ros.experiments import trials as trials_module
-from rhs_isac_ros.experiments import workers as workers_module
+from rhs_isac_ros.experiments import jobs as jobs_module
 
 JOBS = [Job(f'square-{number}', {'number': number, 'of': (1, 2)}) for number in range(4)]
 SQUARES = [{'square': number**2} for number in range(4)]
@@ -97,15 +95,15 @@ def test_a_job_whose_arguments_changed_is_repeated(tmp_path):
     assert numbers_run_again(tmp_path, changed) == [0]
 
 
-def test_a_job_of_another_version_is_repeated(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(store_module, '__version__', '0.0.0')
-        run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
-    assert numbers_run_again(tmp_path) == [0, 1, 2, 3]
+def test_a_job_of_another_version_is_repeated(tmp_path):
+    run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
+    file = ResultStore(tmp_path).path(JOBS[1])
+    file.write_text(json.dumps(json.loads(file.read_text()) | {'version': '0.0.0'}))
+    assert numbers_run_again(tmp_path) == [1]
 
 
 def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(trials_module, '__version__', '9.9.9')
+    monkeypatch.setattr(jobs_module, '__version__', '9.9.9')
     with pytest.raises(JobError, match=r'square-0: the worker has .*, expected 9\.9\.9'):
         run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
 
@@ -249,7 +247,7 @@ def test_an_error_on_a_dask_cluster_names_its_job(tmp_path, cluster):
 
 def test_a_dask_cluster_without_workers_is_an_error(tmp_path, monkeypatch):
     distributed = pytest.importorskip('distributed')
-    monkeypatch.setattr(workers_module, '_TIMEOUT_S', 0.1)
+    monkeypatch.setattr(jobs_module, '_TIMEOUT_S', 0.1)
     with distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=':0') as empty:
         with pytest.raises(ConnectionError, match='^Dask cluster inproc://.*workers'):
             run_jobs(Worker(), JOBS, tmp_path, dask=empty.scheduler_address)

@@ -8,7 +8,8 @@ import pytest
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import random_codebook
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import streams
 
 pytest.importorskip('pymoo')
 pytest.importorskip('joblib')

@@ -63,6 +63,7 @@ def test_there_is_no_verdict_on_few_positions_or_a_single_training(claims):
     assert claims.verdict(42, 43, 50, 10_000, 1) == 'too few trainings'
 
 
+@pytest.mark.slow
 def test_the_claims_have_the_measured_reductions(results, claims):
     found = {(f.quantity, f.own, f.benchmark): f for f in claims.findings(
         results, results.conditions[0])}
@@ -114,6 +115,7 @@ def test_trials_may_share_the_positions(fig4):
     assert results.without_fix[condition, 'random'] == 2
 
 
+@pytest.mark.slow
 def test_the_report_has_tables_picture_and_data(fig4, results, tmp_path, capsys):
     options = argparse.Namespace(trials=3, pairs=7, output=tmp_path, format='png')
     fig4.fig4_report.write(results, options)
@@ -131,6 +133,7 @@ def test_the_report_has_tables_picture_and_data(fig4, results, tmp_path, capsys)
     assert len((tmp_path / 'fig4a.csv').read_text().splitlines()) == 1 + len(LEVELS) * 3
 
 
+@pytest.mark.slow
 def test_every_mark_of_the_picture_is_in_the_legend_and_every_box_is_visible(fig4):
     results = synthetic(fig4, 300, 2)
     figure = fig4.fig4_report.picture(results)
@@ -208,6 +211,7 @@ def test_options_select_the_conditions(fig4, monkeypatch, arguments, conditions)
     assert [condition.slug for condition in seen[0].conditions] == conditions
 
 
+@pytest.mark.slow
 def test_the_command_writes_all_files_and_repeats_no_job(fig4, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fig4, 'optimize', functools.partial(fig4.optimize, max_steps=8))
     monkeypatch.setattr(fig4, 'SAMPLES', 4)

@@ -38,6 +38,7 @@ def test_all_maps_share_one_scale_with_a_unit(figure):
     assert panels[0].images[0].get_extent() == [5, 15, -5, 5]
 
 
+@pytest.mark.slow
 def test_the_command_maps_each_plan(figure, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sweep, 'design', lambda scenario, **_: sweep.plain_codebook(
         random_codebook(Scenario(**scenario), np.random.default_rng(0))))

@@ -7,8 +7,8 @@ import pytest
 
 from rhs_isac_ros.codebook import default_codebook_file, random_codebook
 from rhs_isac_ros.experiments import sweep
-from rhs_isac_ros.experiments.measures import Interval
 from rhs_isac_ros.experiments.sweep import Point
+from rhs_isac_ros.experiments.sweep_settings import Interval
 from rhs_isac_ros.model import Scenario
 
 pytest.importorskip('joblib')
@@ -56,6 +56,7 @@ def test_codebooks_are_optimised_without_the_errors(figure):
             'center_frequencies_hz', 'n_frames'}
 
 
+@pytest.mark.slow
 def test_the_command_gives_advice_and_repeats_no_job(figure, located, tmp_path, capsys):
     call = ['--quick', '--jobs', '1', '--output', str(tmp_path)]
     assert figure.main(call) == 0

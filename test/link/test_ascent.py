@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.link import Beam, capacity
-from rhs_isac_ros.link.ascent import ascend
 from rhs_isac_ros.link.band_link import BandLink
+from rhs_isac_ros.link.steering import ascend
 from rhs_isac_ros.model import Scenario
 
 POSITION = np.array([7.0, 3.0, -0.5])

@@ -230,6 +230,7 @@ def test_invalid_moments_are_errors_that_name_the_field(table1, mean, covariance
         posterior_points(table1.scenario, mean, covariance)
 
 
+@pytest.mark.slow
 def test_a_measured_covariance_has_its_own_capacity(table1, reference_link, shipped):
     """Multipath of one direction: the covariance is complex, unlike a declared one."""
     scenario, rng = table1.scenario, np.random.default_rng(0)

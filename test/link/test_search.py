@@ -7,9 +7,9 @@ import pytest
 
 from rhs_isac_ros.link import Beam, capacity
 from rhs_isac_ros.link import search as search_module
-from rhs_isac_ros.link.ascent import ascend
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.link.search import candidate_configurations, tables
+from rhs_isac_ros.link.steering import ascend
 from rhs_isac_ros.model import Scenario, multipath
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.surface import matched_configuration

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.link.water_filling import water_filling
+from rhs_isac_ros.link.band_link import water_filling
 
 RNG = np.random.default_rng(0)
 CASES = {

@@ -18,7 +18,6 @@ from rhs_isac_ros.model import (
     MeasurementModel,
     Scenario,
     ScenarioError,
-    plugins,
     simulate_received,
 )
 from rhs_isac_ros.model.gain_pattern import PatternError
@@ -26,6 +25,7 @@ from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_h
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import mean_los_power, multipath_covariance
 from rhs_isac_ros.positioning import make_estimator, store
+from rhs_isac_ros.support import plugins
 
 
 def patch(angles):

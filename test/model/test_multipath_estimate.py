@@ -8,8 +8,8 @@ import yaml
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.model import multipath as mp
-from rhs_isac_ros.model.files import ArchiveError
 from rhs_isac_ros.model.multipath_estimate import CONDITIONS, MultipathEstimate
+from rhs_isac_ros.support.files import ArchiveError
 
 N = 40_000
 
@@ -122,6 +122,7 @@ def test_many_elements_have_the_same_spatial_covariance(measured, request):
             found.scatter(rows), product, atol=1e-12 * np.abs(product).max())
 
 
+@pytest.mark.slow
 def test_gains_of_many_elements_have_the_measured_covariance(
         measured, beams, target, by_convolution):
     radiation = MeasurementModel(measured, beams).radiation

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, simulate_received
-from rhs_isac_ros.model.files import ArchiveError
 from rhs_isac_ros.model.los import direct_gain, los_gain
 from rhs_isac_ros.model.path_channel import PathChannel
+from rhs_isac_ros.support.files import ArchiveError
 
 F0 = 2.75e9
 SPEED = 299_792_458.0

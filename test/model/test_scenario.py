@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError, plugins
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario, ScenarioError
+from rhs_isac_ros.support import plugins
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def test_defaults_are_table_1_of_the_paper():
              'timing_std_s', 'carrier_offset_std_hz', 'element_error_rms',
              'failed_element_share', 'amplitude_levels'), 0),
         'multipath_direction_deg': (0.0, 0.0), 'impairments': (),
-        'multipath': None, 'channel': None}
+        'blocked_probability': 0.0, 'multipath': None, 'channel': None}
     assert dataclasses.asdict(Scenario()) == expected
 
 

@@ -1,5 +1,6 @@
 """The view of a network in memory: what it shows, on which path, and from which cycle on."""
 
+import dataclasses
 import re
 import types
 
@@ -7,10 +8,10 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model.geometry import element_positions
-from rhs_isac_ros.monitoring import charts, network_view
-from rhs_isac_ros.monitoring.entities import Clear, Number, Series, Text
+from rhs_isac_ros.monitoring import network_view
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
 from rhs_isac_ros.monitoring.role_statistics import Report
+from rhs_isac_ros.monitoring.shapes import Clear, Number, Series, Text
 from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 
@@ -46,6 +47,18 @@ def test_cycles_are_counted_from_one(watched):
     assert [cycle for cycle, _ in logged] == list(range(1, N_CYCLES + 1))
     for (_, text), cycle_id in zip(logged, ids, strict=True):
         assert re.fullmatch(rf'user [12]: error .* \(cycle {cycle_id}\)', text.text)
+
+
+def test_the_log_names_doubts_about_a_position(watched, scenario):
+    view = NetworkView(scenario)
+    for sent in messages_of(watched.run):
+        message = sent.message
+        if isinstance(message, m.PositionEstimate):
+            message = dataclasses.replace(
+                message, outside_probability=0.004, blocked_probability=0.12)
+        for _, text in on(view.add(message, sent.time_s), network_view.LOG):
+            assert re.search(r'loss .* %, blocked 12 % \(cycle', text.text)
+    assert view.n_ended == N_CYCLES
 
 
 def test_truth_and_estimate_are_those_of_the_messages(watched):
@@ -102,7 +115,7 @@ def test_each_series_has_a_chart_and_one_style(watched):
     series = [entry for entry in watched.entries if isinstance(entry.entity, Series)]
     paths = [entry.path for entry in series]
     assert len(set(paths)) == len(paths) > 10
-    assert {path.partition('/')[0] for path in paths} <= set(charts.TITLES)
+    assert {path.partition('/')[0] for path in paths} <= set(network_view.TITLES)
     assert {entry.cycle for entry in series} == {0}
     assert {entry.path for entry in watched.entries if isinstance(entry.entity, Number)} == set(
         paths)
@@ -192,7 +205,7 @@ def test_the_name_of_a_user_is_above_the_user(watched):
 
 def test_cycles_of_further_users_are_in_the_charts(watched, scenario, monkeypatch):
     monkeypatch.setattr(network_view, '_MAX_USERS', 1)
-    monkeypatch.setattr(charts, '_MAX_SERIES', 1)
+    monkeypatch.setattr(network_view, '_MAX_SERIES', 1)
     view = NetworkView(scenario)
     entries = [entry for sent in messages_of(watched.run)
                for entry in view.add(sent.message, sent.time_s)]

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring import overview as overview_module
-from rhs_isac_ros.monitoring.overview import RECEIVES, RESTING, Overview
+from rhs_isac_ros.monitoring import network_state
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES
+from rhs_isac_ros.monitoring.network_state import RESTING, Overview
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
 
@@ -46,8 +47,8 @@ def test_users_have_the_results_of_their_latest_cycle(network, codebooks):
 
 
 def test_the_numbers_of_users_and_nodes_are_bounded(monkeypatch):
-    monkeypatch.setattr(overview_module, 'MAX_USERS', 2)
-    monkeypatch.setattr(overview_module, '_MAX_NODES', 2)
+    monkeypatch.setattr(network_state, 'MAX_USERS', 2)
+    monkeypatch.setattr(network_state, '_MAX_NODES', 2)
     overview = Overview()
     for number in (1, 2, 3):
         overview.add(m.GroundTruth(

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rhs_isac_ros.link import BeamPattern
-from rhs_isac_ros.monitoring.entities import ellipsoid_95, lobe_m, user_colour
+from rhs_isac_ros.monitoring.shapes import ellipsoid_95, lobe_m, user_colour
 
 # From a table of the chi-square distribution with three degrees of freedom.
 CHI_SQUARE_95 = 7.815

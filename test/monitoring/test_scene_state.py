@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring import scene_state
-from rhs_isac_ros.monitoring.scene_state import RECEIVES, SceneState
+from rhs_isac_ros.monitoring import network_state
+from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
 
 
@@ -54,7 +54,7 @@ def test_the_messages_of_a_network_complete_it(network):
     net.run_cycles(3)
     scene = SceneState()
     for sent in net.log:
-        if isinstance(sent.message, RECEIVES):
+        if isinstance(sent.message, SCENE_RECEIVES):
             scene.add(sent.message, sent.time_s)
     assert scene.complete
     assert scene.shown_user.estimate.cycle_id == 3
@@ -63,7 +63,7 @@ def test_the_messages_of_a_network_complete_it(network):
 
 
 def test_the_number_of_users_is_bounded(monkeypatch):
-    monkeypatch.setattr(scene_state, 'MAX_USERS', 2)
+    monkeypatch.setattr(network_state, 'MAX_USERS', 2)
     scene = SceneState()
     scene.add(m.GroundTruths(
         cycle_id=0, users=np.arange(1, 4), position=np.ones((3, 3)), velocity=np.zeros((3, 3))),

@@ -147,8 +147,9 @@ def test_users_are_tracked_on_request(running):
 
     def published():
         return {track.child_frame_id: track for track in tracks}
-    watch.until(lambda: set(published()) == {'user_1', 'user_2'}, 'odometry', [running.process])
-    place = published()['user_1'].pose.pose.position
+    watch.until(lambda: set(published()) == {'dynamic/user_1', 'dynamic/user_2'}, 'odometry',
+                [running.process])
+    place = published()['dynamic/user_1'].pose.pose.position
     watch.until(lambda: any(
         tuple(estimate.position) == (place.x, place.y, place.z)
         for estimate in watch.received[m.PositionEstimate] if estimate.user == 1),

@@ -46,7 +46,6 @@ CASES = {
     'of a viewer': ('network', {'forget_s': 2.0}, ['forget_s is a parameter of visualizer']),
     'of the optimizer': ('bs', ['--param', 'codebook.id:=x'], ['codebook.id']),
     'of several nodes': ('optimizer', {'seed': 1}, ['seed is a parameter of bs, channel, user,']),
-    'unknown in a file': ('bs', ['--params-file', 'unknown.yaml'], ['polcy', 'policy']),
     'no parameter file': ('bs', ['--params-file', '/no/parameters.yaml'],
                           ['/no/parameters.yaml']),
 }
@@ -149,6 +148,14 @@ def test_a_file_with_the_parameters_of_several_nodes_is_valid(executable, files,
     with pytest.raises(AssertionError, match='the executable starts'):
         importlib.import_module(f'rhs_isac_ros.nodes.{executable}').main(
             ['--ros-args', '--params-file', str(files / 'shared.yaml')])
+
+
+def test_a_foreign_entry_of_a_file_is_ignored_with_a_warning(files, never_spins, capfd):
+    with pytest.raises(AssertionError, match='the executable starts'):
+        importlib.import_module('rhs_isac_ros.nodes.bs').main(
+            ['--ros-args', '--params-file', str(files / 'unknown.yaml')])
+    warning, = (line for line in capfd.readouterr().err.splitlines() if 'WARN' in line)
+    assert 'unknown parameters are ignored: polcy (the closest is policy)' in warning
 
 
 @pytest.fixture(scope='module')

@@ -51,8 +51,9 @@ def _check_compatibility(node, space):
             for subscriber in subscribers:
                 assert qos_check_compatible(publisher.qos_profile, subscriber.qos_profile)[0] != (
                     QoSCompatibility.ERROR), topic
+    # Those of an action are hidden by the convention of ROS.
     hidden = [name for name, _ in node.get_topic_names_and_types()
-              if any(part.startswith('_') for part in name.split('/'))]
+              if any(part.startswith('_') and part != '_action' for part in name.split('/'))]
     assert not hidden
 
 

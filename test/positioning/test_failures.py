@@ -187,6 +187,7 @@ def test_the_second_search_follows_the_covariance_of_a_set(codebook):
         assert (np.linalg.norm((points - point) / radii, axis=1) < 1).any()
 
 
+@pytest.mark.slow
 def test_a_few_failures_cost_little_accuracy(codebook):
     """One Gaussian for all failures has several times the error."""
     rng = np.random.default_rng(5)

@@ -8,14 +8,12 @@ from scipy.stats import chi2
 
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.positioning.alternatives import rejection
 from rhs_isac_ros.positioning.fit import (
     FALSE_ALARM,
-    OUTSIDE_LIMIT,
-    REGION_PROBABILITY,
     FitTest,
-    outside_probability,
-    outside_test,
 )
+from rhs_isac_ros.positioning.outside import OUTSIDE_LIMIT, Outside
 
 
 @pytest.fixture(scope='module', params=['bayes', 'ml'])
@@ -49,10 +47,12 @@ def test_limits_are_quantiles_of_the_chi_square_distribution():
         assert check(limit * (1 + 1e-6 * sign)) != ''
 
 
-def test_a_quarter_of_the_weakest_direct_path_is_not_noise():
+def test_weak_signals_are_a_direct_path_or_nothing():
     """Multipath may be weaker than in the model, as in an empty hall."""
-    assert FitTest(64, 12.0).min_energy == 3.0
-    assert FitTest(64, 1e4).min_energy == FitTest(64).min_energy
+    test = FitTest(64)
+    assert test.weak_test(1.0, 0.1) == ''
+    assert test.weak_test(test.min_energy, 1e3) == ''
+    assert 'expected at most 0.723 of signals weaker' in test.weak_test(1.0, 0.8)
 
 
 def test_users_without_multipath_keep_their_fix(setting):
@@ -109,17 +109,9 @@ def test_distorted_signals_give_no_fix(setting, change):
 
 
 def test_a_user_who_is_almost_certainly_outside_is_rejected():
-    assert outside_test(OUTSIDE_LIMIT) == ''
-    assert outside_test(0.995) == (
+    assert rejection(Outside, OUTSIDE_LIMIT) == ''
+    assert rejection(Outside, 0.995) == (
         'position outside of the region: probability 0.995, expected at most 0.99')
-
-
-def test_the_probability_of_a_user_outside_follows_from_the_bayes_factor():
-    even = -np.log(REGION_PROBABILITY / (1 - REGION_PROBABILITY))
-    assert outside_probability(even) == pytest.approx(0.5)
-    assert outside_probability(even - np.log(3)) == pytest.approx(0.75)
-    assert outside_probability(-np.inf) == pytest.approx(1)
-    assert outside_probability(np.inf) == pytest.approx(0, abs=1e-300)
 
 
 def test_valid_signals_are_located_beside_invalid_ones(setting):

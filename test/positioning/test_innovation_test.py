@@ -116,6 +116,7 @@ def test_estimates_without_a_residual_or_an_expectation_are_ignored(energy, expe
     assert test.n_fixes == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('reject_outside', [False, True])
 def test_the_expectation_accounts_for_the_choice_of_the_best_mode(
         small, random_beams, reject_outside):

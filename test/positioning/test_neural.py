@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.optional import MissingLibraryError
 from rhs_isac_ros.positioning import (
     ModelError,
     Network,
@@ -19,6 +18,7 @@ from rhs_isac_ros.positioning import (
     train,
 )
 from rhs_isac_ros.positioning.__main__ import main
+from rhs_isac_ros.support.optional import MissingLibraryError
 
 pytest.importorskip('sklearn')
 PAIRS = 6000

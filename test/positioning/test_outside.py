@@ -10,9 +10,8 @@ from scipy.stats import norm
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import make_estimator, outside, simulate_pairs
 from rhs_isac_ros.positioning.coordinates import to_positions
-from rhs_isac_ros.positioning.fit import OUTSIDE_LIMIT
 from rhs_isac_ros.positioning.likelihood import Likelihood
-from rhs_isac_ros.positioning.outside import Outside, tabulate_outside
+from rhs_isac_ros.positioning.outside import OUTSIDE_LIMIT, Outside, tabulate_outside
 
 
 @pytest.fixture(scope='module')
@@ -92,6 +91,15 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
     assert found == pytest.approx(expected, abs=0.1)
 
 
+def test_a_factor_is_that_of_the_signals(setting, reference):
+    """Weak signals make directions more alike, so that more of them matter."""
+    scenario, _, arrays = setting
+    table, signals = Outside(scenario, arrays), 3 * reference[0]
+    scales = (0.02, 0.2, 1.0, 3.0)
+    expected = [table.log_evidence(scale * signals)[0] for scale in scales]
+    np.testing.assert_allclose(table.log_evidence(signals, scales), expected, rtol=0, atol=1e-3)
+
+
 def test_bessel_function():
     argument = np.concatenate([np.linspace(0, 5, 100), np.geomspace(5, 1e4, 50)])
     expected = argument + np.log(ive(0, argument))
@@ -130,6 +138,7 @@ def test_templates_cover_all_ranges():
     assert counts[1] > counts[0] < counts[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['bayes', 'ml'])
 def test_users_around_the_region_get_no_fix_or_a_probability_outside(name, shipped):
     """The shell extends from 0.5 m to 20 m."""

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import plugins
-from rhs_isac_ros.model.plugins import PluginError
 from rhs_isac_ros.positioning import Estimate, file_options, make_estimator
+from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.plugins import PluginError
 
 CODE = '''
 import numpy as np

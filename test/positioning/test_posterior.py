@@ -55,6 +55,7 @@ def posterior_moments(scenario, codebook, received, log2_points):
             np.array([np.cov(points.T, aweights=one, ddof=0) for one in weights]))
 
 
+@pytest.mark.slow
 def test_the_mean_is_that_of_the_posterior_with_the_prior_of_the_phases(codebook):
     scenario, rng = SCENARIO, np.random.default_rng(3)
     positions = scenario.sample_positions(N_PHASES, rng)
@@ -90,6 +91,7 @@ def test_only_broad_phases_are_left_to_the_samples(codebook, std_rad, is_informa
     assert BandPhases(Likelihood(scenario, codebook)).is_informative is is_informative
 
 
+@pytest.mark.slow
 def test_random_phases_of_the_bands_leave_the_moments_of_the_posterior(random_beams):
     """The modes extend over the range and overlap."""
     scenario = Scenario(

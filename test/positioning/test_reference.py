@@ -149,6 +149,7 @@ def test_errors_of_a_known_surface_are_part_of_the_model(codebook):
         check(estimate, phase, log_density(signals, mean, covariance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('changes', [
     {'user_gain_std_db': 1.0, 'timing_std_s': 1e-8}, {'band_phase_std_rad': 0.3},
     {'user_gain_std_db': 1.0, 'element_error_rms': 0.03},

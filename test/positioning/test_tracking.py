@@ -67,6 +67,7 @@ def test_position_and_velocity_of_a_walk_converge(follow):
         assert np.linalg.eigvalsh(covariance).min() > 0
 
 
+@pytest.mark.slow
 def test_errors_and_covariances_of_walks(table1_estimator, sample):
     """Over 12 walks of 3 s, errors are half of those of single phases and have 95 % regions."""
     rng = np.random.default_rng(5)

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.user_scheduler import AckFilter, parse_users
+from rhs_isac_ros.protocol.base_station_memory import AckFilter, parse_users
 
 
 @pytest.mark.parametrize(('text', 'users'), [

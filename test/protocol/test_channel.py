@@ -13,9 +13,9 @@ from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.channel import Channel, ImpairedChannel
 from rhs_isac_ros.protocol.events import SettingsOffered
-from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
+from rhs_isac_ros.protocol.settings import Impairments
 
 PLACE = np.array([8.0, -2.0, 0.5])
 

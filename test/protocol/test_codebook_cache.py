@@ -2,7 +2,7 @@
 
 import pytest
 
-from rhs_isac_ros.protocol.newest import CodebookCache
+from rhs_isac_ros.protocol.role import CodebookCache
 
 
 @pytest.fixture

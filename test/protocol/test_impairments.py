@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.channel import Channel
+from rhs_isac_ros.protocol.channel import Channel, ImpairedChannel
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
-from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
 from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.settings import Impairments
 
 
 class Repeats(PlainRole):

@@ -14,7 +14,7 @@ from rhs_isac_ros.link import Beam, CapacityReport
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import transmission
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station_memory import State
 
 STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
 # Duration of the faults, and the time within which every user must be served after it.
@@ -198,6 +198,7 @@ def check_results(net):
             assert (report.band, report.expected_bps) == (beam.band, beam.expected_bps)
 
 
+@pytest.mark.slow
 @given(faults=FAULTS, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
        retries=RETRIES)
 @explicit(faults=[], crashes=[], offers=[], changes=[], ordered=True, retries=3)
@@ -209,6 +210,7 @@ def test_guarantees_hold_under_single_faults_and_crashes(
 @given(noise=NOISE, crashes=CRASHES, offers=OFFERS, changes=CHANGES, ordered=st.booleans(),
        retries=RETRIES)
 # A late beacon and a late grant of a finished cycle.
+@pytest.mark.slow
 @explicit(noise={'seed': 1038635, 'loss': 0.02, 'doubles': 0.5, 'jitter_s': 0.5},
           crashes=[Crash(0.0, 'rhs_controller', 0.0, False), Crash(0.0, 'channel', 0.0, False)],
           offers=[], changes=[], ordered=False, retries=0)

@@ -1,6 +1,6 @@
 """Dictionaries of bounded size."""
 
-from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.role import NewestDict
 
 
 def test_the_oldest_entries_are_discarded_and_counted():

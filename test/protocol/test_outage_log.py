@@ -2,8 +2,8 @@
 
 import pytest
 
+from rhs_isac_ros.protocol.base_station_memory import OutageLog
 from rhs_isac_ros.protocol.events import LogMessage
-from rhs_isac_ros.protocol.outage_log import OutageLog
 
 
 def served(outages, cycle_id, user):

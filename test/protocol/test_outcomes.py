@@ -2,7 +2,7 @@
 
 import pytest
 
-from rhs_isac_ros.protocol.outcomes import Kind, Outcome, kind_of
+from rhs_isac_ros.protocol.events import Kind, Outcome, kind_of
 
 COUNTERS = {
     'retries': {'retry_rhs', 'retry_band', 'retry_position', 'retry_beam', 'retry_data',

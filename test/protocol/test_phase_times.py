@@ -5,26 +5,22 @@ import math
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_steps import PhaseTimes
+from rhs_isac_ros.protocol.base_station_memory import Cycle
 
 
-def test_times_count_from_the_latest_beacon():
-    times = PhaseTimes()
-    times.start(10.0)
-    times.start(20.0)
-    state = times.begin_phase(m.Phase.POSITIONING, 7, 2, 20.5)
+def test_times_count_from_the_beacon():
+    cycle = Cycle(7, user=2)
+    cycle.began_s[:2] = 20.0, 20.5
+    state = cycle.report(m.Phase.POSITIONING, 20.5)
     assert (state.cycle_id, state.user, state.phase, state.outcome, state.elapsed_s) == (
         7, 2, m.Phase.POSITIONING, '', 0.5)
     np.testing.assert_array_equal(state.began_s, [0.0, 0.5, math.nan, math.nan])
-    times.begin_phase(m.Phase.ESTIMATING, 7, 2, 21.0)
-    end = times.end_cycle('transmission_silent', 7, 2, 22.0)
-    assert (end.phase, end.outcome, end.elapsed_s) == (
-        m.Phase.BEACONING, 'transmission_silent', 2.0)
+    cycle.began_s[m.Phase.ESTIMATING] = 21.0
+    end = cycle.report(m.Phase.BEACONING, 22.0, 'transmission_silent')
+    assert (end.outcome, end.elapsed_s) == ('transmission_silent', 2.0)
     np.testing.assert_array_equal(end.began_s, [0.0, 0.5, 1.0, math.nan])
-    # The next cycle starts anew; messages returned earlier do not change.
-    times.start(30.0)
-    assert np.isnan(times.begin_phase(m.Phase.POSITIONING, 8, 1, 30.25).began_s[2:]).all()
-    assert state.began_s[1] == 0.5
+    # A message that was returned earlier does not change.
+    assert np.isnan(state.began_s[2])
 
 
 def test_a_cycle_reports_when_each_phase_began(network):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.positioning import Estimate
+from rhs_isac_ros.positioning import Estimate, TrackEstimate
 from rhs_isac_ros.positioning.innovation_test import MIN_FIXES, MIN_RETURN, WINDOW
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, SettingsOffered
@@ -89,12 +89,16 @@ class Residuals:
     name = 'residuals'
 
     def __init__(self):
-        self.factor, self.reason = 1.0, ''
+        self.factor, self.reason, self.blocked = 1.0, '', 0.0
 
     def estimate(self, received):
         if self.reason:
             nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
             return Estimate(*nothing, self.reason, 9.0, np.nan)
+        if self.blocked:
+            return TrackEstimate(PLACE, np.eye(3), blocked_probability=self.blocked,
+                                 velocity=np.zeros(3), velocity_covariance=np.eye(3),
+                                 is_predicted=True)
         return estimate(self.factor)
 
 
@@ -143,6 +147,29 @@ def test_a_user_outside_is_reported_once_and_causes_no_warning_of_the_residuals(
     assert warnings(net) == ''
     assert {message.reason for message in net.sent(m.NoFix)} == {
         'position outside of the region: probability 1'}
+
+
+def test_a_prediction_through_a_blockage_is_logged_once_with_its_probability(net, estimator):
+    net.run_cycles(1)
+    estimator.blocked = 0.97
+    net.run_cycles(3)
+    assert net['positioner'].status()['probability.blocked'] == '0.970'
+    estimator.blocked = 0.0
+    net.run_cycles(2)
+    assert texts(net) == [
+        'cycle 2: the track of user 1 predicts its position: blocked 97 %',
+        'cycle 5: user 1 is in sight again']
+    assert {message.blocked_probability for message in net.sent(m.PositionEstimate)} == {0, 0.97}
+
+
+def test_the_diagnostics_name_the_likely_cause_of_missing_fixes(net, estimator):
+    net.run_cycles(2)
+    assert 'no_fix.cause' not in net['positioner'].status()
+    estimator.reason = 'blocked: probability 0.9, expected at most 0.5'
+    net.run_cycles(3)
+    values = net['positioner'].status()
+    assert values['no_fix.cause'] == 'blocked'
+    assert values['no_fix.share'] == '3 of 5'
 
 
 def test_a_new_codebook_or_new_settings_begin_anew(net, estimator, codebooks):

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage
-from rhs_isac_ros.protocol.role import PendingSettings
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
+    PendingSettings,
     PositionerSettings,
     changes,
     describe_settings,

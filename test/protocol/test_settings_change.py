@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station import State
-from rhs_isac_ros.protocol.impairments import ImpairedChannel, Impairments
-from rhs_isac_ros.protocol.settings import PositionerSettings
+from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.channel import ImpairedChannel
+from rhs_isac_ros.protocol.settings import Impairments, PositionerSettings
 
 IN_A_CYCLE = [State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING,
               State.TRANSMITTING]

@@ -5,9 +5,8 @@ import enum
 
 import pytest
 
-from rhs_isac_ros.protocol.events import LogMessage
-from rhs_isac_ros.protocol.outcomes import Outcome
-from rhs_isac_ros.protocol.state_machine import ANY, StateMachine, Transition, rows_for
+from rhs_isac_ros.protocol.events import LogMessage, Outcome
+from rhs_isac_ros.protocol.role import ANY, StateMachine, Transition, rows_for
 
 
 class State(enum.Enum):
@@ -70,20 +69,20 @@ class Light(LightSteps):
     EVENT_NAMES = {Go: 'go', Stop: 'stop', Blink: 'blink', Wait: 'wait', Fail: 'fail',
                    Renew: 'renew'}
     TABLE = (
-        Transition(event=Go, guard=LightSteps.past, outcome=Outcome.STALE),
-        Transition(source=(State.RED,), event=Go, guard=LightSteps.fast, target=State.GREEN,
+        Transition(ANY, Go, guard=LightSteps.past, outcome=Outcome.STALE),
+        Transition((State.RED,), Go, guard=LightSteps.fast, target=State.GREEN,
                    outcome=Outcome.OVERFLOW),
-        Transition(source=(State.RED,), event=Go, target=State.GREEN,
+        Transition((State.RED,), Go, target=State.GREEN,
                    actions=(LightSteps.log, LightSteps.record, LightSteps.log)),
-        Transition(source=(State.GREEN,), event=Go, target=State.GREEN),
-        Transition(source=(State.GREEN,), event=Stop, target=State.RED),
-        Transition(source=(State.GREEN,), event=Fail, actions=(LightSteps.shorten,),
+        Transition((State.GREEN,), Go, target=State.GREEN),
+        Transition((State.GREEN,), Stop, target=State.RED),
+        Transition((State.GREEN,), Fail, actions=(LightSteps.shorten,),
                    target=State.RED),
-        Transition(source=(State.RED,), event=Wait),
-        Transition(source=(State.RED, State.GREEN), event=Blink, restart_timeout=True),
-        Transition(event=Renew, enter_again=True),
-        Transition(event=Blink, actions=(LightSteps.log,), outcome=Outcome.DUPLICATE),
-        Transition(event=Fail, actions=(LightSteps.log,), target=State.DARK,
+        Transition((State.RED,), Wait),
+        Transition((State.RED, State.GREEN), Blink, restart_timeout=True),
+        Transition(ANY, Renew, enter_again=True),
+        Transition(ANY, Blink, actions=(LightSteps.log,), outcome=Outcome.DUPLICATE),
+        Transition(ANY, Fail, actions=(LightSteps.log,), target=State.DARK,
                    outcome=Outcome.OVERFLOW),
     )
 

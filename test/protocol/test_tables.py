@@ -12,10 +12,13 @@ from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.protocol import base_station as bs
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import rhs_controller, user
-from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.base_station_memory import POLICIES, State
 from rhs_isac_ros.protocol.events import (
     CodebookOffered,
+    Kind,
+    LocateRequested,
     LogMessage,
+    Outcome,
     PauseRequested,
     PeersChanged,
     Reply,
@@ -27,10 +30,8 @@ from rhs_isac_ros.protocol.events import (
     StoodBy,
     Timeout,
 )
-from rhs_isac_ros.protocol.outcomes import Kind, Outcome
+from rhs_isac_ros.protocol.role import ANY, SAME, StateMachine, always, rows_for
 from rhs_isac_ros.protocol.settings import BaseStationSettings
-from rhs_isac_ros.protocol.state_machine import ANY, SAME, StateMachine, always, rows_for
-from rhs_isac_ros.protocol.user_scheduler import POLICIES
 
 # The first state, the states without a time-out, and the state that a role reaches if it receives
 # no messages.
@@ -39,7 +40,7 @@ ROLES = {
         machine=bs.BaseStation, initial=State.WAITING, final=State.BEACONING,
         endless={State.WAITING, State.PAUSED},
         events={Timeout, CodebookOffered, PeersChanged, SettingsOffered, StoodBy, Resumed,
-                PauseRequested, ResumeRequested, StepRequested}),
+                PauseRequested, ResumeRequested, StepRequested, LocateRequested}),
     'user': types.SimpleNamespace(
         machine=user.User, initial=user.State.DISCONNECTED, final=user.State.NO_BEACON,
         endless={user.State.DISCONNECTED, user.State.NO_BEACON}, events={Timeout, PeersChanged}),
@@ -124,7 +125,7 @@ def test_every_guard_and_action_belongs_to_a_row(role):
     steps = {name for cls in own for name, function in vars(cls).items()
              if inspect.isfunction(function)
              and [*inspect.signature(function).parameters] == ['self', 'event', 'now_s']}
-    assert steps == used - {'always', 'abandon'}
+    assert steps == used - {'always', 'abandon', 'reply'}
 
 
 def test_no_row_is_hidden_by_an_earlier_one(role):
@@ -217,7 +218,7 @@ def test_rows_that_drop_messages_precede_rows_of_single_states(name):
             acting = [other for other in earlier if other.source is not ANY]
             # A grant to another user ends the wait of this one, before any refusal.
             assert {other.guard for other in acting} <= {
-                user.Steps.other_user_granted, user.Steps.other_instance_granted}
+                user.User.other_user_granted, user.User.other_instance_granted}
 
 
 # The machines
@@ -249,7 +250,7 @@ def test_a_snapshot_shows_changes_at_every_depth(machine):
     subject = machine('bs')
     for change in (lambda: subject._users._missed.update({3: 0}),
                    lambda: subject._users._rng.random(),
-                   lambda: subject._times._began_s.__setitem__(0, 1.0),
+                   lambda: subject._cycle.began_s.__setitem__(0, 1.0),
                    lambda: subject._outages._open.put(('user_gone', 1), None),
                    lambda: subject._cycle.configured.add(9)):
         before = snapshot(subject)
@@ -295,6 +296,8 @@ def random_event(rng, subject, example, codebooks):
     """Return an event of a machine that fits its current cycle more often than not."""
     events = list(subject.EVENT_NAMES)
     kind = events[rng.integers(len(events))]
+    if kind is LocateRequested:
+        return LocateRequested(1)
     if kind in (Timeout, ResumeRequested, StepRequested):
         return kind()
     if kind is PauseRequested:

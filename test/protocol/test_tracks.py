@@ -10,7 +10,7 @@ from rhs_isac_ros.model.mobility import Waypoints
 from rhs_isac_ros.positioning import TrackEstimate, make_estimator
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.tracks import Tracks
+from rhs_isac_ros.protocol.positioner import Tracks
 
 PLACE = np.array([8.0, -2.0, 0.5])
 

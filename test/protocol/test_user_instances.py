@@ -2,7 +2,7 @@
 
 import pytest
 
-from rhs_isac_ros.protocol.user_scheduler import SILENT_S, UserInstances
+from rhs_isac_ros.protocol.base_station_memory import SILENT_S, UserInstances
 
 FIRST, SECOND = 1_700_000_000 * 10**9, 1_800_000_000 * 10**9
 SILENT = 10.0 + SILENT_S

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rhs_isac_ros.protocol.outage_log import join_users
+from rhs_isac_ros.protocol.base_station_memory import join_users
 
 
 @pytest.mark.parametrize(('users', 'text'), [

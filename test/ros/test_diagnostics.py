@@ -26,7 +26,7 @@ def test_a_report_becomes_one_status(fault, level):
 @pytest.mark.parametrize('fault', [False, True])
 def test_a_round_trip_preserves_a_report(fault):
     report = Report(fault, 'a summary', {'phase': 'resting', 'cycles.served': '3'})
-    assert list(from_ros(to_ros(report, '/a/bs', Time()))) == [('a/bs', report)]
+    assert list(from_ros(to_ros(report, '/a/bs', Time()), '/a')) == [('a/bs', report)]
 
 
 def test_a_report_is_published_once_a_second(bench, probe):

@@ -54,6 +54,8 @@ def test_a_role_runs_without_what_was_refused(bench, make, refused, capfd, role)
     if role == 'positioner':
         bench.until(lambda: topics.NAMES[m.ReceivedSignals] in refused, 'the estimator')
         assert node.publish(ESTIMATE)
+    if role == 'user':
+        node._publish_ground_truth()
     bench.spin_once()
     # Only tracks have odometry.
     assert {*member.sent, *member.received} - {topics.ODOMETRY} <= {

@@ -12,6 +12,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import markers
+from rhs_isac_ros.ros.frames import Frame
 
 STAMP = Time(sec=3)
 # From a table of the chi-square distribution with three degrees of freedom.
@@ -94,7 +95,7 @@ def test_the_region_has_the_bounds_of_the_scenario(small):
     low, high = small.scenario.roi_bounds_m
     assert of(marker.pose.position) - of(marker.scale) / 2 == pytest.approx(low)
     assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
-    assert (marker.header.frame_id, marker.header.stamp) == ('map', STAMP)
+    assert (marker.header.frame_id, marker.header.stamp) == ('rhs_link', STAMP)
     assert marker.pose.orientation.w == 1
 
 
@@ -103,7 +104,7 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     found = beam_pattern(scenario, steer(scenario, place), 10.0)
     marker = markers.beam(found, 3, STAMP)
     corners = np.array([of(point) for point in marker.points]).reshape(-1, 3, 3)
-    assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'map')
+    assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'rhs_link')
     lengths = np.linalg.norm(corners, axis=-1)
     assert lengths.max() == pytest.approx(10.0)
     tip = corners.reshape(-1, 3)[lengths.argmax()] / 10.0
@@ -117,7 +118,7 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
 
 def test_a_path_contains_its_positions_in_order():
     places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
-    path = markers.path(places, STAMP)
+    path = markers.path(places, STAMP, Frame())
     assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
     assert np.array([of(pose.pose.position) for pose in path.poses]) == pytest.approx(places)
     assert all(pose.header == path.header and pose.pose.orientation.w == 1

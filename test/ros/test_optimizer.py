@@ -83,7 +83,7 @@ def test_the_codebook_is_in_the_parameter_services(bench, client, shipped):
 def test_a_late_joiner_receives_the_codebook(bench, optimizer, probe, shipped):
     message, = latched(bench, probe)
     assert message.codebook_id == shipped.id
-    assert message.header.frame_id == 'map'
+    assert message.header.frame_id == 'rhs_link'
     assert convert.codebook_from_ros(message).id == shipped.id
 
 

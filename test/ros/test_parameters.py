@@ -10,19 +10,20 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rhs_isac_ros.model import Scenario, plugins
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.bs import BsNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.impairments import Impairments
 from rhs_isac_ros.protocol.settings import (
     BaseStationSettings,
+    Impairments,
     PositionerSettings,
     TransmissionSettings,
 )
 from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.parameters import NODES, ParameterError, declare, settings_of
+from rhs_isac_ros.support import plugins
 
 PAIRS = [(executable, p) for executable, group in NODES.items() for p in group]
 NAMES = [f'{executable}-{p.name}' for executable, p in PAIRS]
@@ -328,7 +329,8 @@ def test_a_plug_in_moves_the_user(bench, install, position, place):
 
 
 @pytest.mark.parametrize(('name', 'words'), [
-    ('fly', "mobility: 'fly', expected one of static, waypoints, random_walk or a plug-in of "
+    ('fly', "mobility: 'fly', expected one of static, waypoints, random_walk, odometry, tf or a "
+            'plug-in of '
             'rhs_isac_ros.mobilities; installed: climb, nothing'),
     ('nothing', 'mobility: entry point .*: nothing = moves:nothing of moves: returned None'),
 ])

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import plugins, simulate_received
+from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.nodes import positioner
 from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.positioning import Network, make_estimator
@@ -19,6 +19,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.support import plugins
 
 PLACE = np.array([10.0, 0.5, 0.2])
 

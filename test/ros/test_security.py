@@ -1,14 +1,18 @@
 """Enclaves by name, and one line for every error of the environment of SROS 2."""
 
+import contextlib
 import os
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from ament_index_python.packages import get_package_prefix
+from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from rhs_isac_ros.ros import security
 from rhs_isac_ros.ros.security import SecurityError, prepare
+from rhs_isac_ros.tools import param, topic
 
 EVERY = ('bs', 'lab/user_1', 'operator', 'lab/operator', 'replay', 'other')
 
@@ -91,3 +95,29 @@ def test_a_program_that_cannot_use_its_keys_ends_with_one_line(keystore, executa
     lines = [line for line in done.stderr.splitlines() if '[INFO]' not in line]
     assert len(lines) == 1
     assert lines[0].startswith(f'{executable}: error: DDS security: ')
+
+
+@pytest.mark.parametrize(('main', 'arguments'), [
+    (topic.main, ('echo', 'ack', 'rhs_isac_msgs/msg/Ack')), (topic.main, ('hz', 'ack')),
+    (param.main, ('get', 'bs', 'rest_s'))])
+def test_a_tool_that_is_refused_a_topic_or_a_service_ends_with_one_line(
+        monkeypatch, capsys, main, arguments):
+    # The exchange of keys delays the discovery of the node.
+    def refuse(*_, **__):
+        raise rclpy_implementation.RCLError('Failed to create: not allowed\nat a line')
+    node = SimpleNamespace(
+        create_subscription=refuse, create_client=refuse,
+        get_publishers_info_by_topic=lambda name: [],
+        get_topic_names_and_types=lambda: [('/ack', ['rhs_isac_msgs/msg/Ack'])],
+        get_node_names_and_namespaces=lambda: [('bs', '/')] if clock_s >= 8.0 else [])
+    clock_s = 0.0
+
+    def spin_until(condition, timeout_s=8.0):
+        nonlocal clock_s
+        clock_s += timeout_s
+        return condition()
+    session = SimpleNamespace(node=node, full_name='/{}'.format, spin_until=spin_until)
+    monkeypatch.setattr(
+        'rhs_isac_ros.tools.command.Session', lambda: contextlib.nullcontext(session))
+    assert main(arguments) == 1
+    assert capsys.readouterr().err == 'DDS security: Failed to create: not allowed\n'

@@ -9,12 +9,12 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.validate_topic_name import validate_topic_name
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.user_scheduler import MAX_USERS
+from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.recording import recorded_topics, type_name
 from rhs_isac_ros.ros.roster import ROSTER
 
-ALL = [*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK, topics.DIAGNOSTICS]
+ALL = [*topics.NAMES.values(), topics.POSITION, topics.CODEBOOK]
 
 
 def test_every_message_has_its_own_topic():

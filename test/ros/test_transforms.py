@@ -9,12 +9,13 @@ from builtin_interfaces.msg import Time
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics, transforms
+from rhs_isac_ros.ros.frames import Frame
 
 HAS_TF2 = importlib.util.find_spec('tf2_msgs') is not None
 
 
 def test_the_surface_is_at_the_origin_of_the_map():
-    transform = transforms.surface(Time(sec=3))
+    transform = transforms.surface(Frame(), Time(sec=3))
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'rhs_link')
     assert transform.header.stamp.sec == 3
     assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [0.0] * 3
@@ -22,7 +23,7 @@ def test_the_surface_is_at_the_origin_of_the_map():
 
 
 def test_a_user_is_at_its_estimate():
-    transform = transforms.user(7, np.array([9.0, -1.5, 0.25]), Time(sec=4))
+    transform = transforms.user(Frame(), 7, np.array([9.0, -1.5, 0.25]), Time(sec=4))
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'user_7')
     assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [9.0, -1.5, 0.25]
     assert [getattr(transform.transform.rotation, axis) for axis in 'xyzw'] == [0.0, 0.0, 0.0, 1.0]

@@ -110,7 +110,7 @@ class NetworkObserver(CycleObserver):
         self.invariants.add_codebook(convert.codebook_from_ros(message))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for name, report in diagnostics.from_ros(message):
+        for name, report in diagnostics.from_ros(message, self.get_namespace()):
             self.reports[name] = report
             if report.fault:
                 warnings = self.warnings.setdefault(name, [])

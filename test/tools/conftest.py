@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rhs_isac_ros.ros.processes import Processes
-from rhs_isac_ros.tools.session import Session
+from rhs_isac_ros.tools.command import Session
 
 CONFIG = Path(__file__).parents[2] / 'config'
 TIMEOUT_S = 60.0
@@ -41,7 +41,7 @@ def shared_session(network):
 def call(shared_session, capsys, monkeypatch):
     """Function that calls a tool's main function and returns output, errors and exit code."""
     monkeypatch.setattr(
-        'rhs_isac_ros.tools.session.Session', lambda: contextlib.nullcontext(shared_session))
+        'rhs_isac_ros.tools.command.Session', lambda: contextlib.nullcontext(shared_session))
 
     def result(main, *arguments):
         code = main(arguments)

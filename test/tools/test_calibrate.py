@@ -19,12 +19,13 @@ from rclpy.signals import SignalHandlerOptions
 
 from rhs_isac_ros.calibration import Calibration
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, draw_surface, simulate_received, streams
+from rhs_isac_ros.model import Scenario, draw_surface, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import Recorder
+from rhs_isac_ros.support import streams
 from rhs_isac_ros.tools.calibrate import main
 
 pytest.importorskip('mcap', reason='mcap is not installed')

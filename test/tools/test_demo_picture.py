@@ -9,7 +9,7 @@ from matplotlib.text import Annotation
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.tools.demo_picture import compose, draw
+from rhs_isac_ros.tools.pictures import compose_cycles, draw_cycles
 
 COVARIANCE_M2 = np.array([[0.6, 0.2, 0.05], [0.2, 0.3, 0.0], [0.05, 0.0, 0.1]])
 
@@ -38,7 +38,7 @@ def make_cycles(n, n_users=2, first=2):
 @pytest.fixture(scope='module')
 def panels():
     """The axes of the legend, the view and the errors of 20 cycles, after drawing."""
-    figure = compose(make_cycles(20), Scenario())
+    figure = compose_cycles(make_cycles(20), Scenario())
     FigureCanvasAgg(figure).draw()
     return figure.axes
 
@@ -88,17 +88,17 @@ def test_the_legend_has_every_mark_and_user(panels):
 def test_an_ellipse_beyond_all_bounds_does_not_shrink_the_region():
     cycles = make_cycles(2)
     object.__setattr__(cycles[0].estimate, 'covariance_m2', 1e6 * np.eye(3))
-    view = compose(cycles, Scenario()).axes[1]
+    view = compose_cycles(cycles, Scenario()).axes[1]
     assert np.diff(view.get_xlim()) < 25
 
 
 def test_of_many_cycles_and_users_only_some_are_labelled():
-    legend, view, _ = compose(make_cycles(150, n_users=9), Scenario()).axes
+    legend, view, _ = compose_cycles(make_cycles(150, n_users=9), Scenario()).axes
     assert [text.get_text() for text in legend.get_legend().get_texts()][-2:] == [
         'user 6', 'and 3 more users']
     assert len([text for text in view.texts if text.get_text().isdigit()]) == 50
 
 
 def test_a_single_cycle_is_drawn(tmp_path):
-    draw(make_cycles(1), Scenario(), tmp_path / 'demo.svg')
+    draw_cycles(make_cycles(1), Scenario(), tmp_path / 'demo.svg')
     assert (tmp_path / 'demo.svg').read_bytes().startswith(b'<?xml')

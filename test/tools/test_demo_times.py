@@ -5,8 +5,8 @@ import time
 import pytest
 
 from rhs_isac_ros.executables import STARTED_S
-from rhs_isac_ros.tools import demo_times
-from rhs_isac_ros.tools.demo_times import Parts, process_age_s
+from rhs_isac_ros.tools import demo
+from rhs_isac_ros.tools.demo import Parts, process_age_s
 
 # That of the clock in which the system gives the start of a process.
 RESOLUTION_S = 0.02
@@ -19,7 +19,7 @@ def test_the_text_contains_the_total_and_each_part():
     assert parts.text() == 'time: 2.25 s (imports 0.50, cycles 1.75)'
 
 
-@pytest.mark.skipif(not demo_times._STAT_FILE.exists(), reason='this system has no /proc')
+@pytest.mark.skipif(not demo._STAT_FILE.exists(), reason='this system has no /proc')
 def test_the_age_of_a_process_grows_with_time():
     def look():
         return time.monotonic(), process_age_s(), time.monotonic()
@@ -38,5 +38,5 @@ def test_the_age_is_unknown_without_a_readable_start(tmp_path, monkeypatch, text
     file = tmp_path / 'stat'
     if text is not None:
         file.write_text(text)
-    monkeypatch.setattr(demo_times, '_STAT_FILE', file)
+    monkeypatch.setattr(demo, '_STAT_FILE', file)
     assert process_age_s() is None

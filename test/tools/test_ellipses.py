@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.tools.ellipses import ellipse_95, limits_with_ellipses
+from rhs_isac_ros.tools.pictures import ellipse_95, limits_with_ellipses
 
 # From a table of the chi-square distribution with two degrees of freedom.
 CHI_SQUARE_95 = 5.991

@@ -9,7 +9,7 @@ from geometry_msgs.msg import Point, Point32, PolygonStamped
 from std_msgs.msg import Header, MultiArrayDimension, MultiArrayLayout
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.tools.message_text import Layout, as_csv, as_yaml
+from rhs_isac_ros.tools.topic import Layout, as_csv, as_yaml
 
 ARRAY = ros.RealArray(shape=array.array('I', [2, 2]), data=array.array('d', [1.0, -2.5, 0.0, 4.0]))
 

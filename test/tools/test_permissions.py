@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
+from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.recording import Recorder, recorded_topics
-from rhs_isac_ros.tools import permissions
+from rhs_isac_ros.tools import permissions, replay
 from rhs_isac_ros.tools.calibrate import CalibratorNode, PilotLog
+from rhs_isac_ros.tools.command import Session
 from rhs_isac_ros.tools.record import RecorderNode
-from rhs_isac_ros.tools.republish import RepublisherNode
-from rhs_isac_ros.tools.session import Session
+from rhs_isac_ros.tools.replay import RepublisherNode
 from rhs_isac_ros.tools.snapshot import SnapshotNode
-from rhs_isac_ros.tools.view_node import ViewNode
-from rhs_isac_ros.tools.view_posteriors import Posteriors
+from rhs_isac_ros.tools.view import Posteriors, ViewNode
 from rhs_isac_ros.tools.watch import WatchNode
 
 ROOT = Path(__file__).parents[2]
@@ -48,11 +48,13 @@ def test_the_command_prints_the_policy_of_two_users(capsys):
 
 def test_a_user_may_not_publish_messages_of_another_role():
     allowed = rules(permissions.policy(users=3))
-    own = {f'/{name}' for name in (
-        'ack', 'data', 'ground_truth', 'ground_truths', 'pilot', topics.DIAGNOSTICS)}
-    common = {'/parameter_events', '/rosout'}
+    common = {'/ack', '/data', '/ground_truth', '/ground_truths', '/pilot', topics.DIAGNOSTICS,
+              '/parameter_events', '/rosout'}
+    odometry = {f'/{topics.TRUE_ODOMETRY.format(user=user)}' for user in (1, 2, 3)}
+    assert allowed['/users']['publish'] == common | odometry
     for number in (1, 2, 3):
-        assert allowed[f'/user_{number}']['publish'] == own | common
+        own = f'/{topics.TRUE_ODOMETRY.format(user=number)}'
+        assert allowed[f'/user_{number}']['publish'] == {*common, own}
         assert not allowed[f'/user_{number}']['request']
 
 
@@ -60,10 +62,12 @@ def test_only_the_operator_may_set_parameters_of_other_nodes():
     allowed = rules(permissions.policy())
     assert {'/bs/set_parameters', '/bs/pause', '/users/set_parameters'} <= allowed.pop(
         '/operator')['request']
+    del allowed['/replay']
     for path, rights in allowed.items():
         assert rights['request'] <= {'/optimizer/get_parameters'}
         if path != '/network':
-            assert {name.rpartition('/')[0] for name in rights['reply']} <= {path}
+            assert {name.rpartition('/')[0] for name in rights['reply']} <= {
+                path, *(('/locate/_action',) if path == '/bs' else ())}
 
 
 def test_the_process_of_a_network_has_the_permissions_of_its_nodes():
@@ -77,11 +81,14 @@ def test_the_process_of_a_network_has_the_permissions_of_its_nodes():
         assert united <= allowed['/network'][right]
 
 
-def test_a_replay_may_publish_every_recorded_topic_and_read_none():
-    replay = rules(permissions.policy(users=2))['/replay']
-    assert replay['publish'] == {
-        *(f'/{name}' for name in recorded_topics()), '/parameter_events', '/rosout'}
-    assert not replay['subscribe'] | replay['reply'] | replay['request']
+def test_a_replay_may_publish_every_recorded_topic_and_be_an_optimizer():
+    allowed = rules(permissions.policy(users=2))
+    rights, optimizer = allowed['/replay'], allowed['/optimizer']
+    assert rights['publish'] == {
+        *(f'/{name.lstrip("/")}' for name in recorded_topics()), '/parameter_events', '/rosout'}
+    assert rights['subscribe'] == optimizer['subscribe']
+    assert rights['reply'] == optimizer['reply']
+    assert {name.rpartition('/')[0] for name in rights['request']} == {'/optimizer'}
 
 
 def test_the_tools_use_no_more_than_the_permissions_of_the_operator(tmp_path):
@@ -93,13 +100,17 @@ def test_the_tools_use_no_more_than_the_permissions_of_the_operator(tmp_path):
         view._follow_track(1)
         nodes = [session.node, view, CalibratorNode(PilotLog(scenario), scenario), WatchNode(),
                  SnapshotNode(scenario), RecorderNode(Recorder(tmp_path / 'a.mcap', scenario)),
-                 RepublisherNode([], [*recorded_topics()], 1.0)]
+                 RepublisherNode([], [*recorded_topics()], 1.0),
+                 replay._optimizer(scenario, Codebook.load(default_codebook_file()))]
+        # It creates the clients.
+        replay._optimizer_present(nodes[-2])
         for node in nodes:
-            rights = allowed['/replay' if node.get_name() == 'replay' else '/operator']
+            rights = allowed['/replay' if node in nodes[-2:] else '/operator']
             for right, find in [
                     ('publish', session.node.get_publisher_names_and_types_by_node),
                     ('subscribe', session.node.get_subscriber_names_and_types_by_node),
-                    ('reply', session.node.get_service_names_and_types_by_node)]:
+                    ('reply', session.node.get_service_names_and_types_by_node),
+                    ('request', session.node.get_client_names_and_types_by_node)]:
                 names = {name for name, _ in find(node.get_name(), '/')}
                 assert names <= rights[right], (node.get_name(), right)
                 assert right != 'publish' or '/rosout' in names
@@ -114,7 +125,7 @@ def test_publishers_are_those_of_the_documentation():
     assert len(rows) >= len(topics.NAMES)
     for topic, publishers in rows:
         allowed_to = {path[1:].replace('user_1', 'user') for path, rights in allowed.items()
-               if f'/{topic}' in rights['publish']}
+               if f'/{topic.lstrip("/")}' in rights['publish']}
         # These stand for several nodes, or publish for others.
         allowed_to -= {'network', 'users', 'replay'}
         reporting = {path[1:].replace('user_1', 'user') for path in allowed} - {
@@ -148,6 +159,9 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
         del allowed[f'{space}/{name}']
     if not importlib.util.find_spec('tf2_msgs'):
         allowed[f'{space}/visualizer']['publish'] -= {topics.TF, topics.TF_STATIC}
+    # This node has two of the four users.
+    allowed[f'{space}/users']['publish'] -= {
+        f'{space}/{topics.TRUE_ODOMETRY.format(user=user)}' for user in (1, 2)}
 
     def used(path):
         node, name = watch.node, path.rpartition('/')[2]

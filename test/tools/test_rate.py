@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from rhs_isac_ros.tools.rate import Rate
+from rhs_isac_ros.tools.topic import Rate
 
 
 def numbers(report):

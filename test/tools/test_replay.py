@@ -14,12 +14,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import Scenario, plugins
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import Recorder, read
+from rhs_isac_ros.support import plugins
 from rhs_isac_ros.tools.replay import errors_m, load, main, tracked_errors_m
 
 pytest.importorskip('mcap', reason='mcap is not installed')

@@ -6,9 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model.optional import MissingLibraryError
-from rhs_isac_ros.monitoring import charts, network_view
-from rhs_isac_ros.monitoring.entities import (
+from rhs_isac_ros.monitoring import network_view
+from rhs_isac_ros.monitoring.shapes import (
     Boxes,
     Clear,
     Ellipsoids,
@@ -20,6 +19,7 @@ from rhs_isac_ros.monitoring.entities import (
     Series,
     Text,
 )
+from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.tools.rerun_stream import RerunStream, blueprint
 
 rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/_view)')
@@ -123,7 +123,7 @@ def test_the_layout_contains_every_chart_and_the_scene():
             collect(child)
     collect(blueprint().root_container)
     assert sorted(shown) == sorted([
-        *charts.TITLES, network_view.WORLD, network_view.MODES, network_view.POSITIONING,
+        *network_view.TITLES, network_view.WORLD, network_view.MODES, network_view.POSITIONING,
         network_view.TRANSMISSION, network_view.LOG])
 
 

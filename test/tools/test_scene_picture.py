@@ -11,11 +11,10 @@ from matplotlib.text import Text
 
 from rhs_isac_ros.link import steer
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.pictures import look
-from rhs_isac_ros.monitoring.scene_state import SceneState
+from rhs_isac_ros.monitoring.network_state import SceneState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.tools.ellipses import ellipse_95
-from rhs_isac_ros.tools.scene_picture import compose, draw
+from rhs_isac_ros.support.pictures import look
+from rhs_isac_ros.tools.pictures import compose_scene, draw_scene, ellipse_95
 
 POSITIONS = np.array([[9.0, 2.0, 0.5], [12.0, -3.0, -0.4], [7.0, -1.0, 0.0]])
 COVARIANCE_M2 = np.array([[0.6, 0.2, 0.05], [0.2, 0.3, 0.0], [0.05, 0.0, 0.1]])
@@ -58,7 +57,7 @@ def texts(figure, monkeypatch):
 
 def test_no_text_is_cut_off_or_overlaps_another(monkeypatch):
     scenario = Scenario()
-    figure = compose(make_scene(scenario, 12), scenario)
+    figure = compose_scene(make_scene(scenario, 12), scenario)
     found = texts(figure, monkeypatch)
     assert {'$x$ [m]', '$y$ [m]', '$z$ [m]', 'user 8', 'and 4 more', 'surface'} <= {
         text for text, _ in found}
@@ -71,7 +70,7 @@ def test_no_text_is_cut_off_or_overlaps_another(monkeypatch):
 
 def test_both_views_show_region_users_and_ellipses_at_their_positions():
     scenario = Scenario()
-    figure = compose(make_scene(scenario, 3), scenario)
+    figure = compose_scene(make_scene(scenario, 3), scenario)
     views = {axes.get_ylabel(): axes for axes in figure.axes}
     low, high = scenario.roi_bounds_m
     for label, plane in (('$y$ [m]', [0, 1]), ('$z$ [m]', [0, 2])):
@@ -99,13 +98,14 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
 def test_both_views_contain_the_ellipses_up_to_a_quarter_of_the_region():
     scenario = Scenario()
     scene = make_scene(scenario, 3)
-    without = [(axes.get_xlim(), axes.get_ylim()) for axes in compose(scene, scenario).axes[:2]]
+    without = [(axes.get_xlim(), axes.get_ylim())
+               for axes in compose_scene(scene, scenario).axes[:2]]
     at_the_edge = np.array([14.5, 4.5, 0.8])
     for variances, expected in (((0.6, 0.4, 0.1), None), ((1e6, 1e6, 1e6), (17.5, 7.5))):
         scene.add(m.PositionEstimate(
             cycle_id=200, user=1, codebook_id='cb', position=at_the_edge,
             covariance_m2=np.diag(variances), crlb_m2=0.1, estimator='bayes', latency_s=0.01), 0.0)
-        views = compose(scene, scenario).axes[:2]
+        views = compose_scene(scene, scenario).axes[:2]
         # The same scale, and room for the whole region and the surface.
         assert views[0].get_xlim() == views[1].get_xlim()
         for axes, (xlim, ylim) in zip(views, without, strict=True):
@@ -130,7 +130,7 @@ def test_title_beam_and_lobe_are_of_one_user():
     beam = steer(scenario, POSITIONS[2])
     scene.add(m.Beam(cycle_id=102, user=2, codebook_id='cb', band=0, analog=beam.analog,
                      digital=beam.digital, expected_bps=1e6), 0.0)
-    figure = compose(scene, scenario)
+    figure = compose_scene(scene, scenario)
     assert [text.get_text() for text in figure.texts] == ['cycle 102, user 2']
     (polar,) = [axes for axes in figure.axes if axes.name == 'polar']
     assert polar.get_title() == 'data beam to user 2, band 0 [dB]'
@@ -144,7 +144,7 @@ def test_title_beam_and_lobe_are_of_one_user():
 
 def test_users_differ_by_marker():
     scenario = Scenario()
-    figure = compose(make_scene(scenario, 3), scenario)
+    figure = compose_scene(make_scene(scenario, 3), scenario)
     (above,) = [axes for axes in figure.axes if axes.get_ylabel() == '$y$ [m]']
     assert [line.get_marker() for line in above.lines if line.get_markeredgecolor() == 'black'
             and line.get_marker() != 'None'] == [look(user).marker for user in range(3)]
@@ -155,7 +155,7 @@ def test_the_surface_is_shown_from_the_front(small):
     configuration = np.linspace(0, 1, small.scenario.n_elements)[None]
     scene.add(m.RhsConfiguration(
         cycle_id=1, mode=m.Mode.TRANSMISSION, band=0, codebook_id='cb', analog=configuration), 0.0)
-    figure = compose(scene, small.scenario)
+    figure = compose_scene(scene, small.scenario)
     (axes,) = [axes for axes in figure.axes if axes.images]
     # Rows increase with z, and columns with y, which points to the right from the front.
     assert axes.images[0].origin == 'lower'
@@ -165,7 +165,7 @@ def test_the_surface_is_shown_from_the_front(small):
 
 
 def test_an_empty_scene_is_drawn(small, tmp_path):
-    draw(SceneState(), small.scenario, tmp_path / 'scene.png')
+    draw_scene(SceneState(), small.scenario, tmp_path / 'scene.png')
     assert (tmp_path / 'scene.png').read_bytes().startswith(b'\x89PNG')
     assert [path.name for path in tmp_path.iterdir()] == ['scene.png']
 
@@ -174,7 +174,7 @@ def test_a_rectangular_surface_has_its_shape_and_orientation():
     """Twelve columns along y and three rows along z, over a flat region."""
     scenario = Scenario(elements_per_side=(12, 3), roi_size_m=(10.0, 10.0, 0.0))
     scene = make_scene(scenario, 1)
-    (axes,) = [axes for axes in compose(scene, scenario).axes if axes.images]
+    (axes,) = [axes for axes in compose_scene(scene, scenario).axes if axes.images]
     (image,) = axes.images
     expected = scene.configuration.analog.mean(axis=0).reshape(3, 12)
     np.testing.assert_array_equal(image.get_array(), expected)

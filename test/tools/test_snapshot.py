@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.monitoring.scene_state import SceneState
+from rhs_isac_ros.monitoring.network_state import SceneState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.snapshot import SnapshotNode, write_picture
 

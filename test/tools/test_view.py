@@ -19,14 +19,11 @@ from rclpy.serialization import serialize_message
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import network_view
-from rhs_isac_ros.monitoring.entities import user_colour
+from rhs_isac_ros.monitoring.shapes import user_colour
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.recording import Recorder, RecordingError, read, schema, type_name
 from rhs_isac_ros.tools.replay import load
-from rhs_isac_ros.tools.view import main
-from rhs_isac_ros.tools.view_node import ViewNode
-from rhs_isac_ros.tools.view_posteriors import Posteriors
-from rhs_isac_ros.tools.view_recording import entries
+from rhs_isac_ros.tools.view import Posteriors, ViewNode, entries, main
 
 CONFIG = Path(__file__).parents[2] / 'config'
 SCRIPT = CONFIG.parent / 'scripts' / 'view'
@@ -100,7 +97,7 @@ def paths(rerun):
 
 def test_a_running_network_is_shown(shared_session, monkeypatch):
     """Including the modes and the bound, which the view computes itself, in the background."""
-    monkeypatch.setattr('rhs_isac_ros.tools.view_posteriors._N_PHASES', 4)
+    monkeypatch.setattr('rhs_isac_ros.tools.view._N_PHASES', 4)
     found = {}
 
     def write(entries):
@@ -187,7 +184,7 @@ def test_without_a_network_the_view_names_domain_and_namespace_and_writes_no_fil
 
 
 def test_a_recording_of_another_scenario_is_named(recording, monkeypatch):
-    monkeypatch.setattr('rhs_isac_ros.tools.view_posteriors._N_PHASES', 4)
+    monkeypatch.setattr('rhs_isac_ros.tools.view._N_PHASES', 4)
     scenario = dataclasses.replace(
         Scenario.from_yaml(CONFIG / 'quick.yaml'), refractive_index=2.0)
     with pytest.raises(RecordingError, match=f'recorded with scenario .*, expected {scenario.id}'):

@@ -6,10 +6,11 @@ import re
 import numpy as np
 import pytest
 
-from rhs_isac_ros.monitoring.overview import RECEIVES, Overview
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES
+from rhs_isac_ros.monitoring.network_state import Overview
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.tools.watch_view import render
+from rhs_isac_ros.tools.watch import render
 
 console = pytest.importorskip('rich.console', reason='rich is not installed')
 

@@ -80,10 +80,9 @@ class SurfaceModel:
 
         low, high = scenario.roi_bounds_m
         nodes = low + qmc.Sobol(3, seed=0).random(2**_LOG2_NODES) * (high - low)
-        covariance: np.ndarray = np.mean([
+        return np.mean([
             self.error_covariance_at(scenario, beams, block).mean(axis=0)
             for block in np.split(nodes, len(nodes) // _BLOCK)], axis=0)
-        return covariance
 
     def error_covariance_at(
             self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
@@ -128,8 +127,7 @@ class ElementErrors(SurfaceModel):
         if analog.shape[-1:] != self.gains.shape:
             raise ValueError(f'surface: {len(self.gains)} elements, expected N_E = '
                              f'{analog.shape[-1]} as in the configurations')
-        coefficients: np.ndarray = np.where(np.isnan(self.stuck), analog, self.stuck) * self.gains
-        return coefficients
+        return np.where(np.isnan(self.stuck), analog, self.stuck) * self.gains
 
     def applied_beams(self, beams: Beamforming) -> AppliedBeams:
         """Return the beamforming in effect."""
@@ -224,9 +222,8 @@ def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
     """Compute the factors times the weights S B, complex128 [T, N_B, N_SB F, N_E]."""
     weights = np.matmul(beams.digital, onboard_matrix(scenario))
     factors = error_factors(scenario, beams.analog)
-    radiation: np.ndarray = (factors[:, :, None] * weights).reshape(
+    return (factors[:, :, None] * weights).reshape(
         len(factors), scenario.n_bands, -1, scenario.n_elements)
-    return radiation
 
 
 @functools.lru_cache(maxsize=16)

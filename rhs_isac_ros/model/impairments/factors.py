@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rhs_isac_ros.model import plugins
 from rhs_isac_ros.model.geometry import subband_frequencies_hz
 from rhs_isac_ros.model.impairments.elements import ElementErrors, draw_surface, has_errors
 from rhs_isac_ros.model.impairments.impairment import Impairment, Linear, Nuisance, Scope
 from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.support import plugins
 
 # Nepers per decibel of an amplitude gain.
 _NEPERS_PER_DB = np.log(10) / 20

@@ -68,8 +68,7 @@ class Impairment:
 
     def values(self, scenario: Scenario, white: np.ndarray) -> np.ndarray:
         """Map standard normal numbers [n, q] to values of n independent draws, [n, q]."""
-        result: np.ndarray = white @ self.linear(scenario).root.T
-        return result
+        return white @ self.linear(scenario).root.T
 
 
 class Nuisance:

@@ -19,7 +19,8 @@ from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, ambiguity
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.codebook.provenance import Provenance
 from rhs_isac_ros.codebook.sampling import draw_confusable, sobol
-from rhs_isac_ros.model import MeasurementModel, Scenario, streams
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.support import streams
 
 SHIPPED = Path(__file__).parents[3] / 'config' / 'codebook_ambiguity.yaml'
 HELD_OUT_PAIRS = 32_768

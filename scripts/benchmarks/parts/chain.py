@@ -1,6 +1,7 @@
-"""The chain of messages of a cycle: when each was sent, and how long its sender took."""
+"""The chain of messages of a cycle: when each arrived, and how long its sender took."""
 
 import collections
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -38,36 +39,36 @@ class ChainObserver(Node):
     def __init__(self) -> None:
         super().__init__('chain_observer')
         self.served = 0
-        self._stored: dict[type[m.Message], list[bytes]] = collections.defaultdict(list)
+        # With the time of arrival of each [s]: stamps are those of measurements.
+        self._stored: dict[type[m.Message], list[tuple[bytes, float]]] = (
+            collections.defaultdict(list))
         for kind in KINDS:
             self.create_subscription(
                 convert.ros_type(kind), topics.NAMES[kind], self._store(kind), qos.OBSERVATION,
                 raw=True, event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
 
     def _store(self, kind: type[m.Message]) -> Callable[[bytes], None]:
-        stored = self._stored[kind]
-        if kind is not m.ProtocolState:
-            return stored.append
+        stored, ends = self._stored[kind], kind is m.ProtocolState
 
         def store(content: bytes) -> None:
-            stored.append(content)
+            stored.append((content, time.monotonic()))
             # The outcome is text on the wire.
-            self.served += b'served' in content
+            self.served += ends and b'served' in content
         return store
 
     def cycles(self) -> list['Cycle']:
         """Return the cycles that were served and are complete, in order."""
         cycles: dict[int, Cycle] = {}
         for kind, stored in self._stored.items():
-            for content in stored:
+            for content, arrived_s in stored:
                 message = convert.from_bytes(kind, content)
                 cycle = cycles.setdefault(message.cycle_id, Cycle())
-                cycle.sent.append((_stamp_s(content), message))
+                cycle.sent.append((arrived_s, message))
         return [cycle for _, cycle in sorted(cycles.items()) if cycle.is_served]
 
 
 class Cycle:
-    """The messages of a cycle with the times at which they were sent [s]."""
+    """The messages of a cycle with the times at which they arrived [s]."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[float, m.Message]] = []
@@ -136,9 +137,3 @@ def _step(message: m.Message) -> str | None:
         case m.Data():
             return f'{name} {message.direction.name.lower()} {message.stage.name.lower()}'
     return name
-
-
-def _stamp_s(content: bytes) -> float:
-    """Return the stamp of the header [s], the first eight bytes after the representation."""
-    seconds, nanoseconds = np.frombuffer(content, '<u4', 2, 4).tolist()
-    return float(seconds) + 1e-9 * nanoseconds

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from parts.optimizer_growth import GROWTH
 
-from rhs_isac_ros.model.pictures import (
+from rhs_isac_ros.support.pictures import (
     PAGE_IN,
     label_decades,
     look,

@@ -7,7 +7,7 @@ from parts.fig4_claims import CLAIMS, OWN, Finding, findings
 from parts.fig4_results import SCANS, Results
 
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.model.files import write_whole
+from rhs_isac_ros.support.files import write_whole
 
 
 def write(results: Results, options: argparse.Namespace) -> None:

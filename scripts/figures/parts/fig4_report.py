@@ -8,8 +8,8 @@ from parts import fig4_claims
 from parts.fig4_results import Condition, Results
 
 from rhs_isac_ros.experiments import markdown_table
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.model.pictures import (
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.pictures import (
     PAGE_IN,
     look,
     new_panels,

@@ -9,7 +9,8 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook, directional_codebook, random_codebook
 from rhs_isac_ros.experiments.resampling import Replicates, replicate
-from rhs_isac_ros.model import Scenario, streams
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import streams
 
 NEURAL = 'neural'
 # Rows whose codebook differs between trials.

@@ -19,11 +19,11 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments import JobError, markdown_table
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario, simulate_received
-from rhs_isac_ros.model.files import write_whole
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.process_network import watch
 
 # Users of a network, each at its own position, and cycles for each.

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.experiments.sweep_jobs import OPTIMIZE, with_power
+from rhs_isac_ros.experiments.sweep import OPTIMIZE, with_power
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import input_file, positive_int
+from rhs_isac_ros.support.arguments import input_file, positive_int
 
 # Seed of all positions, signals and codebooks.
 SEED = 1

@@ -13,7 +13,7 @@ from rhs_isac_ros.model.impairments import (
     impairments_of,
     nuisance_of,
 )
-from rhs_isac_ros.model.plugins import IMPAIRMENTS, PluginError
+from rhs_isac_ros.support.plugins import IMPAIRMENTS, PluginError
 
 N_PHASES = 1500
 

@@ -16,18 +16,18 @@ from rclpy.executors import ExternalShutdownException
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.command_line import check_domain
+from rhs_isac_ros.ros.early import use_discovery_profile
+from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
     output_file,
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
-from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.process_network import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.chaos.trial import ChaosError, Trial

@@ -15,7 +15,7 @@ from visualization_msgs.msg import MarkerArray
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.newest import NewestDict
+from rhs_isac_ros.protocol.role import NewestDict
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.processes import Processes

@@ -5,7 +5,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping
 
-from rhs_isac_ros.protocol.impairments import Impairments
+from rhs_isac_ros.protocol.settings import Impairments
 from rhs_isac_ros.ros.processes import Processes
 from system.chaos.trial import ChaosError
 from system.observer import NetworkObserver

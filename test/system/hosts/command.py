@@ -14,16 +14,16 @@ from rclpy.signals import SignalHandlerOptions
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.arguments import (
+from rhs_isac_ros.ros.early import discovery_profile_file
+from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
     integer,
     output_file,
     positive_float,
 )
-from rhs_isac_ros.model.files import write_whole
-from rhs_isac_ros.ros.early import discovery_profile_file
-from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.process_network import (
     add_network_options,
     check_users,

@@ -1,0 +1,368 @@
+"""Optimisation methods: each minimises a `Search` and returns the reason for stopping.
+
+The default is L-BFGS-B, on samples of the pairs if there are many, and followed by exchanges if
+the elements have a few amplitudes. The alternating, direct and genetic methods are those of the
+paper and its references.
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rhs_isac_ros.codebook.problem import Search
+from rhs_isac_ros.support.optional import optional_import
+from rhs_isac_ros.support.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    # A slow import, which loading a codebook does not need.
+    from scipy.optimize import OptimizeResult
+
+# Number of corrections that approximate the Hessian. Evaluations are expensive, so more
+# corrections than SciPy's default of 10 pay off.
+_MEMORY = 30
+
+
+def minimize_lbfgs(search: Search) -> str:
+    """Minimise with L-BFGS-B; return the reason for stopping."""
+    result = run_lbfgs(search.value_and_gradient, search.start, search.bounds, search.max_steps,
+                       search.on_step)
+    return 'max_steps reached' if result.status == 1 else str(result.message)
+
+
+def run_lbfgs(
+        objective: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray,
+        bounds: Sequence[tuple[float, float] | tuple[None, None]], max_steps: int,
+        on_step: Callable[[], None], memory: int = _MEMORY) -> OptimizeResult:
+    """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
+
+    The result does not depend on the unit of the function, whose value is positive. `on_step` is
+    called after each of at most `max_steps` steps; `memory` is the number of corrections.
+    """
+    # A slow import, which loading a codebook does not need.
+    from scipy.optimize import minimize
+
+    # SciPy multiplies the corrections with a BLAS of its own.
+    one_blas_thread.find_libraries()
+    unit = 0.0
+
+    def relative(variables: np.ndarray) -> tuple[float, np.ndarray]:
+        """Divide by the value at the start: SciPy's tolerances are for values of about 1."""
+        nonlocal unit
+        value, gradient = objective(variables)
+        unit = unit or value or 1.0
+        return value / unit, gradient / unit
+
+    result = minimize(
+        relative, start, jac=True, method='L-BFGS-B', bounds=bounds,
+        callback=lambda _: on_step(),
+        options={'maxiter': max_steps, 'maxfun': 20 * max_steps,
+                 'maxcor': memory, 'ftol': 1e-10, 'gtol': 1e-10})
+    result.fun, result.jac = unit * result.fun, unit * result.jac
+    return result
+
+
+# Objectives with fewer pairs are evaluated with all of them.
+FEWEST_PAIRS = 4096
+# Pairs and steps of each round; the last one is repeated. The first steps change the codebook, and
+# with it the pairs that matter, more than later ones, which need a more accurate objective.
+_ROUNDS = (2048, 200), (4096, 600)
+# Corrections that approximate the Hessian: an evaluation takes little longer than their products.
+_SAMPLED_MEMORY = 100
+# Scale of the combining vectors, to which the objective is more sensitive than to configurations.
+_DIGITAL_SCALE = 0.3
+
+
+def minimize_sampled(search: Search) -> str:
+    """Minimise with L-BFGS-B on samples of the pairs; return the reason for stopping.
+
+    Each round draws a sample for the codebook that the previous one has found, as
+    `PairwiseErrorCost.sample` describes, and evaluates this codebook with all pairs. The search
+    ends with its steps, or with a round that does not lower the objective.
+    """
+    variables, left = search.start, search.max_steps
+    value = search.value_m2
+    for n_pairs, steps in itertools.chain(_ROUNDS, itertools.repeat(_ROUNDS[-1])):
+        done, variables = _round(search, variables, min(n_pairs, search.n_pairs),
+                                 min(steps, left))
+        left -= done
+        if not left:
+            return 'max_steps reached'
+        if search.value_m2 >= value:
+            return 'no round of steps on a sample lowers the objective'
+        value = search.value_m2
+    raise AssertionError('unreachable: the rounds are endless')
+
+
+def _round(search: Search, start: np.ndarray, n_pairs: int, steps: int) -> tuple[int, np.ndarray]:
+    """Minimise on one sample; return the number of steps and the point."""
+    scale = np.ones(len(start))
+    scale[search.n_analog:] = _DIGITAL_SCALE
+    sample = search.sample(start, n_pairs)
+    lowest, point, done = np.inf, start, 0
+
+    def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal lowest, point
+        value, gradient = sample(scaled * scale)
+        if value < lowest:
+            lowest, point = value, scaled * scale
+        return value, gradient * scale
+
+    def on_step() -> None:
+        nonlocal done
+        # The last step of the round is recorded with the value of all pairs.
+        if done:
+            search.on_step()
+        done += 1
+
+    try:
+        run_lbfgs(objective, start / scale, search.bounds, steps, on_step, _SAMPLED_MEMORY)
+    finally:
+        # Also after Ctrl-C, and when the sample has used the evaluations but one.
+        if done:
+            search.value(point)
+            search.on_step()
+    return done, point
+
+
+# Weights of the penalty in its rounds, relative to the objective.
+_WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0)
+# Shares of the steps for the relaxation and for the penalty; the exchange takes the rest.
+_RELAXED, _PENALISED = 0.4, 0.3
+# Steps on the combining vectors after each sweep.
+_DIGITAL_STEPS = 20
+# A sweep ends after as many exchanges in a row that do not lower the objective.
+_MAX_FAILURES = 64
+
+
+def minimize_levels(search: Search) -> str:
+    """Minimise over levels of the amplitudes, and return the reason for stopping.
+
+    Three phases follow each other. The first treats amplitudes as continuous. The second adds
+    the penalty sin^2(pi (L - 1) c), which is zero at the L levels, with growing weight: the
+    amplitudes reach the levels while the others and the combining vectors adapt. The third
+    exchanges single amplitudes for neighbouring levels, in the order of the gradient, as long as
+    that lowers the objective. L-BFGS-B minimises over continuous variables.
+    """
+    share = _PENALISED / len(_WEIGHTS)
+    variables, left = search.start, search.max_steps
+    for weight, part in ((0.0, _RELAXED), *((weight, share) for weight in _WEIGHTS)):
+        # At least one step in each round, unless none is left.
+        steps = min(max(int(part * search.max_steps), 1), left)
+        if steps:
+            variables = _penalised(search, variables, weight, steps)
+        left -= steps
+    return _exchange(search, variables, left)
+
+
+def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int) -> np.ndarray:
+    """Minimise the relaxed objective plus a penalty, and evaluate the rounded result."""
+    scale = weight * search.relaxed_value_and_gradient(start)[0] / search.n_analog
+    frequency = np.pi * (search.amplitude_levels - 1)
+
+    def objective(variables: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = search.relaxed_value_and_gradient(variables)
+        phase = frequency * variables[:search.n_analog]
+        gradient[:search.n_analog] += scale * frequency * np.sin(2 * phase)
+        return value + scale * float(np.sum(np.sin(phase)**2)), gradient
+
+    result = run_lbfgs(objective, start, search.bounds, max_steps, search.on_step)
+    search.value(result.x)
+    return result.x
+
+
+def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
+    """Exchange single amplitudes until none lowers the objective; return why it stopped."""
+    levels = search.amplitude_levels - 1
+    variables = np.array(variables)
+    variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels
+    while max_steps > 0:
+        used, variables = _digital(search, variables, min(_DIGITAL_STEPS, max_steps))
+        max_steps -= used
+        if max_steps:
+            variables, exchanged, n_failed, n_allowed = _sweep(search, variables, max_steps)
+            max_steps -= exchanged
+            if not exchanged:
+                return ('no exchange of an amplitude lowers the objective'
+                        if n_failed == n_allowed else
+                        f'none of the {n_failed} most promising exchanges lowers the objective')
+    return 'max_steps reached'
+
+
+def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
+           ) -> tuple[np.ndarray, int, int, int]:
+    """Exchange amplitudes in the order of the expected decrease.
+
+    Returns the variables, the number of exchanges, that of failures since the last one, and that
+    of the amplitudes that have a level in the direction of descent.
+    """
+    levels = search.amplitude_levels - 1
+    value, gradient = search.value_and_gradient(variables)
+    by_analog = gradient[:search.n_analog]
+    target = variables[:search.n_analog] - np.sign(by_analog) / levels
+    # A level outside of [0, 1] does not exist.
+    allowed = np.flatnonzero((target > -0.5 / levels) & (target < 1 + 0.5 / levels))
+    exchanged = failures = 0
+    for entry in allowed[np.argsort(-np.abs(by_analog[allowed]))]:
+        if failures == _MAX_FAILURES or exchanged == max_exchanges:
+            break
+        candidate = np.array(variables)
+        candidate[entry] = np.rint(target[entry] * levels) / levels
+        lower = search.value(candidate)
+        if lower < value:
+            value, variables = lower, candidate
+            exchanged, failures = exchanged + 1, 0
+            search.on_step()
+        else:
+            failures += 1
+    return variables, exchanged, failures, len(allowed)
+
+
+def _digital(search: Search, start: np.ndarray, max_steps: int) -> tuple[int, np.ndarray]:
+    """Minimise over the combining vectors alone; return the steps taken and the variables."""
+    steps = 0
+
+    def objective(digital: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = search.value_and_gradient(
+            np.concatenate([start[:search.n_analog], digital]))
+        return value, gradient[search.n_analog:]
+
+    def on_step() -> None:
+        nonlocal steps
+        steps += 1
+        search.on_step()
+
+    result = run_lbfgs(objective, start[search.n_analog:], search.bounds[search.n_analog:],
+                       max_steps, on_step)
+    return steps, np.concatenate([start[:search.n_analog], result.x])
+
+
+# Initial weight of the barrier; the objective is scaled to 1 at the start.
+_BARRIER = 1e-3
+_MIN_STEP = 1e-9
+
+
+def minimize_interior_point(
+        search: Search, start: np.ndarray, free: np.ndarray, max_steps: int) -> np.ndarray:
+    """Minimise over the free variables: barrier, trust region, conjugate gradients, BFGS Hessian.
+
+    SciPy's `trust-constr` is the algorithm of Byrd, Hribar and Nocedal that the paper cites.
+
+    Parameters
+    ----------
+    start
+        Initial values of all variables, float64 [n].
+    free
+        Mask of the variables to change, bool [n].
+
+    Returns
+    -------
+    numpy.ndarray
+        The best point evaluated, `start` included, float64 [n].
+    """
+    # A slow import, which loading a codebook does not need.
+    from scipy.optimize import BFGS, Bounds, minimize
+
+    # SciPy multiplies the Hessian matrix with a BLAS of its own.
+    one_blas_thread.find_libraries()
+    best = search.value_and_gradient(start)[0], np.array(start)
+    scale = best[0]
+
+    def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal best
+        variables = np.array(start)
+        variables[free] = values
+        value, gradient = search.value_and_gradient(variables)
+        if value < best[0]:
+            best = value, variables
+        return value / scale, gradient[free] / scale
+
+    steps = evaluations = 0
+
+    def on_iteration(_: np.ndarray, state: OptimizeResult) -> bool:
+        """Count the iterations that moved; SciPy also reports the start and each new barrier."""
+        nonlocal steps, evaluations
+        if steps < max_steps and state.nfev > max(evaluations, 1):
+            steps, evaluations = steps + 1, state.nfev
+            search.on_step()
+        return steps >= max_steps
+
+    low, high = np.array(search.bounds, dtype=float).T[:, free]
+    bounded = not np.isnan(low).all()
+    bounds = Bounds(np.nan_to_num(low, nan=-np.inf), np.nan_to_num(high, nan=np.inf))
+    with warnings.catch_warnings():
+        # SciPy warns whenever a step leaves the gradient, and so the Hessian, unchanged.
+        warnings.filterwarnings('ignore', 'delta_grad == 0.0', UserWarning)
+        minimize(
+            objective, start[free], jac=True, hess=BFGS(), method='trust-constr',
+            bounds=bounds if bounded else None,
+            callback=on_iteration,
+            options={'maxiter': 2 * max_steps + 50, 'initial_barrier_parameter': _BARRIER,
+                     'initial_barrier_tolerance': _BARRIER, 'sparse_jacobian': True,
+                     'gtol': 1e-10, 'xtol': _MIN_STEP})
+    return best[1]
+
+
+# N_itr of Table I. With the default number of steps, each sub-problem takes N_us = 50 steps.
+_ITERATIONS = 4
+
+
+def minimize_alternating(search: Search) -> str:
+    """Implements Algorithm 1. Solve sP1 and sP2 alternately until neither changes a variable.
+
+    The steps of the search are divided evenly among the 2 N_itr sub-problems. Returns the reason
+    for stopping.
+    """
+    steps = max(search.max_steps // (2 * _ITERATIONS), 1)
+    remaining = search.max_steps
+    analog = np.arange(len(search.start)) < search.n_analog
+    variables = search.start
+    for iteration in range(_ITERATIONS):
+        previous = variables
+        for free in (analog, ~analog):
+            if remaining < steps:
+                return 'max_steps reached'
+            variables = minimize_interior_point(search, variables, free, steps)
+            remaining -= steps
+        if np.array_equal(previous, variables):
+            return f'iteration {iteration + 1} changed nothing'
+    return f'{_ITERATIONS} iterations of 2 x {steps} steps'
+
+
+def minimize_direct(search: Search) -> str:
+    """Minimise over analog and digital beamforming jointly; return the reason for stopping."""
+    minimize_interior_point(
+        search, search.start, np.ones(len(search.start), bool), search.max_steps)
+    return f'{search.max_steps} steps at most'
+
+
+# The default of the implementation that the paper uses, for more than five variables.
+_POPULATION = 200
+
+
+def minimize_genetic(search: Search) -> str:
+    """Minimise with pymoo's genetic algorithm, one step a generation.
+
+    Only the direction of a combining vector matters, so its unscaled parts are searched in
+    [-1, 1]. The first generation contains the start. Returns the reason for stopping; raises
+    MissingLibraryError if pymoo is not installed.
+    """
+    with optional_import("method 'genetic'", extra='genetic'):
+        from pymoo.algorithms.soo.nonconvex.ga import GA
+        from pymoo.optimize import minimize
+        from pymoo.problems.functional import FunctionalProblem
+
+    n_variables = len(search.start)
+    low = np.where(np.arange(n_variables) < search.n_analog, 0.0, -1.0)
+    problem = FunctionalProblem(n_variables, search.value, xl=low, xu=1.0)
+    first = problem.xl + (problem.xu - problem.xl) * search.rng.uniform(
+        size=(_POPULATION, n_variables))
+    first[0] = np.clip(search.start, problem.xl, problem.xu)
+    seed = int(search.rng.integers(2**31))
+    minimize(problem, GA(pop_size=_POPULATION, sampling=first), ('n_gen', search.max_steps),
+             callback=lambda _: search.on_step(), seed=seed)
+    return f'{search.max_steps} generations'

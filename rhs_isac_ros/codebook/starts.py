@@ -1,0 +1,129 @@
+"""Codebooks without optimisation: random ones, and focused beams that scan the region of interest.
+
+Both are benchmarks of the paper and starts of its optimisation. The paper leaves open which points
+the beams are focused on. `SCANS` contains three readings.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.surface import matched_configuration, on_levels, onboard_matrix
+
+
+def random_codebook(scenario: Scenario, rng: np.random.Generator) -> Codebook:
+    """Draw random configurations: the paper's `Random`, and the start of its optimisation.
+
+    C is uniform in [0, 1], or rounded to the levels of the elements; every entry of S is
+    sqrt(P_max / (K N_SB)).
+    """
+    sizes = scenario.sizes
+    analog = on_levels(scenario, rng.uniform(size=[sizes[s] for s in ('N_B', 'F', 'N_E')]))
+    weight = np.sqrt(scenario.max_power_w / (sizes['K'] * sizes['N_SB']))
+    digital = np.full((sizes['N_B'], sizes['N_SB'], sizes['F'], sizes['K']), weight, complex)
+    return Codebook(analog, digital, provenance='random')
+
+
+def directional_codebook(
+        scenario: Scenario, rng: np.random.Generator | None = None,
+        scan: str = 'width') -> Codebook:
+    """Focus each of the N_B F frames on a point of a scan: the paper's `Directional`.
+
+    The configuration follows the holographic principle. The weights of each sub-band are the
+    matched filter of the resulting feed signals, with equal power in all sub-bands. The codebook
+    is deterministic; `rng` is unused.
+
+    Parameters
+    ----------
+    scan
+        One of `SCANS`: ``width``, N_B F points across the width of the region; ``width_per_band``,
+        F points across the width, the same in each band; ``grid``, F points of a grid across width
+        and height, the same in each band.
+
+    Raises
+    ------
+    ValueError
+        If the scan is unknown, or a gain pattern of the scenario is zero at a focal point.
+    """
+    if scan not in SCANS:
+        raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')
+    sizes = scenario.sizes
+    analog = np.empty([sizes[s] for s in ('N_B', 'F', 'N_E')])
+    digital = np.empty([sizes[s] for s in ('N_B', 'N_SB', 'F', 'K')], complex)
+    points = SCANS[scan](scenario)
+    for band, onboard in enumerate(onboard_matrix(scenario)):
+        for frame, los in enumerate(los_gain(scenario, points[:, band], band)):
+            analog[band, frame] = on_levels(
+                scenario, matched_configuration(los, onboard))
+            feeds = np.einsum('jkm,jm->jk', onboard, analog[band, frame] * los)
+            if not los.any():
+                raise ValueError(
+                    f'element_gain, user_gain: no gain at {points[frame, band].tolist()} m, '
+                    f'expected a positive one at the focal point of frame {frame}, band {band}')
+            digital[band, :, frame] = np.conj(feeds) / np.linalg.norm(
+                feeds, axis=1, keepdims=True)
+    return Codebook(analog, digital * np.sqrt(scenario.max_power_w / sizes['N_SB']),
+                    provenance='directional' if scan == 'width' else f'directional, {scan}')
+
+
+def width_points(scenario: Scenario) -> np.ndarray:
+    """Return N_B F focal points across the width of the region, float64 [F, N_B, 3] [m].
+
+    Consecutive points belong to different bands, so that each band scans the whole width. Frames
+    alternate between points below and above mid-height: beams that were all symmetric in height
+    could not distinguish up from down.
+    """
+    n_frames, n_bands = scenario.n_frames, scenario.n_bands
+    across = _centers(n_frames * n_bands).reshape(n_frames, n_bands)
+    return _points(scenario, across, _alternating(n_frames)[:, None])
+
+
+def width_points_per_band(scenario: Scenario) -> np.ndarray:
+    """Return F focal points across the width, the same in each band, float64 [F, N_B, 3] [m].
+
+    Frames alternate between points below and above mid-height.
+    """
+    n_frames = scenario.n_frames
+    return _points(scenario, _centers(n_frames)[:, None], _alternating(n_frames)[:, None])
+
+
+def grid_points(scenario: Scenario) -> np.ndarray:
+    """Return a grid of F focal points, the same in each band, float64 [F, N_B, 3] [m].
+
+    The number of rows is the largest divisor of F up to its root: four frames make a grid of
+    2 x 2 points.
+    """
+    n_frames = scenario.n_frames
+    rows = max(n for n in range(1, n_frames + 1) if n_frames % n == 0 and n * n <= n_frames)
+    row, column = np.divmod(np.arange(n_frames), n_frames // rows)
+    return _points(scenario, _centers(n_frames // rows)[column][:, None],
+                   _centers(rows)[row][:, None])
+
+
+SCANS: Mapping[str, Callable[[Scenario], np.ndarray]] = {
+    'width': width_points, 'width_per_band': width_points_per_band, 'grid': grid_points}
+
+
+def _points(scenario: Scenario, across: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Place points at fractions of width and height that broadcast to [F, N_B], at mid-depth."""
+    low, high = scenario.roi_bounds_m
+    points = np.tile((low + high) / 2, (scenario.n_frames, scenario.n_bands, 1))
+    points[..., 1] = low[1] + (high[1] - low[1]) * across
+    points[..., 2] = low[2] + (high[2] - low[2]) * up
+    return points
+
+
+def _centers(n: int) -> np.ndarray:
+    """Return the centres of n equal parts of the interval from 0 to 1."""
+    return (np.arange(n) + 0.5) / n
+
+
+def _alternating(n_frames: int) -> np.ndarray:
+    return np.where(np.arange(n_frames) % 2, 0.75, 0.25)
+
+
+STARTS: Mapping[str, Callable[[Scenario, np.random.Generator], Codebook]] = {
+    'random': random_codebook, 'directional': directional_codebook}

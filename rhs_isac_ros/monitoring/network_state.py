@@ -1,0 +1,328 @@
+"""State of a network, from its messages: `Overview` for a terminal, `SceneState` for a scene."""
+
+import collections
+import dataclasses
+import math
+
+import numpy as np
+
+from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog
+from rhs_isac_ros.monitoring.role_statistics import Report
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station_memory import MAX_USERS, State
+
+RESTING = 'resting'
+# The rate of cycles is averaged over this time [s].
+_RATE_WINDOW_S = 10.0
+# Nodes report once a second; a node is silent after three missing reports.
+_REPORT_TIMEOUT_S = 3.5
+_MAX_NODES = 4096
+# Longer strings of digits in a report are not counts.
+_MAX_DIGITS = 18
+
+
+@dataclasses.dataclass(frozen=True)
+class Fix:
+    """The latest complete cycle of a user.
+
+    Attributes
+    ----------
+    received_s
+        Arrival of the cycle's last message [s].
+    """
+
+    cycle: CompleteCycle
+    received_s: float
+
+    @property
+    def sigma_m(self) -> float:
+        """Square root of the trace of the covariance [m], to compare with the error."""
+        return math.sqrt(max(np.trace(self.cycle.estimate.covariance_m2), 0.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class NodeStatus:
+    """The latest report of a node.
+
+    Attributes
+    ----------
+    received_s
+        Time at which the report arrived [s].
+    """
+
+    report: Report
+    received_s: float
+
+    def silent(self, now_s: float) -> bool:
+        """Return whether reports are missing at the time `now_s` [s]."""
+        return now_s - self.received_s > _REPORT_TIMEOUT_S
+
+    def counts(self, section: str) -> dict[str, int]:
+        """Return the nonzero counts of a section, ``dropped`` or ``cycles``, by reason."""
+        counts = {key.partition('.')[2]: int(value) for key, value in self.report.values.items()
+                  if key.startswith(f'{section}.') and value.isdecimal()
+                  and len(value) <= _MAX_DIGITS}
+        return {reason: count for reason, count in counts.items() if count}
+
+
+class Overview:
+    """Phase, cycles, users and nodes of one network.
+
+    Attributes
+    ----------
+    phase
+        Phase of the base station, `RESTING` between cycles; empty before the first message.
+    phase_began_s
+        Time at which the phase began [s].
+    cycle_id, user
+        Current cycle and its user; 0 where unknown.
+    codebook_id
+        Codebook of the latest signals; empty before the first.
+    served, given_up
+        Numbers of cycles that ended.
+    last_failure
+        Description of the last cycle that was given up; empty if there was none.
+    began_s
+        Arrival of the first message [s]; infinite before.
+    users
+        Latest fix of each user by id; None before the first. At most `MAX_USERS`, because the ids
+        come from messages.
+    nodes
+        Status of each node by name; at most 4096, for the same reason.
+    """
+
+    def __init__(self) -> None:
+        self.phase = ''
+        self.phase_began_s = math.nan
+        self.cycle_id = self.user = self.served = self.given_up = 0
+        self.codebook_id = self.last_failure = ''
+        self.users: dict[int, Fix | None] = {}
+        self.nodes: dict[str, NodeStatus] = {}
+        self._log = CycleLog()
+        self._served_s: collections.deque[float] = collections.deque()
+        self.began_s = math.inf
+
+    def add(self, message: m.Message, now_s: float) -> None:
+        """Add a message of one of the types `cycle_log.RECEIVES` that arrived at `now_s` [s]."""
+        self.began_s = min(self.began_s, now_s)
+        match message:
+            case m.Beacon():
+                self._set_phase(m.Phase.BEACONING.name.lower(), message.cycle_id, 0, now_s)
+            case m.ProtocolState():
+                phase = RESTING if message.outcome else message.phase.name.lower()
+                self._set_phase(phase, message.cycle_id, message.user, now_s)
+                if message.outcome:
+                    self._end_cycle(message, now_s)
+            case m.GroundTruth():
+                if len(self.users) < MAX_USERS:
+                    self.users.setdefault(message.user, None)
+            case m.ReceivedSignals():
+                self.codebook_id = message.codebook_id
+        self._log.add(message, now_s)
+        for cycle in self._log.complete:
+            if cycle.user in self.users or len(self.users) < MAX_USERS:
+                self.users[cycle.user] = Fix(cycle, now_s)
+        self._log.clear()
+
+    def add_report(self, node: str, report: Report, now_s: float) -> None:
+        """Add the report of a node that arrived at `now_s` [s]."""
+        if node in self.nodes or len(self.nodes) < _MAX_NODES:
+            self.nodes[node] = NodeStatus(report, now_s)
+
+    def rate_hz(self, now_s: float) -> float:
+        """Return the rate of served cycles [Hz].
+
+        It is averaged over the last ten seconds, or since the first message if that is less.
+        """
+        begin_s = max(now_s - _RATE_WINDOW_S, self.began_s)
+        while self._served_s and self._served_s[0] < begin_s:
+            self._served_s.popleft()
+        return len(self._served_s) / (now_s - begin_s) if now_s > begin_s else 0.0
+
+    @property
+    def fixes(self) -> list[Fix]:
+        """The fixes of all users that have one, the latest first."""
+        return sorted(filter(None, self.users.values()), key=lambda fix: -fix.received_s)
+
+    @property
+    def paused(self) -> bool:
+        """Whether a base station has reported a pause since the current phase began."""
+        return any(status.report.values.get('phase') == State.PAUSED.value
+                   and not status.received_s < self.phase_began_s
+                   for status in self.nodes.values())
+
+    def _set_phase(self, phase: str, cycle_id: int, user: int, now_s: float) -> None:
+        if (phase, cycle_id) != (self.phase, self.cycle_id):
+            self.phase_began_s = now_s
+        self.phase, self.cycle_id, self.user = phase, cycle_id, user
+
+    def _end_cycle(self, state: m.ProtocolState, now_s: float) -> None:
+        if state.outcome == 'served':
+            self.served += 1
+            self._served_s.append(now_s)
+        else:
+            self.given_up += 1
+            user = f' of user {state.user}' if state.user else ''
+            self.last_failure = f'cycle {state.cycle_id}{user}: {state.outcome}'
+
+
+# Messages that the state of the scene needs.
+SCENE_RECEIVES = (m.RhsConfiguration, m.GroundTruth, m.GroundTruths, m.PositionEstimate, m.Beam)
+# Maximum number of positions in a path, and minimum distance between consecutive true positions.
+_MAX_PATH_LENGTH = 200
+_MIN_STEP_M = 0.05
+
+
+def _empty_path() -> collections.deque[np.ndarray]:
+    return collections.deque(maxlen=_MAX_PATH_LENGTH)
+
+
+@dataclasses.dataclass
+class UserState:
+    """Position, estimate and paths of one user.
+
+    Attributes
+    ----------
+    user
+        Id of the user.
+    updated_s
+        Arrival of the latest message about the user [s].
+    truth
+        The true position; None before the first.
+    estimate
+        The latest estimate; None before the first.
+    true_path, estimated_path
+        True positions and estimates, float64 [3] [m] each, the latest last.
+    """
+
+    user: int
+    updated_s: float
+    truth: m.GroundTruth | None = None
+    estimate: m.PositionEstimate | None = None
+    true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=_empty_path)
+    estimated_path: collections.deque[np.ndarray] = dataclasses.field(
+        default_factory=_empty_path)
+    # The true position at which the pilots of the latest cycle were sent.
+    _cycle_truth: m.GroundTruth | None = None
+
+    @property
+    def error_m(self) -> float:
+        """Distance of the estimate from the true position of its cycle [m]; NaN if unknown."""
+        truth, estimate = self._cycle_truth, self.estimate
+        if truth is None or estimate is None or truth.cycle_id != estimate.cycle_id:
+            return math.nan
+        return float(np.linalg.norm(estimate.position - truth.position))
+
+    def add_truth(self, truth: m.GroundTruth) -> None:
+        """Add a true position."""
+        self.truth = truth
+        if truth.cycle_id:
+            self._cycle_truth = truth
+        if not self.true_path or math.dist(self.true_path[-1], truth.position) > _MIN_STEP_M:
+            self.true_path.append(truth.position)
+
+    def add_estimate(self, estimate: m.PositionEstimate) -> None:
+        """Add an estimate."""
+        self.estimate = estimate
+        self.estimated_path.append(estimate.position)
+
+
+class SceneState:
+    """The surface, its beam, and the users.
+
+    Attributes
+    ----------
+    configuration
+        Configuration that the surface applies; None before the first message.
+    beam
+        Latest beam of a transmission; None before the first.
+    users
+        Users by id, at most `MAX_USERS`, because the ids come from messages. Further users are
+        ignored until others are discarded.
+    """
+
+    def __init__(self) -> None:
+        self.configuration: m.RhsConfiguration | None = None
+        self.beam: m.Beam | None = None
+        self.users: dict[int, UserState] = {}
+        self._beam_s = math.nan
+
+    def add(self, message: m.Message, now_s: float) -> None:
+        """Add a message of one of the types `SCENE_RECEIVES` that arrived at `now_s` [s]."""
+        match message:
+            case m.RhsConfiguration():
+                self.configuration = message
+            case m.Beam():
+                self.beam, self._beam_s = message, now_s
+            case m.GroundTruth():
+                self._add_truth(message, now_s)
+            case m.GroundTruths():
+                for truth in message.each():
+                    self._add_truth(truth, now_s)
+            case m.PositionEstimate():
+                if state := self._updated_user(message.user, now_s):
+                    state.add_estimate(message)
+
+    def _add_truth(self, truth: m.GroundTruth, now_s: float) -> None:
+        if state := self._updated_user(truth.user, now_s):
+            state.add_truth(truth)
+
+    def _updated_user(self, user: int, now_s: float) -> UserState | None:
+        """Return the state of a user; None if it is new and there are too many."""
+        state = self.users.get(user)
+        if state is None:
+            if len(self.users) >= MAX_USERS:
+                return None
+            state = self.users[user] = UserState(user, now_s)
+        state.updated_s = now_s
+        return state
+
+    def discard_stale(self, before_s: float) -> list[int]:
+        """Discard users and a beam without a message since `before_s` [s]; return the users.
+
+        A beam to a discarded user is discarded as well.
+        """
+        stale = [user for user, state in self.users.items() if state.updated_s < before_s]
+        for user in stale:
+            del self.users[user]
+        if self.beam is not None and (self.beam.user in stale or self._beam_s < before_s):
+            self.beam = None
+        return stale
+
+    @property
+    def drawable(self) -> bool:
+        """Whether the surface, an estimate and its beam are known."""
+        return self.configuration is not None and self.shown_beam is not None
+
+    @property
+    def complete(self) -> bool:
+        """Whether the scene is drawable and every user has an estimate."""
+        return self.drawable and not self.without_estimate
+
+    @property
+    def without_estimate(self) -> list[int]:
+        """Ids of the users without an estimate, sorted."""
+        return sorted(user for user, state in self.users.items() if not state.estimate)
+
+    @property
+    def shown_user(self) -> UserState | None:
+        """The user of the latest cycle with an estimate and a beam, or else with an estimate.
+
+        None if there is no estimate.
+        """
+        if self.beam is not None:
+            state = self.users.get(self.beam.user)
+            if state and state.estimate and state.estimate.cycle_id == self.beam.cycle_id:
+                return state
+        cycles = [(state.estimate.cycle_id, user) for user, state in self.users.items()
+                  if state.estimate]
+        return self.users[max(cycles)[1]] if cycles else None
+
+    @property
+    def shown_beam(self) -> m.Beam | None:
+        """The beam of the cycle in which the shown user was estimated; None if it is unknown."""
+        shown = self.shown_user
+        if shown is None or shown.estimate is None or self.beam is None:
+            return None
+        same = (shown.user, shown.estimate.cycle_id) == (self.beam.user, self.beam.cycle_id)
+        return self.beam if same else None

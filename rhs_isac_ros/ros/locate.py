@@ -1,0 +1,150 @@
+"""The action ``locate`` of the base station: the position of one user, once."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.node import Node
+from rclpy.task import Future
+
+from rhs_isac_msgs.action import Locate
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.endpoints import create_or_refuse, steady_timer
+from rhs_isac_ros.ros.topics import LOCATE
+
+_DEFAULT_TIMEOUT_S = 10.0
+_MAX_TIMEOUT_S = 3600.0
+
+
+@dataclasses.dataclass(eq=False)
+class _Goal:
+    """A goal in progress, and the cycle that serves its user; 0 before it."""
+
+    handle: Any
+    future: Future
+    cycle_id: int = 0
+
+
+class LocateServer:
+    """Serves the action, from the messages that the base station sends and receives.
+
+    Parameters
+    ----------
+    request
+        Called with the user of each accepted goal.
+    pose
+        Converts an estimate to a pose.
+    max_users
+        Highest number of a user.
+    """
+
+    def __init__(
+            self, node: Node, request: Callable[[int], None],
+            pose: Callable[[m.PositionEstimate], PoseWithCovarianceStamped],
+            max_users: int) -> None:
+        self._node, self._request, self._pose = node, request, pose
+        self._max_users = max_users
+        self._goals: list[_Goal] = []
+        self._server = create_or_refuse(node, f'action {LOCATE}', lambda: ActionServer(
+            node, Locate, LOCATE, self._execute, goal_callback=self._accept,
+            cancel_callback=self._cancel))
+
+    def observe(self, message: Any) -> None:
+        """Process a message of the base station."""
+        match message:
+            case m.ProtocolState(phase=m.Phase.BEACONING):
+                for goal in self._of(message):
+                    if goal.cycle_id == message.cycle_id:
+                        # The next cycle of the user tries again.
+                        goal.cycle_id = 0
+                        self._request(message.user)
+                        self._feed_back(goal, m.Phase.BEACONING)
+            case m.ProtocolState():
+                for goal in self._of(message):
+                    if message.phase is m.Phase.POSITIONING:
+                        goal.cycle_id = message.cycle_id
+                    if goal.cycle_id == message.cycle_id:
+                        self._feed_back(goal, message.phase)
+            case m.PositionEstimate() | m.NoFix():
+                for goal in self._of(message):
+                    if goal.cycle_id == message.cycle_id:
+                        self._finish(goal, message)
+
+    def destroy(self, delay_s: float = 0.0) -> None:
+        """Abort all goals, and withdraw the action.
+
+        Parameters
+        ----------
+        delay_s
+            Time in which the node sends the results of the goals [s]; without it, it sends none.
+        """
+        for goal in list(self._goals):
+            self._end(goal, 'the base station ends or stands by')
+        server, self._server = self._server, None
+        if server and delay_s:
+            self._later(delay_s, server.destroy)
+        elif server:
+            server.destroy()
+
+    def _of(self, message: Any) -> list[_Goal]:
+        return [goal for goal in self._goals if goal.handle.request.user == message.user]
+
+    def _accept(self, request: Locate.Goal) -> GoalResponse:
+        valid = 1 <= request.user <= self._max_users and 0 <= request.timeout_s <= _MAX_TIMEOUT_S
+        if not valid:
+            self._node.get_logger().warning(
+                f'{LOCATE}: user {request.user}, timeout_s {request.timeout_s:g}, expected a user '
+                f'from 1 to {self._max_users} and a timeout from 0 to {_MAX_TIMEOUT_S:g} s')
+        return GoalResponse.ACCEPT if valid else GoalResponse.REJECT
+
+    def _cancel(self, handle: Any) -> CancelResponse:
+        for goal in self._goals:
+            if goal.handle.goal_id == handle.goal_id:
+                # Afterwards, when the handle has the state CANCELING.
+                self._later(0.0, functools.partial(self._end, goal, 'canceled'))
+        return CancelResponse.ACCEPT
+
+    async def _execute(self, handle: Any) -> Locate.Result:
+        goal = _Goal(handle, Future())
+        self._goals.append(goal)
+        timeout_s = handle.request.timeout_s or _DEFAULT_TIMEOUT_S
+        timer = self._later(timeout_s, functools.partial(
+            self._end, goal, f'no position within {timeout_s:g} s'))
+        self._feed_back(goal, m.Phase.BEACONING)
+        self._request(handle.request.user)
+        result = await goal.future
+        self._node.destroy_timer(timer)
+        return result
+
+    def _later(self, delay_s: float, callback: Callable[[], None]) -> Any:
+        def once() -> None:
+            timer.cancel()
+            callback()
+        timer = steady_timer(self._node, max(delay_s, 1e-3), once)
+        return timer
+
+    def _feed_back(self, goal: _Goal, phase: m.Phase) -> None:
+        goal.handle.publish_feedback(Locate.Feedback(phase=int(phase), cycle_id=goal.cycle_id))
+
+    def _finish(self, goal: _Goal, message: m.PositionEstimate | m.NoFix) -> None:
+        if isinstance(message, m.NoFix):
+            self._end(goal, f'no fix: {message.reason}')
+        else:
+            self._end(goal, '', Locate.Result(
+                pose=self._pose(message), cycle_id=message.cycle_id))
+
+    def _end(self, goal: _Goal, reason: str, result: Locate.Result | None = None) -> None:
+        """End a goal: with a result, canceled if that was requested, or aborted."""
+        if goal not in self._goals:
+            return
+        self._goals.remove(goal)
+        if goal.handle.is_cancel_requested:
+            goal.handle.canceled()
+        elif result:
+            goal.handle.succeed()
+        else:
+            goal.handle.abort()
+        goal.future.set_result(result or Locate.Result(reason=reason))

@@ -1,0 +1,1 @@
+"""Files, command lines, pictures, plug-ins, random streams and threads: nothing of the subject."""

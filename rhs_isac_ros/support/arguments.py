@@ -1,0 +1,169 @@
+"""Command lines: a parser with errors of one line, types of arguments, and exit codes."""
+
+import argparse
+import math
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rhs_isac_ros.support.files import check_writable
+from rhs_isac_ros.support.pictures import picture_format
+
+# Highest seed, which is that of the ROS parameter.
+_MAX_SEED = 2**31 - 1
+# Any larger number of things to do is a mistake.
+_MAX_COUNT = 10**9
+
+
+class ArgumentParser(argparse.ArgumentParser):
+    """A parser whose usage errors are one line with a hint; options cannot be abbreviated."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **{'allow_abbrev': False, **options})
+
+    def error(self, message: str) -> NoReturn:
+        """Print an error as one line, and exit with code 2."""
+        # An argument may contain line breaks.
+        text = ' '.join(message.split())
+        self.exit(2, f'{self.prog}: error: {text}; see {self.prog} --help\n')
+
+
+class HelpFormatter(
+        argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Shows defaults, and keeps the lines of the description and of the text below."""
+
+
+def integer(low: int, high: int = _MAX_COUNT) -> Callable[[str], int]:
+    """Return a type for argparse: integers from `low` to `high`."""
+    def parse(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f'{text!r}, expected an integer') from None
+        if number < low:
+            raise argparse.ArgumentTypeError(f'{text}, expected at least {low}')
+        if number > high:
+            raise argparse.ArgumentTypeError(f'{text}, expected at most {high}')
+        return number
+    return parse
+
+
+def positive_int(text: str) -> int:
+    """Parse an integer of at least 1, or raise argparse.ArgumentTypeError."""
+    return integer(1)(text)
+
+
+def seed(text: str) -> int:
+    """Parse a seed, which is valid as a ROS parameter too, or raise ArgumentTypeError."""
+    return integer(0, _MAX_SEED)(text)
+
+
+def positive_float(text: str) -> float:
+    """Parse a finite number above 0, or raise argparse.ArgumentTypeError."""
+    return _number(text, lambda number: 0 < number < math.inf, 'a positive number')
+
+
+def nonnegative_float(text: str) -> float:
+    """Parse a finite number of at least 0, or raise argparse.ArgumentTypeError."""
+    return _number(text, lambda number: 0 <= number < math.inf, 'a number of at least 0')
+
+
+def share(text: str) -> float:
+    """Parse a number from 0 to 1, or raise argparse.ArgumentTypeError."""
+    return _number(text, lambda value: 0 <= value <= 1, 'a number from 0 to 1')
+
+
+def _number(text: str, valid: Callable[[float], bool], expected: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not valid(number):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected {expected}')
+    return number
+
+
+def interval(text: str) -> tuple[float, float]:
+    """Parse LOW:HIGH, positive numbers in ascending order, or raise ArgumentTypeError."""
+    low, colon, high = text.partition(':')
+    try:
+        numbers = positive_float(low), positive_float(high)
+    except argparse.ArgumentTypeError:
+        numbers = math.inf, 0.0
+    if not colon or numbers[0] > numbers[1]:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected LOW:HIGH with 0 < LOW <= HIGH')
+    return numbers
+
+
+def input_file(text: str) -> Path:
+    """Parse the path of an existing file, or raise argparse.ArgumentTypeError."""
+    path = Path(text)
+    # A pipe is not opened, because its content can be read only once.
+    if not text or not os.path.exists(path):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected an existing file')
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f'{text}: a directory, expected a file')
+    if not os.access(path, os.R_OK):
+        raise argparse.ArgumentTypeError(f'{text}: expected a file that can be read')
+    return path
+
+
+def output_file(text: str) -> Path:
+    """Parse the path of a file that can be written, or raise argparse.ArgumentTypeError."""
+    try:
+        if not text:
+            raise OSError("'', expected a file")
+        check_writable(Path(text))
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(_reason(error)) from None
+    return Path(text)
+
+
+def picture_file(text: str) -> Path:
+    """Parse the path of a picture that can be written, or raise argparse.ArgumentTypeError."""
+    try:
+        picture_format(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return output_file(text)
+
+
+def output_folder(text: str) -> Path:
+    """Parse the path of a folder that exists or can be made, or raise ArgumentTypeError."""
+    path = Path(text)
+    # The nearest ancestor that exists; the root always does.
+    try:
+        found = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        if not text or not found.is_dir():
+            raise OSError
+        check_writable(found / 'file')
+    except (OSError, ValueError):
+        raise argparse.ArgumentTypeError(
+            f'{text!r}, expected a folder that exists or can be made, and can be written'
+        ) from None
+    return path
+
+
+def check_distinct(
+        parser: argparse.ArgumentParser, inputs: Mapping[str, Path | None],
+        outputs: Mapping[str, Path | None]) -> None:
+    """Exit with a usage error if an output file is also an input or another output.
+
+    Parameters
+    ----------
+    inputs, outputs
+        Values by the name of the argument; None if it was not given.
+    """
+    names = {path.resolve(): name for name, path in inputs.items() if path}
+    for name, path in outputs.items():
+        if path:
+            other = names.setdefault(path.resolve(), name)
+            if other != name:
+                parser.error(f'argument {name}: {path}, expected another file than {other}')
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f'{error.filename}: {error.strerror}'
+    return str(error)

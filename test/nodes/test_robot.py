@@ -1,0 +1,183 @@
+"""A robot as a user, in the frame of the robot and in the time of its simulation."""
+
+import math
+import time
+import types
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.action.client import ActionClient
+from rclpy.clock import Clock, ClockType
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from rhs_isac_msgs.action import Locate
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros.frames import Frame
+
+# The surface is turned by 90 degrees about z, and moved.
+TURNED = Frame('odom', origin=np.array([1.0, 2.0, 3.0]),
+               orientation=np.array([0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]))
+FRAME = {'frame_id': 'odom', 'surface_pose': [1.0, 2.0, 3.0, 0.0, 0.0, math.pi / 2]}
+# Time of the simulation at its begin, far from that of the computer [s].
+BEGIN_S = 1000.0
+CENTER, RADIUS_M, TURN_RATE = np.array([9.0, 0.0, 0.0]), 1.0, 0.5
+SPEED_MPS = RADIUS_M * TURN_RATE
+
+
+class Robot:
+    """Drives on a circle in front of the surface; publishes odometry at 20 Hz, and ``/clock``."""
+
+    def __init__(self, node, pace):
+        self._pace, self._begin_s = pace, time.monotonic()
+        self._odometry = node.create_publisher(Odometry, 'odom', 10)
+        self._clock = node.create_publisher(ClockMessage, '/clock', 10)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.drives = False
+        node.create_timer(0.01, self._publish_clock, clock=steady)
+        node.create_timer(0.05, self._publish_odometry, clock=steady)
+
+    @staticmethod
+    def place(now_s):
+        """Return the position in the frame of the surface, and the angle on the circle."""
+        angle = TURN_RATE * now_s
+        return CENTER + RADIUS_M * np.array([math.cos(angle), math.sin(angle), 0.0]), angle
+
+    def _now_s(self):
+        return BEGIN_S + self._pace * (time.monotonic() - self._begin_s)
+
+    def _publish_clock(self):
+        now = Time(nanoseconds=int(1e9 * self._now_s()))
+        self._clock.publish(ClockMessage(clock=now.to_msg()))
+
+    def _publish_odometry(self):
+        if not self.drives:
+            return
+        now_s = self._now_s()
+        place, angle = self.place(now_s)
+        message = Odometry()
+        message.header.stamp = Time(nanoseconds=int(1e9 * now_s)).to_msg()
+        message.header.frame_id, message.child_frame_id = 'odom', 'base_link'
+        point = message.pose.pose.position
+        point.x, point.y, point.z = TURNED.from_surface(place).tolist()
+        # The robot looks ahead: along the tangent, which the surface turns by another 90 degrees.
+        heading = angle + math.pi
+        turn = message.pose.pose.orientation
+        turn.z, turn.w = math.sin(heading / 2), math.cos(heading / 2)
+        message.twist.twist.linear.x = SPEED_MPS
+        self._odometry.publish(message)
+
+
+@pytest.fixture(scope='module', params=[0.2, 5.0])
+def driven(request, make_processes, make_watch):
+    """A network with a user of its own and a robot, in a simulation slower or faster than time."""
+    space = '/yard'
+    with make_processes() as processes:
+        watch = make_watch(space)
+        robot = Robot(watch.node, request.param)
+        poses, reports = [], []
+        watch.node.create_subscription(
+            PoseWithCovarianceStamped, topics.POSE.format(user=2), poses.append, qos.EXCHANGE)
+        watch.node.create_subscription(
+            DiagnosticArray, topics.DIAGNOSTICS, reports.append, qos.EXCHANGE)
+        running = [
+            processes.start('network', namespace=space, users=1, rest_s=0.0, use_sim_time=True,
+                            mobility='waypoints', speed_mps=1.0, ground_truth_period_s=0.01,
+                            waypoints_m=[8.0, -4.0, 0.0, 8.0, 4.0, 0.0], **FRAME),
+            processes.start('user', namespace=space, name='user_2', user_id=2, use_sim_time=True,
+                            mobility='odometry', robot_timeout_s=5.0, **FRAME)]
+        yield types.SimpleNamespace(
+            watch=watch, robot=robot, poses=poses, reports=reports, running=running)
+
+
+def test_a_robot_is_served_where_it_is(driven):
+    watch = driven.watch
+    # Until odometry arrives, the user names what is missing and answers no beacon.
+    watch.until(lambda: any(
+        'user_2' in status.name and 'odometry on /yard/odom' in status.message
+        for report in driven.reports for status in report.status), 'the reason', driven.running)
+    watch.until_served(1, 1, driven.running)
+    assert {end.user for end in watch.served} == {1}
+    driven.robot.drives = True
+    ends = watch.until_served(6, 2, driven.running)
+    errors, delays_m = [], []
+    for end in ends:
+        truth, = watch.until(lambda n=end.cycle_id: watch.of_cycle(m.GroundTruth, n), 'the truth')
+        estimate, = watch.until(
+            lambda n=end.cycle_id: watch.of_cycle(m.PositionEstimate, n), 'the estimate')
+        assert BEGIN_S < 1e-9 * estimate.stamp_ns < 1e6
+        delays_m.append(np.linalg.norm(
+            truth.position - driven.robot.place(1e-9 * truth.stamp_ns)[0]))
+        assert np.linalg.norm(truth.velocity) == pytest.approx(SPEED_MPS)
+        errors.append(np.linalg.norm(estimate.position - truth.position))
+        pose = watch.until(lambda found=estimate: pose_of(driven.poses, found), 'the pose')
+        assert pose.header.frame_id == 'odom'
+        assert_at(pose, estimate)
+    assert np.median(delays_m) < 0.1
+    # A random point of the region is about 5 m away.
+    assert np.median(errors) < 2.5
+
+
+def pose_of(poses, estimate):
+    """Return the pose with the stamp of an estimate, or None."""
+    return next((pose for pose in poses
+                 if Time.from_msg(pose.header.stamp).nanoseconds == estimate.stamp_ns), None)
+
+
+def assert_at(pose, estimate):
+    point = pose.pose.pose.position
+    np.testing.assert_allclose(
+        [point.x, point.y, point.z], TURNED.from_surface(estimate.position), atol=1e-9)
+    np.testing.assert_allclose(
+        np.reshape(pose.pose.covariance, (6, 6))[:3, :3],
+        TURNED.rotation @ estimate.covariance_m2 @ TURNED.rotation.T, rtol=1e-9, atol=1e-12)
+
+
+def test_a_mobility_moves_with_the_clock_of_the_simulation(driven):
+    watch = driven.watch
+
+    def speeds():
+        truths = [truth for truth in watch.received[m.GroundTruth]
+                  if truth.user == 1 and not truth.cycle_id]
+        return [np.linalg.norm(after.position - before.position)
+                / (1e-9 * (after.stamp_ns - before.stamp_ns))
+                for before, after in zip(truths[:-5], truths[5:], strict=True)
+                if after.stamp_ns > before.stamp_ns]
+    assert np.median(watch.until(lambda: (found := speeds())[40:] and found, 'the truths',
+                                 driven.running)) == pytest.approx(1.0, rel=0.05)
+
+
+def test_an_action_returns_the_position_of_each_user(driven):
+    watch, feedback = driven.watch, {1: [], 2: [], 9: []}
+    driven.robot.drives = True
+    client = ActionClient(watch.node, Locate, topics.LOCATE)
+    watch.until(client.server_is_ready, 'the action', driven.running)
+    # At once, and for a user that does not exist.
+    sent = {user: client.send_goal_async(
+        Locate.Goal(user=user, timeout_s=60.0),
+        lambda message, user=user: feedback[user].append(message.feedback.phase))
+        for user in feedback}
+    watch.until(lambda: all(future.done() for future in sent.values()), 'the goals')
+    results = {user: future.result().get_result_async() for user, future in sent.items()}
+    for user in (1, 2):
+        found = watch.until(lambda user=user: results[user].done() and results[user].result(),
+                            f'the position of user {user}', driven.running)
+        assert found.status == GoalStatus.STATUS_SUCCEEDED, found.result.reason
+        assert found.result.pose.header.frame_id == 'odom'
+        estimate, = watch.until(
+            lambda n=found.result.cycle_id: watch.of_cycle(m.PositionEstimate, n), 'the estimate')
+        assert estimate.user == user
+        assert Time.from_msg(found.result.pose.header.stamp).nanoseconds == estimate.stamp_ns
+        assert_at(found.result.pose, estimate)
+        watch.until(lambda user=user: [*dict.fromkeys(feedback[user])] == [
+            m.Phase.BEACONING, m.Phase.POSITIONING, m.Phase.ESTIMATING], 'the feedback')
+    sent[9].result().cancel_goal_async()
+    ended = watch.until(lambda: results[9].done() and results[9].result(), 'the end')
+    assert ended.status == GoalStatus.STATUS_CANCELED
+    assert feedback[9] == [m.Phase.BEACONING]
+    client.destroy()

@@ -1,0 +1,139 @@
+"""The action ``locate``, called by a client, during the messages of a cycle."""
+
+import types
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Time
+from rclpy.action.client import ActionClient
+from rclpy.node import Node
+
+from rhs_isac_msgs.action import Locate
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.frames import Frame
+from rhs_isac_ros.ros.locate import LocateServer
+from rhs_isac_ros.ros.topics import LOCATE
+
+PHASES = (m.Phase.POSITIONING, m.Phase.ESTIMATING)
+FRAME = Frame('odom', origin=np.array([1.0, 0.0, 0.0]))
+
+
+def state(user, phase, outcome='', cycle_id=7):
+    return m.ProtocolState(cycle_id=cycle_id, user=user, phase=phase, outcome=outcome,
+                           began_s=np.zeros(len(m.Phase)), elapsed_s=0.0)
+
+
+def estimate(user, cycle_id=7):
+    return m.PositionEstimate(
+        cycle_id=cycle_id, user=user, codebook_id='a', position=np.array([9.0, user, 0.0]),
+        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.1)
+
+
+@pytest.fixture
+def action(bench):
+    """The action, the users it requested, and a function that sends a goal."""
+    requested = []
+    server = LocateServer(
+        bench.add(Node, 'bs'), requested.append,
+        lambda found: convert.pose(found, Time(sec=4), FRAME), max_users=8)
+    client = ActionClient(bench.add(Node, 'client'), Locate, LOCATE)
+    bench.until(client.server_is_ready, 'the action')
+
+    def send(user, timeout_s=60.0):
+        goal = types.SimpleNamespace(feedback=[])
+        goal.handle = bench.result(client.send_goal_async(
+            Locate.Goal(user=user, timeout_s=timeout_s),
+            lambda message: goal.feedback.append(
+                (message.feedback.phase, message.feedback.cycle_id))))
+        if goal.handle.accepted:
+            goal.result = goal.handle.get_result_async()
+            bench.until(lambda: user in requested and goal.feedback, 'the begin of the goal')
+        return goal
+    yield types.SimpleNamespace(server=server, requested=requested, send=send)
+    client.destroy()
+    server.destroy()
+
+
+def finish(bench, goal, status):
+    found = bench.result(goal.result)
+    assert found.status == status
+    return found.result
+
+
+def test_the_position_arrives_after_the_feedback_of_each_phase(bench, action):
+    goal = action.send(1)
+    for phase in PHASES:
+        action.server.observe(state(1, phase))
+    bench.until(lambda: len(goal.feedback) == 3, 'the feedback')
+    action.server.observe(estimate(1))
+    result = finish(bench, goal, GoalStatus.STATUS_SUCCEEDED)
+    assert goal.feedback == [(m.Phase.BEACONING, 0), *((phase, 7) for phase in PHASES)]
+    assert (result.cycle_id, result.reason) == (7, '')
+    assert (result.pose.header.frame_id, result.pose.header.stamp.sec) == ('odom', 4)
+    assert (result.pose.pose.pose.position.x, result.pose.pose.pose.position.y) == (10.0, 1.0)
+
+
+@pytest.mark.parametrize('phases', [PHASES[:n] for n in range(3)])
+def test_a_goal_can_be_cancelled_in_each_phase(bench, action, phases):
+    goal = action.send(1)
+    for phase in phases:
+        action.server.observe(state(1, phase))
+    response = bench.result(goal.handle.cancel_goal_async())
+    assert len(response.goals_canceling) == 1
+    result = finish(bench, goal, GoalStatus.STATUS_CANCELED)
+    assert (result.cycle_id, result.reason) == (0, 'canceled')
+    # The position arrives too late.
+    action.server.observe(estimate(1))
+
+
+def test_two_goals_are_reached_at_once(bench, action):
+    goals = {user: action.send(user) for user in (1, 2)}
+    for user, cycle_id in ((2, 8), (1, 9)):
+        action.server.observe(state(user, m.Phase.POSITIONING, cycle_id=cycle_id))
+        action.server.observe(estimate(user, cycle_id))
+        result = finish(bench, goals[user], GoalStatus.STATUS_SUCCEEDED)
+        assert (result.cycle_id, result.pose.pose.pose.position.y) == (cycle_id, user)
+
+
+def test_a_cycle_that_began_before_the_goal_does_not_end_it(bench, action):
+    goal = action.send(1)
+    action.server.observe(state(1, m.Phase.ESTIMATING))
+    action.server.observe(estimate(1))
+    action.server.observe(state(1, m.Phase.POSITIONING, cycle_id=8))
+    action.server.observe(estimate(1, cycle_id=8))
+    assert finish(bench, goal, GoalStatus.STATUS_SUCCEEDED).cycle_id == 8
+
+
+def test_after_a_lost_cycle_the_user_is_requested_again(bench, action):
+    goal = action.send(1)
+    action.server.observe(state(1, m.Phase.POSITIONING))
+    action.server.observe(state(1, m.Phase.BEACONING, 'rhs_silent'))
+    assert action.requested == [1, 1]
+    bench.until(lambda: goal.feedback[-1:] == [(m.Phase.BEACONING, 0)] and len(goal.feedback) == 3,
+                'the feedback')
+
+
+def test_signals_without_a_position_abort_the_goal(bench, action):
+    goal = action.send(1)
+    action.server.observe(state(1, m.Phase.POSITIONING))
+    action.server.observe(m.NoFix(cycle_id=7, user=1, codebook_id='a', reason='outside'))
+    assert finish(bench, goal, GoalStatus.STATUS_ABORTED).reason == 'no fix: outside'
+
+
+def test_a_goal_ends_after_its_timeout(bench, action):
+    assert finish(bench, action.send(1, 0.05), GoalStatus.STATUS_ABORTED).reason == (
+        'no position within 0.05 s')
+
+
+def test_a_goal_ends_with_the_action(bench, action):
+    goal = action.send(1)
+    action.server.destroy(0.5)
+    assert 'stands by' in finish(bench, goal, GoalStatus.STATUS_ABORTED).reason
+
+
+@pytest.mark.parametrize(('user', 'timeout_s'), [(0, 1.0), (9, 1.0), (1, -1.0), (1, np.nan)])
+def test_an_invalid_goal_is_rejected(action, user, timeout_s):
+    assert not action.send(user, timeout_s).handle.accepted
+    assert not action.requested

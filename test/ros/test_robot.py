@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from geometry_msgs.msg import Pose
+from nav_msgs.msg import Odometry
+from rclpy.node import Node as Node_
+
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.frames import Frame, rotation_matrix
+from rhs_isac_ros.ros.robot import RobotMobility
+
+# Turned by 90 degrees about z, and moved.
+TURNED = Frame('odom', origin=np.array([1.0, 2.0, 3.0]),
+               orientation=np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]))
+
+
+class Clock:
+    nanoseconds = 10 * 10**9
+
+    def now(self):
+        return self
+
+
+class Node:
+    def get_clock(self):
+        return Clock()
+
+
+def robot():
+    return RobotMobility(Node(), TURNED, 'odometry on /odom', 1.0)
+
+
+def test_a_position_makes_the_way_to_the_surface_and_back():
+    place = np.array([4.0, -1.0, 0.5])
+    moved = TURNED.from_surface(place)
+    np.testing.assert_allclose(moved, [2.0, 6.0, 3.5], atol=1e-12)
+    np.testing.assert_allclose(TURNED.to_surface(moved), place, atol=1e-12)
+
+
+def test_a_pose_is_turned_with_the_surface():
+    pose = TURNED.pose(Pose())
+    turn = pose.orientation
+    matrix = rotation_matrix(np.array([turn.x, turn.y, turn.z, turn.w]))
+    np.testing.assert_allclose(matrix, TURNED.rotation, atol=1e-12)
+    assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
+
+
+def test_a_robot_without_a_position_is_lacking():
+    mobility = robot()
+    assert mobility.lack == 'odometry on /odom'
+    mobility.reject('in the frame')
+    assert mobility.lack == 'odometry on /odom: in the frame'
+
+
+def test_a_robot_is_continued_with_its_velocity():
+    mobility = robot()
+    mobility.put(Clock.nanoseconds - 10**8, np.array([2.0, 6.0, 3.5]), np.array([0.0, 1.0, 0.0]))
+    assert mobility.lack == ''
+    position, velocity = mobility.state(0.0)
+    np.testing.assert_allclose(position, [4.1, -1.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(velocity, [1.0, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(('stamp_ns', 'position', 'words'), [
+    (10**9, [2.0, 6.0, 3.5], 'use_sim_time'), (0, [2.0, -6.0, 3.5], 'in front of the surface')])
+def test_a_position_that_cannot_be_used_is_named(stamp_ns, position, words):
+    mobility = robot()
+    mobility.put(stamp_ns, np.array(position), np.zeros(3))
+    assert words in mobility.lack
+
+
+def test_odometry_is_read_in_the_frame_of_the_robot(bench):
+    from rhs_isac_ros.ros.robot import follow_odometry
+
+    node = bench.add(Node_, 'robot_user')
+    publisher = bench.add(Node_, 'robot').create_publisher(Odometry, 'odom', 10)
+    mobility = follow_odometry(node, Frame(), 'odom', 60.0)
+    message = Odometry()
+    message.header.frame_id = topics.MAP_FRAME
+    message.pose.pose.position.x = 5.0
+    message.pose.pose.orientation.z = message.pose.pose.orientation.w = 0.5
+    message.twist.twist.linear.x = 2.0
+
+    def arrived():
+        publisher.publish(message)
+        return not mobility.lack
+    bench.until(arrived, 'the odometry')
+    np.testing.assert_allclose(mobility.state(0.0)[1], [0.0, 2.0, 0.0], atol=1e-12)

@@ -1,0 +1,78 @@
+"""Types of command line arguments."""
+
+import argparse
+import os
+from pathlib import Path
+
+import pytest
+
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    output_folder,
+    positive_int,
+)
+
+
+@pytest.mark.parametrize(('text', 'number'), [('1', 1), ('250', 250)])
+def test_positive_int_parses_integers_from_one(text, number):
+    assert positive_int(text) == number
+
+
+@pytest.mark.parametrize(('text', 'expected'), [
+    ('0', 'at least 1'), ('-3', 'at least 1'), ('1.5', 'an integer'), ('x', 'an integer'),
+    ('', 'an integer')])
+def test_anything_else_is_an_error_that_names_the_expectation(text, expected):
+    with pytest.raises(argparse.ArgumentTypeError, match=f', expected {expected}$'):
+        positive_int(text)
+
+
+def test_an_error_is_one_line_with_a_hint_and_exits_with_code_2(capsys):
+    parser = ArgumentParser(prog='command')
+    parser.add_argument('--option')
+    with pytest.raises(SystemExit, match='^2$'):
+        parser.parse_args(['two\nlines'])
+    assert capsys.readouterr().err == (
+        'command: error: unrecognized arguments: two lines; see command --help\n')
+    with pytest.raises(SystemExit, match='^2$'):
+        parser.parse_args(['--opt', 'abbreviated'])
+
+
+def test_subcommands_have_the_same_parser(capsys):
+    parser = ArgumentParser(prog='command')
+    parser.add_subparsers().add_parser('verb')
+    with pytest.raises(SystemExit, match='^2$'):
+        parser.parse_args(['verb', '--bogus'])
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_pipe_is_an_input_file(tmp_path):
+    os.mkfifo(tmp_path / 'pipe')
+    assert input_file(str(tmp_path / 'pipe')) == tmp_path / 'pipe'
+
+
+def test_a_folder_that_can_be_made_is_an_output_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ('.', 'new/one', str(tmp_path / 'new' / 'two')):
+        assert output_folder(name) == Path(name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('name', ['', 'file', 'file/folder', '/proc/folder'])
+def test_a_folder_that_cannot_be_made_is_an_error(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'file').touch()
+    with pytest.raises(argparse.ArgumentTypeError, match='expected a folder'):
+        output_folder(name)
+
+
+def test_an_output_differs_from_inputs_and_other_outputs(tmp_path, capsys):
+    parser = ArgumentParser(prog='command')
+    check_distinct(parser, {'--a': tmp_path / 'a', '--b': None}, {'--c': tmp_path / 'c'})
+    for inputs, outputs in (
+            ({'--a': tmp_path / 'a'}, {'--c': tmp_path / 'x' / '..' / 'a'}),
+            ({}, {'--a': tmp_path / 'a', '--b': None, '--c': tmp_path / 'a'})):
+        with pytest.raises(SystemExit, match='^2$'):
+            check_distinct(parser, inputs, outputs)
+        assert 'argument --c: ' in capsys.readouterr().err

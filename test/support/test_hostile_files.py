@@ -1,0 +1,87 @@
+"""Files of a stranger are rejected in one line, within a second and little memory."""
+
+import io
+import os
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.support.files import ArchiveError, read_archive, read_yaml, write_whole
+
+# Each list contains the one before ten times.
+BOMB = ', '.join(['&a0 [1, 1]', *(
+    f'&a{level} [{", ".join([f"*a{level - 1}"] * 10)}]' for level in range(1, 10))])
+FILES = {
+    'n_frames: ' + 100_000 * '[': 'nested more than 16 times',
+    100_000 * '[': 'nested more than 16 times',
+    100_000 * '- ': 'nested more than 16 times',
+    f'n_frames: [{BOMB}]': 'reference *a0, expected none',
+    f'/**: {{ros__parameters: {{codebook: {{shape: [{BOMB}]}}}}}}': 'reference *a0, expected none',
+    '!!python/object/apply:os.system [exit 1]': 'could not determine a constructor',
+    '\0': 'characters are not allowed'}
+# In a process with 2 GB of memory, because a defect would use more or end it.
+READ = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (2 * 10**9, 2 * 10**9))
+from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.model import Scenario, ScenarioError
+for read, kind in ((Scenario.from_yaml, ScenarioError), (Codebook.load, CodebookError)):
+    try:
+        read(sys.argv[1])
+    except kind as error:
+        print(error)
+"""
+
+
+@pytest.mark.parametrize(('content', 'text'), FILES.items(), ids=range(len(FILES)))
+def test_yaml(tmp_path, content, text):
+    file = tmp_path / 'a.yaml'
+    file.write_text(content, encoding='utf-8')
+    with pytest.raises(ValueError, match='a.yaml: cannot be read: ') as error:
+        read_yaml(file)
+    assert text in str(error.value)
+    done = subprocess.run([sys.executable, '-c', READ, file], capture_output=True, text=True,
+                          timeout=60, check=True)
+    assert done.stdout.count(text) == 2
+    assert done.stdout.count('\n') == 2
+
+
+def test_a_file_without_end(monkeypatch):
+    monkeypatch.setattr('rhs_isac_ros.support.files._MAX_YAML_BYTES', 1000)
+    with pytest.raises(ValueError, match='/dev/zero: cannot be read: more than 1000 bytes'):
+        read_yaml('/dev/zero')
+
+
+def npy(shape, kind='<f8'):
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        stream, {'descr': kind, 'fortran_order': False, 'shape': shape})
+    return stream.getvalue() + bytes(80)
+
+
+@pytest.mark.parametrize(('name', 'content', 'compression'), [
+    ('x', npy((10**15,)), zipfile.ZIP_STORED),
+    ('x', npy((10**30,)), zipfile.ZIP_STORED),
+    ('x', npy((10,)), zipfile.ZIP_DEFLATED),
+    ('x', npy((10,), '|O'), zipfile.ZIP_STORED),
+    ('y', npy((10,)), zipfile.ZIP_STORED)])
+def test_archives(tmp_path, name, content, compression):
+    file = tmp_path / 'a.npz'
+    with zipfile.ZipFile(file, 'w', compression) as archive:
+        archive.writestr(f'{name}.npy', content)
+    with pytest.raises(ArchiveError, match='a.npz: (cannot be read|not a model)'):
+        read_archive(file, 'model', 1, {'x'})
+
+
+@pytest.mark.parametrize(('umask', 'mode'), [(0o077, 0o600), (0o022, 0o644), (0o002, 0o664)])
+def test_a_written_file_has_the_permissions_of_a_new_file(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        write_whole(tmp_path / 'a', 'text')
+    finally:
+        os.umask(before)
+    assert (tmp_path / 'a').stat().st_mode & 0o777 == mode
+    assert [path.name for path in tmp_path.iterdir()] == ['a']

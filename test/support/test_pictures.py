@@ -1,0 +1,163 @@
+"""Pictures: formats, equal files of repeated runs, style and looks."""
+
+import itertools
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.support.pictures import (
+    LOOKS,
+    PICTURE_FORMATS,
+    label_decades,
+    look,
+    new_figure,
+    new_panels,
+    paper_style,
+    picture_format,
+    write_picture,
+)
+
+MAGIC = {'png': b'\x89PNG', 'pdf': b'%PDF', 'svg': b'<?xml'}
+# Everything whose ids or order Matplotlib might draw at random.
+DRAW = '''
+import sys
+from rhs_isac_ros.support.pictures import look, new_figure, paper_style, write_picture
+
+with paper_style():
+    figure = new_figure(3.5, 2.5)
+    axes = figure.subplots()
+    for index in range(3):
+        axes.errorbar([1, 2, 3], [index, 2, 1], 0.3, marker=look(index).marker, label='äß²')
+    axes.bar([1, 2], [1, 2], hatch='//', alpha=0.5)
+    axes.imshow([[0, 1], [2, 3]])
+    axes.set(xlabel=r'$N_\\mathrm{B}$', ylabel='√CRLB [m]', yscale='symlog')
+    axes.legend()
+for path in sys.argv[1:]:
+    write_picture(path, figure)
+'''
+
+
+@pytest.fixture
+def figure():
+    pytest.importorskip('matplotlib')
+    with paper_style():
+        figure = new_figure(3.5, 2.5)
+        figure.subplots().set(xlabel=r'$r_\mathrm{min}$ [m]')
+        return figure
+
+
+@pytest.mark.parametrize('kind', PICTURE_FORMATS)
+def test_the_suffix_selects_the_format(figure, tmp_path, kind):
+    write_picture(tmp_path / f'a.{kind.upper()}', figure)
+    assert (tmp_path / f'a.{kind.upper()}').read_bytes().startswith(MAGIC[kind])
+
+
+def test_another_suffix_is_an_error_and_leaves_no_file(figure, tmp_path):
+    with pytest.raises(ValueError, match=r"a\.gif', expected a file name that ends in .png, .pdf"):
+        write_picture(tmp_path / 'a.gif', figure)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_without_suffix_has_no_format():
+    with pytest.raises(ValueError, match=r"^'png', expected"):
+        picture_format('png')
+
+
+@pytest.mark.slow
+def test_processes_write_equal_files_whatever_their_hash_seed(tmp_path, monkeypatch):
+    pytest.importorskip('matplotlib')
+    for name in ('here', 'there'):
+        (tmp_path / name).mkdir()
+    files = [f'a.{kind}' for kind in PICTURE_FORMATS]
+    monkeypatch.setattr(sys, 'argv', ['', *(str(tmp_path / 'here' / name) for name in files)])
+    exec(DRAW, {})
+    subprocess.run([sys.executable, '-c', DRAW, *files], check=True, timeout=60,
+                   cwd=tmp_path / 'there', env=os.environ | {'PYTHONHASHSEED': '1'})
+    for name in files:
+        assert (tmp_path / 'here' / name).read_bytes() == (tmp_path / 'there' / name).read_bytes()
+
+
+def test_the_text_of_a_pdf_is_truetype_and_that_of_an_svg_is_outlines(figure, tmp_path):
+    write_picture(tmp_path / 'a.pdf', figure)
+    write_picture(tmp_path / 'a.svg', figure)
+    assert b'/Subtype /Type3' not in (tmp_path / 'a.pdf').read_bytes()
+    assert b'STIXGeneral' in (tmp_path / 'a.pdf').read_bytes()
+    assert '<text' not in (tmp_path / 'a.svg').read_text(encoding='utf-8')
+
+
+def test_the_size_is_that_of_the_figure(figure, tmp_path):
+    write_picture(tmp_path / 'a.svg', figure)
+    text = (tmp_path / 'a.svg').read_text(encoding='utf-8')
+    assert re.search(r'width="252pt" height="180pt"', text)
+
+
+def test_the_style_replaces_the_settings_of_the_user_inside_the_block_only():
+    matplotlib = pytest.importorskip('matplotlib')
+    with matplotlib.rc_context({'font.size': 30.0, 'lines.linewidth': 9.0, 'axes.grid': True}):
+        with paper_style():
+            assert matplotlib.rcParams['font.size'] == 8.0
+            assert not matplotlib.rcParams['axes.grid']
+        assert matplotlib.rcParams['font.size'] == 30.0
+        assert matplotlib.rcParams['axes.grid']
+
+
+@pytest.mark.parametrize(('high', 'expected'), [
+    (0.17, {'0.08', '0.1', '0.15'}), (7.0, {'0.1', '0.2', '0.5', '1', '2', '5'})])
+def test_a_logarithmic_axis_has_labels_within_a_decade_and_beyond(high, expected):
+    pytest.importorskip('matplotlib')
+    with paper_style():
+        axes = new_figure(3.5, 2.5).subplots()
+        axes.semilogy([0, 1], [0.078, high])
+        label_decades(axes.yaxis)
+        low, top = axes.get_ylim()
+        assert {text.get_text() for text in axes.get_yticklabels()
+                if low <= text.get_position()[1] <= top} == expected
+
+
+@pytest.mark.parametrize('shape', [(1, 2), (3, 1)])
+def test_a_legend_above_the_panels_overlaps_none(shape):
+    pytest.importorskip('matplotlib')
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    with paper_style():
+        figure, panels, above = new_panels(7.0, 4.0, *shape, sharex=True)
+        for axes in panels.flat:
+            axes.plot([0, 1], label='a line')
+            axes.set_title('title')
+        legend = above.legend(*panels[0, 0].get_legend_handles_labels(), loc='lower center',
+                              title='two\nlines')
+        FigureCanvasAgg(figure).draw()
+    assert panels.shape == shape
+    box = legend.get_window_extent()
+    assert figure.bbox.y1 >= box.y1
+    assert all(axes.title.get_window_extent().y1 <= box.y0 for axes in panels[0])
+
+
+def lightness(colour):
+    """Return L* of CIELAB, from 0 (black) to 100 (white)."""
+    from matplotlib.colors import to_rgb
+    rgb = np.array(to_rgb(colour))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055)**2.4)
+    return 116 * np.cbrt(max(linear @ [0.2126, 0.7152, 0.0722], 0.008856)) - 16
+
+
+def test_looks_differ_in_colour_marker_line_and_hatch_and_neighbours_in_lightness():
+    pytest.importorskip('matplotlib')
+    for attribute in zip(*LOOKS, strict=True):
+        assert len(set(attribute)) == len(LOOKS)
+    values = [lightness(entry.colour) for entry in LOOKS[:4]]
+    assert min(abs(a - b) for a, b in itertools.combinations(values, 2)) > 9
+    for one, other in itertools.pairwise(LOOKS):
+        assert abs(lightness(one.colour) - lightness(other.colour)) > 3
+    assert look(len(LOOKS)) == LOOKS[0]
+
+
+def test_without_matplotlib_the_error_names_purpose_and_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    with pytest.raises(MissingLibraryError, match=r'^plotting needs matplotlib, .*ros\[plot\]'), \
+            paper_style('plotting'):
+        pass

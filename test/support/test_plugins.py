@@ -1,0 +1,59 @@
+"""Plug-ins of other packages."""
+
+import re
+
+import pytest
+
+from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.plugins import PluginError
+
+GROUP = plugins.MOBILITIES
+
+
+def test_names_are_those_of_the_installed_packages(install):
+    assert plugins.names(GROUP) == ()
+    install('strolls', 'def stroll(): return 1', {GROUP: {'stroll': 'stroll', 'amble': 'stroll'}})
+    install('strides', '', {GROUP: {'march': 'march'}, 'another.group': {'x': 'y'}})
+    assert plugins.names(GROUP) == ('amble', 'march', 'stroll')
+
+
+def test_the_object_of_an_entry_point_is_imported_and_called(install):
+    install('strolls', 'def stroll(a, *, b): return a, b', {GROUP: {'stroll': 'stroll'}})
+    assert plugins.load(GROUP, 'stroll').__name__ == 'stroll'
+    assert plugins.make(GROUP, 'stroll', 1, b=2) == (1, 2)
+
+
+def test_the_error_for_an_unknown_name_lists_the_installed_plugins(install):
+    with pytest.raises(PluginError, match=f"'stroll', expected a plug-in of {GROUP}; .*: none"):
+        plugins.load(GROUP, 'stroll')
+    install('strolls', '', {GROUP: {'b': 'x', 'a': 'x'}})
+    with pytest.raises(PluginError, match="'stroll', expected .*; installed: a, b"):
+        plugins.load(GROUP, 'stroll')
+
+
+@pytest.mark.parametrize(('code', 'words'), [
+    ('import no_such_module', "ModuleNotFoundError: No module named 'no_such_module'"),
+    ('1 / 0', 'ZeroDivisionError: division by zero'),
+    ('', "AttributeError: module 'strolls' has no attribute 'stroll'"),
+    ('def', 'SyntaxError: '),
+])
+def test_the_error_for_a_failed_import_names_the_entry_point(install, code, words):
+    install('strolls', code, {GROUP: {'stroll': 'stroll'}})
+    prefix = f'entry point {GROUP}: stroll = strolls:stroll of strolls: cannot be loaded: '
+    with pytest.raises(PluginError, match=re.escape(prefix + words)):
+        plugins.load(GROUP, 'stroll')
+
+
+def test_the_error_for_a_failed_call_names_the_entry_point(install):
+    install('strolls', 'def stroll(): raise KeyError("speed")', {GROUP: {'stroll': 'stroll'}})
+    with pytest.raises(PluginError, match=r"strolls:stroll of strolls: failed: KeyError: 'speed'"):
+        plugins.make(GROUP, 'stroll')
+    with pytest.raises(PluginError, match='failed: TypeError: .* positional argument'):
+        plugins.make(GROUP, 'stroll', 1)
+
+
+def test_the_error_for_a_duplicate_name_names_both_packages(install):
+    install('strolls', 'def stroll(): return 1', {GROUP: {'stroll': 'stroll'}})
+    install('ambles', 'def stroll(): return 2', {GROUP: {'stroll': 'stroll'}})
+    with pytest.raises(PluginError, match=r"'stroll': .*ambles.* and .*strolls.*, expected one"):
+        plugins.load(GROUP, 'stroll')

@@ -1,0 +1,166 @@
+"""Public functions run BLAS with one thread and leave the setting of the process as it was."""
+
+import os
+import threading
+
+import numpy as np
+import pytest
+from threadpoolctl import ThreadpoolController, threadpool_limits
+
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.support import threads
+from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
+
+# Other tests may have loaded the BLAS of SciPy, which most functions do not use.
+BLAS = [library for library in ThreadpoolController().select(user_api='blas').lib_controllers
+        if 'scipy.libs' not in library.filepath]
+TIMEOUT_S = 30
+
+
+def numbers():
+    return [library.get_num_threads() for library in BLAS]
+
+
+@pytest.fixture(autouse=True)
+def three_threads():
+    """A process in which BLAS may use three threads."""
+    if not BLAS:
+        pytest.skip('NumPy has no BLAS whose threads can be limited')
+    with threadpool_limits(3, user_api='blas'):
+        if set(numbers()) != {3}:
+            pytest.skip('BLAS cannot use three threads here')
+        # The setting now belongs to the test, not to this context.
+        for library in BLAS:
+            getattr(library, 'clear_controlling_thread', lambda: None)()
+        yield
+
+
+def test_only_the_block_has_one_thread():
+    with one_blas_thread:
+        assert set(numbers()) == {1}
+        with one_blas_thread:
+            assert set(numbers()) == {1}
+        assert set(numbers()) == {1}
+    assert set(numbers()) == {3}
+
+
+def test_a_block_does_not_search_for_libraries(monkeypatch):
+    """A search would block if another thread imports an extension module at that time."""
+    monkeypatch.setattr(threads, 'ThreadpoolController', None)
+    with one_blas_thread:
+        assert map_blocks(abs, [-1, -2]) == [1, 2]
+
+
+def test_libraries_that_are_found_in_a_block_are_limited_and_restored():
+    one_blas_thread.find_libraries()
+    with one_blas_thread:
+        for library in BLAS:
+            library.set_num_threads(3)
+            getattr(library, 'clear_controlling_thread', lambda: None)()
+        one_blas_thread.find_libraries()
+        assert set(numbers()) == {1}
+    assert set(numbers()) == {3}
+
+
+def test_an_error_restores_the_setting():
+    with pytest.raises(ZeroDivisionError):
+        with one_blas_thread:
+            raise ZeroDivisionError
+    assert set(numbers()) == {3}
+
+
+def test_the_last_of_several_callers_restores_the_setting():
+    inside, leave = threading.Event(), threading.Event()
+
+    def other_caller():
+        with one_blas_thread:
+            inside.set()
+            leave.wait(TIMEOUT_S)
+
+    thread = threading.Thread(target=other_caller)
+    with one_blas_thread:
+        thread.start()
+        assert inside.wait(TIMEOUT_S)
+    assert set(numbers()) == {1}
+    leave.set()
+    thread.join(TIMEOUT_S)
+    assert set(numbers()) == {3}
+
+
+def test_a_setting_made_in_between_remains():
+    with one_blas_thread:
+        for library in BLAS:
+            library.set_num_threads(2)
+            getattr(library, 'clear_controlling_thread', lambda: None)()
+    assert set(numbers()) == {2}
+
+
+@pytest.mark.skipif(not hasattr(os, 'fork'), reason='this system has no fork')
+@pytest.mark.filterwarnings('ignore:.*multi-threaded:DeprecationWarning')
+def test_a_forked_process_begins_with_the_setting_of_the_process():
+    with one_blas_thread:
+        child = os.fork()
+        if child == 0:
+            os._exit(int(set(numbers()) != {3}))
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert set(numbers()) == {3}
+
+
+@pytest.mark.skipif(not hasattr(os, 'fork'), reason='this system has no fork')
+@pytest.mark.filterwarnings('ignore:.*multi-threaded:DeprecationWarning')
+def test_a_process_forked_in_a_block_can_leave_it():
+    parent, code = os.getpid(), 1
+    try:
+        with one_blas_thread:
+            child = os.fork()
+        code = int(set(numbers()) != {3})
+    finally:
+        if os.getpid() != parent:
+            os._exit(code)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_blocks_run_side_by_side_with_one_blas_thread_each(monkeypatch):
+    monkeypatch.setattr(threads, '_n_cores', lambda: 2)
+    # Neither block returns before both have begun.
+    barrier = threading.Barrier(2)
+
+    def block(number):
+        barrier.wait(TIMEOUT_S)
+        return number, set(numbers())
+
+    assert map_blocks(block, [1, 2]) == [(1, {1}), (2, {1})]
+
+
+@pytest.mark.parametrize(('limit', 'cores'), [(1, 4), (3, 1)])
+def test_blocks_use_no_more_threads_than_blas_may_or_cores_exist(monkeypatch, limit, cores):
+    monkeypatch.setattr(threads, '_n_cores', lambda: cores)
+    with threadpool_limits(limit, user_api='blas'):
+        assert map_blocks(lambda _: threading.get_ident(), [1, 2, 3]) == [
+            threading.get_ident()] * 3
+
+
+def test_blocks_start_no_threads_of_their_own(monkeypatch):
+    monkeypatch.setattr(threads, '_n_cores', lambda: 2)
+
+    def outer(_):
+        return {threading.get_ident(), *map_blocks(lambda _: threading.get_ident(), [1, 2])}
+
+    assert [len(identifiers) for identifiers in map_blocks(outer, [1, 2])] == [1, 1]
+
+
+def test_an_error_in_a_block_propagates(monkeypatch):
+    monkeypatch.setattr(threads, '_n_cores', lambda: 2)
+    with pytest.raises(ZeroDivisionError):
+        map_blocks(lambda number: 1 / number, [1, 0])
+    assert set(numbers()) == {3}
+
+
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch, shipped):
+    from rhs_isac_ros.bounds import crlb
+    positions = Scenario().sample_positions(600, np.random.default_rng(0))
+    bounds = []
+    for cores in (1, 2):
+        monkeypatch.setattr(threads, '_n_cores', lambda cores=cores: cores)
+        bounds.append(crlb(Scenario(), shipped, positions))
+    assert np.array_equal(*bounds)
