@@ -12,6 +12,7 @@ It yields the covariance for any other beams, and for single elements.
 """
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,8 @@ class MultipathEstimate(ArrayFile):
     conditions
         Fields of the scenario of the survey on which it depends.
     about
-        How it was made: ``positions``, their number; ``prior_weight`` nu and ``inflation`` t;
+        How it was made: ``positions``, their number; ``prior_weight`` nu, ``inflation`` t and
+        ``level_std_db``, the standard deviation of the power among users [dB];
         ``coverage``, the expected share of positions in the 95 % region, with its interval;
         ``warnings``; ``codebook``, its id; ``version``.
     path
@@ -76,6 +78,16 @@ class MultipathEstimate(ArrayFile):
                 raise ArchiveError(f'{name}: not finite, expected finite numbers')
         for array in (self.radiation, self.excess):
             array.flags.writeable = False
+
+    @property
+    def level_db(self) -> tuple[float, float]:
+        """Median and standard deviation of the level of a user's multipath [dB].
+
+        The median is below 0 dB, because the covariance is larger than the multipath by the
+        inflation of the survey.
+        """
+        return (-10 * math.log10(self.about.get('inflation', 1.0)),
+                self.about.get('level_std_db', 0.0))
 
     def content(self) -> tuple[np.ndarray, ...]:
         """Return the arrays that the digest covers."""

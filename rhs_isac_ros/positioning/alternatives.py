@@ -44,8 +44,8 @@ class Alternative(Protocol):
     limit: float
     log_odds: float
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
-                        ) -> float:
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
+                        prior: NuisancePrior) -> float:
         """Compute the logarithm of the evidence with the nuisance parameters integrated out.
 
         Parameters
@@ -55,6 +55,8 @@ class Alternative(Protocol):
             [N_B, N_SB F].
         aligned
             Parameters that the signals alone reveal, float64 [Q]; 0 for the others.
+        residual
+            Energy of the whitened residual at the best position in the region.
         """
         ...
 
@@ -64,22 +66,31 @@ class Alternative(Protocol):
 
 
 class Blocked:
-    """A user without a direct path, whose signals are multipath of an unknown level."""
+    """A user without a direct path, whose signals are multipath of an unknown level.
+
+    A survey inflates the covariance of the multipath, and its level differs among users in sight.
+    Their evidence is that of the inflated covariance, in which weak residuals are improbable, so
+    the evidence of a blocked user is divided by the change that the actual levels would make.
+    """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
 
     def __init__(self, scenario: Scenario) -> None:
         share = scenario.blocked_probability
         self.log_odds = math.log(share / max(1 - share, _MIN_PROBABILITY))
+        self._median_db, self._std_db = (
+            scenario.multipath.level_db if scenario.multipath else (0.0, 0.0))
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
-                        ) -> float:
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
+                        prior: NuisancePrior) -> float:
         """Compute the evidence, as `Alternative` describes; phases have no effect."""
-        energy = np.array([np.sum(np.abs(whitened)**2)])
+        energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is a part of the level.
-        std_db = math.hypot(BLOCKED_STD_DB, _DB_PER_NEPER * prior.gain_std)
-        level = log_evidence_of_level(energy, whitened.size, std_db)
-        return float(level[0]) + prior.log_evidence_of_aligned(aligned)
+        std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
+        in_sight, blocked = (
+            float(log_evidence_of_level(energy[[index]], whitened.size, std, self._median_db)[0])
+            for index, std in enumerate((self._std_db, std_db)))
+        return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some level explains the signals, as `Alternative` describes."""

@@ -28,7 +28,12 @@ from rhs_isac_ros.positioning.estimate import (
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
 from rhs_isac_ros.positioning.fit import DOUBT_LIMIT, FitTest
-from rhs_isac_ros.positioning.grid import Starts, TemplateTable, standard_normal
+from rhs_isac_ros.positioning.grid import (
+    Starts,
+    TemplateTable,
+    first_of_each,
+    standard_normal,
+)
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
@@ -225,9 +230,11 @@ class SearchEstimator(abc.ABC):
         else:
             samples = draw_samples(modes, self._normal, self._bounds)
         whitened = likelihood.whitened(aligned, signals)
+        best = np.minimum.reduceat(modes.residual, first_of_each(modes.phases))
         log_weights = np.array([
             [one.log_odds + one.log_evidence_of(*phase, likelihood.nuisance)
-             for one in self._alternatives] for phase in zip(whitened, aligned, strict=True)])
+             for one in self._alternatives]
+            for phase in zip(whitened, aligned, best.tolist(), strict=True)])
         return _Search(modes, samples, whitened, log_weights)
 
     def _judge(self, found: _Search) -> Iterator[tuple[Located, Modes | None]]:

@@ -107,7 +107,8 @@ class Outside:
                            out=np.full(self._possible.shape, -np.inf))
         self._offset = (log_prior - self._energy).astype(np.float32)
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
+                        prior: NuisancePrior
                         ) -> float:
         """Compute the evidence, as `Alternative` describes.
 

@@ -11,6 +11,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.model.gaussian import log_evidence_of_level
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
+from rhs_isac_ros.model.multipath_estimate import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.positioning import Tracker, make_estimator
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
 
@@ -30,14 +31,16 @@ def signals_of(scenario, codebook, seed):
     return positions, received, blocked
 
 
-def test_the_evidence_of_a_level_is_the_average_over_it():
+@pytest.mark.parametrize('median_db', [0.0, -6.0])
+def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
     energy, n, std_db = np.array([0.1, 50.0, 5e3]), 512, 12.0
     db = np.linspace(-60, 60, 200_001)
     level = db * np.log(10) / 10
     expected = logsumexp(
-        -energy[:, None] * np.exp(-level) - n * level + norm(scale=std_db).logpdf(db),
+        -energy[:, None] * np.exp(-level) - n * level + norm(median_db, std_db).logpdf(db),
         axis=1) + np.log(db[1] - db[0])
-    np.testing.assert_allclose(log_evidence_of_level(energy, n, std_db), expected, atol=0.05)
+    np.testing.assert_allclose(
+        log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
 
 
 def test_blocked_users_have_the_multipath_alone(shipped):
@@ -76,6 +79,24 @@ def test_the_probability_of_blocked_users_is_calibrated(name, reject_outside, ch
         reasons = [reason for reason in estimate.reason if reason]
         assert np.mean([one.startswith('blocked: probability') for one in reasons]) > 0.5
     assert probability[blocked].mean() > probability[~blocked].mean() + 0.3
+
+
+def test_the_inflation_of_a_survey_makes_no_user_in_sight_blocked(shipped):
+    """The residuals are weaker than the inflated covariance, as those of a blocked user are."""
+    declared = Scenario(multipath_to_los_db=-8.0)
+    scenario = dataclasses.replace(declared, blocked_probability=0.3)
+    _, received, blocked = signals_of(scenario, shipped, 3)
+    model, inflation = MeasurementModel(scenario, shipped), 6.0
+    n_bands, n_rows = model.shape
+    fields = declared.fields()
+    assumed = dataclasses.replace(scenario, multipath=MultipathEstimate(
+        declared.multipath_to_los_db + 10 * np.log10(inflation), declared.delay_spread_s,
+        declared.angular_spread_deg, np.array(model.radiation),
+        np.zeros((n_bands, n_rows, n_rows), complex), {name: fields[name] for name in CONDITIONS},
+        {'inflation': inflation, 'level_std_db': 1.0}))
+    estimate = make_estimator('bayes', assumed, shipped).estimate(received)
+    assert estimate.fix[~blocked].mean() > 0.95
+    assert estimate.fix[blocked].mean() < 0.1
 
 
 def test_without_the_field_users_are_in_sight(shipped, table1_estimator):

@@ -87,7 +87,7 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
     exponent += norm(scale=std).logpdf(gains) - 2 * received.size * gains
     expected = logsumexp(exponent) + np.log(gains[1] - gains[0])
     found = table.log_evidence_of(
-        likelihood.model.whiten(received)[0], np.zeros(1), likelihood.nuisance)
+        likelihood.model.whiten(received)[0], np.zeros(1), 0.0, likelihood.nuisance)
     assert found == pytest.approx(expected, abs=0.1)
 
 
