@@ -21,21 +21,21 @@ from rhs_isac_ros.bounds.rows import (
     rows_within,
 )
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.gaussian import marginalise
-from rhs_isac_ros.model.impairments import AppliedBeams, nuisance_of
-from rhs_isac_ros.model.impairments.elements import (
+from rhs_isac_ros.model.elements import (
+    SurfaceEstimate,
     element_correlation,
     error_radiation,
     error_terms,
 )
+from rhs_isac_ros.model.gaussian import marginalise
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
 from rhs_isac_ros.model.multipath import (
     coupling,
     declared_covariance,
     measurement_correlation,
 )
-from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, onboard_matrix
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses

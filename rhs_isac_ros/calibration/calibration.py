@@ -11,7 +11,7 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.calibration.estimate import TOLERANCE, Pilots, estimate_surface, prior_of
 from rhs_isac_ros.calibration.mixture import SurfacePrior
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 _FORMAT = 1

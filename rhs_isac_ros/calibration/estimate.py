@@ -19,17 +19,16 @@ from rhs_isac_ros.calibration.mixture import (
     without_data,
 )
 from rhs_isac_ros.model import Beamforming, Scenario
-from rhs_isac_ros.model.gaussian import eliminate
-from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
-from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.measurement import signal_covariance
-from rhs_isac_ros.model.surface_estimate import (
+from rhs_isac_ros.model.elements import (
     SurfaceEstimate,
     direct_design,
     element_radiation,
     scattered_errors,
 )
+from rhs_isac_ros.model.gaussian import eliminate
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
+from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.measurement import signal_covariance
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Prior of scenarios that declare no errors or failures.

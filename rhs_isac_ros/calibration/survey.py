@@ -25,9 +25,9 @@ from rhs_isac_ros import __version__
 from rhs_isac_ros.calibration.estimate import Pilots, set_phases
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
+from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.model.multipath_estimate import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Share of positions in the region of the local bound, and of residuals that pass their test, with

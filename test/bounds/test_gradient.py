@@ -9,8 +9,8 @@ from rhs_isac_ros.bounds import AverageCrlb, crlb
 from rhs_isac_ros.bounds.average import gradient_analog, gradient_digital
 from rhs_isac_ros.calibration import survey
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.impairments import AppliedBeams
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.model.surface import AppliedBeams
 
 
 def complex_array(rng, *shape):
