@@ -1,5 +1,6 @@
 """Operations on arrays that all parts of the model share."""
 
+import functools
 import hashlib
 from collections.abc import Mapping
 from typing import Any
@@ -21,6 +22,13 @@ def adjoint(matrices: np.ndarray) -> np.ndarray:
 def blocks(n: int, size: int) -> list[slice]:
     """Split n items into blocks of a size; the last one may be smaller."""
     return [slice(start, start + size) for start in range(0, n, size)]
+
+
+@functools.cache
+def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights of a quadrature from -1 to 1; their computation takes long."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    return read_only(nodes), read_only(weights)
 
 
 def digest(*arrays: np.ndarray) -> str:

@@ -23,7 +23,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, blocks, digest, read_only
+from rhs_isac_ros.model.arrays import adjoint, blocks, digest, gauss_legendre, read_only
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
@@ -295,7 +295,7 @@ def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
     The gain is that of the direct path, averaged over the region of interest, and of the
     multipath. Returns complex128 [N_SB F, N_SB F, N_E], read-only.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
+    nodes, weights = gauss_legendre(_ROI_NODES)
     low, high = scenario.roi_bounds_m
     axes = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     positions = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, blocks, read_only
+from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
 from rhs_isac_ros.model.hall import MultipathEstimate
@@ -242,7 +242,7 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
     This is the mean of (v_0 g^U / (4 pi f_c,i r))^2, with the distance r from the surface's
     centre. A gain pattern g^U is evaluated at the angle from the boresight there.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
+    nodes, weights = gauss_legendre(_ROI_NODES)
     low, high = scenario.roi_bounds_m
     x, y, z = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     squares = x[:, None, None]**2 + y[:, None]**2 + z**2
@@ -403,7 +403,7 @@ def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase
     The phase [rad] over the elements determines the number. Of an even profile, only the positive
     angles are included.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
+    nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
     signs = (1,) if is_even else (-1, 1)
