@@ -14,8 +14,8 @@ import pytest
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.measurement import receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
-from rhs_isac_ros.model.receive import receive_feeds, received_signal
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import Estimate, ModelError
 from rhs_isac_ros.protocol import messages as m

@@ -8,7 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Scenario, mobility
-from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user

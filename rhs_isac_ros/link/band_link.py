@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain_at
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 # Gains above this have finite reciprocals.
 _MIN_GAIN = 1e-300

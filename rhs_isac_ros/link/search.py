@@ -8,8 +8,8 @@ import numpy as np
 from rhs_isac_ros.link import band_link
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 # Largest share of the multipath power that the modes may omit, unless that takes more of them.
 # The ascent from the configurations that are found includes all of it.

@@ -15,7 +15,7 @@ from rhs_isac_ros.link.band_link import (
 from rhs_isac_ros.link.capacity import Beam, actual_capacity, expected_capacities
 from rhs_isac_ros.link.search import candidate_configurations, tables
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Maximum number of rounds; two or three are usual.

@@ -9,27 +9,17 @@ BLOCKED_STD_DB = 10.0
 
 
 class Marginal(NamedTuple):
-    """The Gaussian of the first n of n + Q unknowns, after the maximum over the others.
+    """The Gaussian of the first n of n + Q unknowns, after the maximum over the others."""
 
-    Attributes
-    ----------
-    information
-        Schur complement of the information, float64 [N, n, n].
-    gradient
-        Gradient of the log-likelihood, float64 [N, n].
-    regression
-        Change of the other unknowns with the first ones, float64 [N, Q, n].
-    offset
-        Step of the other unknowns to their maximum, float64 [N, Q].
-    log_volume
-        Logarithm of the integral over the others relative to the maximum, without the factors
-        2 pi, float64 [N].
-    """
-
+    # Schur complement of the information [N, n, n], and gradient of the log-likelihood [N, n].
     information: np.ndarray
     gradient: np.ndarray
+    # Change of the other unknowns with the first ones [N, Q, n], and their step to the maximum
+    # [N, Q].
     regression: np.ndarray
     offset: np.ndarray
+    # Logarithm of the integral over the others relative to the maximum [N], without the factors
+    # 2 pi.
     log_volume: np.ndarray
 
 
@@ -57,8 +47,8 @@ def eliminate(
     """Maximise a quadratic log-likelihood over nuisance parameters.
 
     Takes its curvature in these, float64 [N, Q, Q], their coupling with n other unknowns,
-    [N, Q, n], and its gradient, [N, Q]. Returns how the maximum moves with the other unknowns, the
-    negative coupling after a solution, [N, Q, n], and the step to the maximum, [N, Q].
+    [N, Q, n], and its gradient, [N, Q]. Returns how the maximum moves with the other unknowns,
+    [N, Q, n], and the step to the maximum, [N, Q].
     """
     both = np.linalg.solve(
         curvature, np.concatenate([-coupling, gradient[..., None]], axis=-1))

@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.impairments.elements import (
+from rhs_isac_ros.model.elements import (
     DeclaredElements,
     ElementErrors,
     element_correlation,

@@ -20,8 +20,7 @@ from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import eliminate, marginalise
-from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
 from rhs_isac_ros.positioning.expansion import Means

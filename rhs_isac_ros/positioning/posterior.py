@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     is_inside,

@@ -13,7 +13,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.impairments import ElementErrors
+from rhs_isac_ros.model.elements import ElementErrors
 from rhs_isac_ros.positioning.coordinates import to_polar
 from rhs_isac_ros.positioning.estimate import Estimate, checked_received, stack_parts
 from rhs_isac_ros.positioning.estimators import BayesEstimator

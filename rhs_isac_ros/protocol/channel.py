@@ -9,7 +9,8 @@ import numpy as np
 
 from rhs_isac_ros.link import Beam, actual_capacity
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.impairments import DeclaredElements, draw_factors, draw_surface
+from rhs_isac_ros.model.elements import DeclaredElements, draw_surface
+from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import element_signals, feed_signals

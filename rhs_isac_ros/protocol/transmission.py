@@ -17,7 +17,7 @@ from rhs_isac_ros.link import (
     choose_beam,
 )
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     Action,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.model import Scenario, mobility
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.ros import topics

@@ -13,7 +13,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import check
 from rhs_isac_ros.ros import convert, qos, topics

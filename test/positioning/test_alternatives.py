@@ -11,7 +11,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
 from rhs_isac_ros.model.gaussian import log_evidence_of_level
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
-from rhs_isac_ros.model.multipath_estimate import CONDITIONS, MultipathEstimate
+from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.positioning import Tracker, make_estimator
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.impairments import DeclaredElements, ElementErrors, nuisance_of
+from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.positioning.coordinates import jacobian, to_polar
 from rhs_isac_ros.positioning.failures import FailureModel, FailureSearch, can_enumerate

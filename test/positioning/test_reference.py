@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import norm, qmc
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface
-from rhs_isac_ros.model.impairments import ElementErrors, nuisance_of
+from rhs_isac_ros.model.elements import ElementErrors
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning import exhaustive_posterior, reference, simulate_pairs
 from rhs_isac_ros.positioning.reference import posterior_with_truth

@@ -9,8 +9,8 @@ import pytest
 from in_memory_network import feed
 
 from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.channel import Channel, ImpairedChannel

@@ -1,4 +1,4 @@
-"""Unknown coefficients of the elements: draws, and their effect on mean and covariance.
+"""Coefficients of the elements of a surface: drawn, declared as unknown, or estimated.
 
 The coefficient of element m in frame q is (1 + e_m) x_{q,m}, with the relative error e_m, complex
 normal of variance s^2, and the amplitude x: the configuration c, or with the probability p of a
@@ -10,25 +10,29 @@ covariance between two frames is
 a sum of at most three products of a factor for each frame. Elements are independent. Signals are
 treated as circular: failures also contribute a pseudo-covariance, a sum over elements whose terms
 differ in phase.
+
+An estimated coefficient is linear in two numbers, ``gain c + offset``: an element that works has
+the offset 0, and one that has failed the gain 0. A band multiplies all its signals by a gain of
+the receiving chain. Mean signals are therefore linear in the elements and in each band's gain, and
+their errors have a covariance in closed form.
 """
 
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import adjoint, blocks, digest, gauss_legendre, read_only
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
-    legendre_quadrature,
     measurement_correlation,
+    multipath_covariance,
     spatial_covariance,
 )
 from rhs_isac_ros.model.scenario import Scenario
-from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
+from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights
 
 # Nodes along each side of the region of interest. Products of the gains of two sub-bands have no
 # carrier and are smooth.
@@ -43,15 +47,8 @@ _BLOCK = 32
 DirectErrors = Callable[[int, np.ndarray], np.ndarray]
 
 
-class AppliedBeams(NamedTuple):
-    """Beamforming whose coefficients need not be real, or levels of the surface."""
-
-    analog: np.ndarray
-    digital: np.ndarray
-
-
 class SurfaceModel:
-    """Knowledge of the elements of a surface: expected coefficients and the errors of these.
+    """Knowledge of the elements of a surface: expected coefficients and their errors.
 
     A subclass defines `applied_beams`, and if there are errors `is_exact` and `errors`.
     """
@@ -67,9 +64,7 @@ class SurfaceModel:
 
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
         """Return the covariance from the multipath [N_B, N_SB F, N_SB F] and the direct errors."""
-        n_rows = scenario.n_subbands * scenario.n_frames
-        return (np.zeros((scenario.n_bands, n_rows, n_rows), complex),
-                lambda band, positions: np.zeros((len(positions), n_rows, 0), complex))
+        raise NotImplementedError
 
     def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
         """Compute the covariance due to errors, complex128 [N_B, N_SB F, N_SB F] [W].
@@ -91,10 +86,9 @@ class SurfaceModel:
         scattered, direct = self.errors(scenario, beams)
         covariance = np.repeat(scattered[None], len(positions), axis=0)
         for band in range(scenario.n_bands):
-            for start in range(0, len(positions), _BLOCK):
-                block = slice(start, start + _BLOCK)
+            for block in blocks(len(positions), _BLOCK):
                 errors = direct(band, positions[block])
-                covariance[block, band] += np.matmul(errors, np.conj(np.swapaxes(errors, 1, 2)))
+                covariance[block, band] += np.matmul(errors, adjoint(errors))
         return covariance
 
 
@@ -116,14 +110,12 @@ class ElementErrors(SurfaceModel):
     @property
     def id(self) -> str:
         """Hash of the errors, 16 hexadecimal digits."""
-        digest = hashlib.sha256(np.asarray(self.gains, complex).astype('<c16').tobytes())
-        digest.update(np.asarray(self.stuck, float).astype('<f8').tobytes())
-        return digest.hexdigest()[:16]
+        return digest(np.asarray(self.gains, '<c16'), np.asarray(self.stuck, '<f8'))
 
     def applied(self, analog: np.ndarray) -> np.ndarray:
         """Return the coefficients in effect, complex128, for configurations [..., N_E].
 
-        Raise ValueError if the surface has another number of elements.
+        Raises ValueError if the surface has another number of elements.
         """
         if analog.shape[-1:] != self.gains.shape:
             raise ValueError(f'surface: {len(self.gains)} elements, expected N_E = '
@@ -168,14 +160,84 @@ class DeclaredElements(SurfaceModel):
         n_bands, n_rows, n_terms, n_elements = radiation.shape
         amplitude = np.sqrt(spatial_covariance(scenario).power)
         flat = (radiation * amplitude[:, None, None]).reshape(n_bands, n_rows, -1)
-        scattered = np.matmul(flat, np.conj(np.swapaxes(flat, 1, 2)))
 
         def direct(band: int, positions: np.ndarray) -> np.ndarray:
             gains = np.repeat(los_gain(scenario, positions, band), scenario.n_frames, axis=1)
-            errors: np.ndarray = radiation[band] * gains[:, :, None]
+            errors = radiation[band] * gains[:, :, None]
             return errors.reshape(len(gains), n_rows, n_terms * n_elements)
 
-        return measurement_correlation(scenario) * scattered, direct
+        return measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)), direct
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SurfaceEstimate(SurfaceModel):
+    """Mean and covariance of the coefficients of a surface.
+
+    Attributes
+    ----------
+    gains, offsets
+        Expected coefficient of each element, ``gain c + offset``, complex128 [N_E].
+    band_gains
+        Expected gain of each band, complex128 [N_B].
+    factor
+        F with F F^H the covariance of gains, offsets and relative errors of the band gains,
+        complex128 [2 N_E + N_B, R].
+    failed_probability
+        Probability that each element has failed, float64 [N_E].
+    """
+
+    gains: np.ndarray
+    offsets: np.ndarray
+    band_gains: np.ndarray
+    factor: np.ndarray
+    failed_probability: np.ndarray
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the estimate has no errors."""
+        return not self.factor.shape[1]
+
+    @property
+    def id(self) -> str:
+        """Hash of the estimate, 16 hexadecimal digits."""
+        return digest(*(np.asarray(array, '<c16') for array in (
+            self.gains, self.offsets, self.band_gains, self.factor)))
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Which elements have probably failed, bool [N_E]."""
+        return self.failed_probability > 0.5
+
+    def std(self) -> np.ndarray:
+        """Return the standard deviations of the rows of `factor`, float64 [2 N_E + N_B]."""
+        return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
+
+    def without_errors(self) -> 'SurfaceEstimate':
+        """Return an estimate that takes the means as exact."""
+        return dataclasses.replace(self, factor=self.factor[:, :0])
+
+    def applied(self, analog: np.ndarray) -> np.ndarray:
+        """Return the expected coefficients, complex128, for configurations [..., N_E]."""
+        return self.gains * analog + self.offsets
+
+    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
+        """Return the expected beamforming in effect, with the gains of the bands."""
+        return AppliedBeams(
+            self.applied(beams.analog), self.band_gains[:, None, None, None] * beams.digital)
+
+    def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
+        """Return the errors, as `SurfaceModel` describes."""
+        radiation = element_radiation(scenario, beams)
+        of_elements, of_bands = np.split(self.factor, [2 * scenario.n_elements])
+        scattered = scattered_errors(scenario, radiation, of_elements @ np.conj(of_elements.T))
+
+        def direct(band: int, positions: np.ndarray) -> np.ndarray:
+            design = direct_design(scenario, radiation, band, positions)
+            mean = design @ np.concatenate([self.gains, self.offsets])
+            return self.band_gains[band] * (
+                design @ of_elements + mean[..., None] * of_bands[band])
+
+        return scattered * np.abs(self.band_gains[:, None, None])**2, direct
 
 
 def has_errors(scenario: Scenario) -> bool:
@@ -221,9 +283,8 @@ def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
 
 def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
     """Compute the factors times the weights S B, complex128 [T, N_B, N_SB F, N_E]."""
-    weights = np.matmul(beams.digital, onboard_matrix(scenario))
     factors = error_factors(scenario, beams.analog)
-    return (factors[:, :, None] * weights).reshape(
+    return (factors[:, :, None] * feed_weights(scenario, beams)).reshape(
         len(factors), scenario.n_bands, -1, scenario.n_elements)
 
 
@@ -234,18 +295,49 @@ def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
     The gain is that of the direct path, averaged over the region of interest, and of the
     multipath. Returns complex128 [N_SB F, N_SB F, N_E], read-only.
     """
-    nodes, weights = legendre_quadrature(_ROI_NODES)
+    nodes, weights = gauss_legendre(_ROI_NODES)
     low, high = scenario.roi_bounds_m
     axes = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     positions = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
     shares = np.einsum('a,b,c->abc', *[weights / 2] * 3).ravel()
     direct = np.zeros((scenario.n_subbands, scenario.n_subbands, scenario.n_elements), complex)
-    for start in range(0, len(positions), _BLOCK):
-        block = slice(start, start + _BLOCK)
+    for block in blocks(len(positions), _BLOCK):
         gains = los_gain(scenario, positions[block], band)
         direct += np.einsum('n,njm,nlm->jlm', shares[block], gains, np.conj(gains))
     correlation = np.repeat(np.repeat(direct, scenario.n_frames, 0), scenario.n_frames, 1)
     power = spatial_covariance(scenario).power[band]
     correlation += measurement_correlation(scenario)[band][..., None] * power
-    correlation.flags.writeable = False
-    return correlation
+    return read_only(correlation)
+
+
+def element_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
+    """Compute the weights of gains and offsets of the elements in every measurement.
+
+    Returns complex128 [N_B, N_SB F, 2 N_E], for unit gains of the bands.
+    """
+    weights = feed_weights(scenario, beams)
+    both = np.concatenate([beams.analog[:, None] * weights, weights], axis=-1)
+    return both.reshape(scenario.n_bands, -1, 2 * scenario.n_elements)
+
+
+def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,
+                  positions: np.ndarray) -> np.ndarray:
+    """Compute the derivative of a band's mean signals with respect to gains and offsets.
+
+    Returns complex128 [N, N_SB F, 2 N_E] for the weights of `element_radiation`.
+    """
+    los = los_gain(scenario, positions, band)
+    by_measurement = np.repeat(np.concatenate([los, los], axis=-1), scenario.n_frames, axis=1)
+    return by_measurement * radiation[band]
+
+
+def scattered_errors(
+        scenario: Scenario, radiation: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Compute the covariance of the signals from the multipath at erroneous elements [W].
+
+    Takes the weights of `element_radiation` and the covariance of gains and offsets, complex128
+    [2 N_E, 2 N_E]. Returns complex128 [N_B, N_SB F, N_SB F].
+    """
+    spatial = np.tile(multipath_covariance(scenario), (1, 2, 2))
+    products = np.matmul(radiation @ (spatial * errors), adjoint(radiation))
+    return measurement_correlation(scenario) * products

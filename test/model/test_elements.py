@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface, simulate_received
-from rhs_isac_ros.model.impairments import elements
-from rhs_isac_ros.model.impairments.elements import (
+from rhs_isac_ros.model import (
+    MeasurementModel,
+    Scenario,
+    draw_surface,
+    elements,
+    simulate_received,
+)
+from rhs_isac_ros.model.elements import (
     DeclaredElements,
     element_correlation,
     error_factors,
@@ -128,16 +133,6 @@ def test_a_known_surface_has_no_error(small):
     known = MeasurementModel(scenario, small.codebook, surface)
     exact = MeasurementModel(small.scenario, small.codebook, surface)
     np.testing.assert_array_equal(known.covariance(), exact.covariance())
-
-
-def test_known_errors_have_no_covariance(small, damaged):
-    surface, positions = draw_surface(damaged, np.random.default_rng(3)), np.ones((5, 3))
-    n_rows = small.vectors['cov'].shape[-1]
-    np.testing.assert_array_equal(
-        surface.error_covariance(damaged, small.codebook), np.zeros((1, n_rows, n_rows)))
-    np.testing.assert_array_equal(
-        surface.error_covariance_at(damaged, small.codebook, positions),
-        np.zeros((5, 1, n_rows, n_rows)))
 
 
 def test_elements_are_exact_if_their_errors_are_known_or_absent(small, damaged):
