@@ -15,10 +15,12 @@ from rhs_isac_ros.positioning.alternatives import (
     ALTERNATIVES,
     Alternative,
     Blocked,
+    Outside,
     rejection,
     shares,
 )
-from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
+from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, symmetric, to_positions
+from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import (
     Estimate,
     Estimator,
@@ -27,7 +29,6 @@ from rhs_isac_ros.positioning.estimate import (
     estimate_each,
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.fit import DOUBT_LIMIT, FitTest
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable, standard_normal
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
@@ -37,7 +38,6 @@ from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
     Signals,
 )
-from rhs_isac_ros.positioning.outside import Outside
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
     Posterior,
@@ -46,11 +46,7 @@ from rhs_isac_ros.positioning.posterior import (
     draw_broad_samples,
     draw_samples,
 )
-from rhs_isac_ros.positioning.search import (
-    Modes,
-    ascend,
-    find_modes,
-)
+from rhs_isac_ros.positioning.search import Modes, ascend, find_modes
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
@@ -61,41 +57,33 @@ _BLOCK = 128
 # Samples of a mode if the phases of the bands carry information: their density has several peaks
 # within a mode, so that fewer samples have most of the weight.
 _N_INFORMATIVE = 512
+# Probability of all alternatives above which residuals are not compared with the scenario.
+_DOUBT_LIMIT = 0.05
 
 
 class _Search(NamedTuple):
-    """The result of a search for several phases.
-
-    Attributes
-    ----------
-    modes
-        Modes of all phases.
-    samples
-        Their samples.
-    whitened
-        Whitened signals without the parameters that they reveal, complex128 [N, N_B, N_SB F].
-    log_weights
-        Logarithm of the prior odds of each alternative times its evidence, float64 [N, A].
-    """
+    """The result of a search for several phases."""
 
     modes: Modes
     samples: Samples
+    # Whitened signals without the parameters that they reveal, complex128 [N, N_B, N_SB F].
     whitened: np.ndarray
+    # Logarithm of the prior odds of each alternative times its evidence, float64 [N, A].
     log_weights: np.ndarray
 
 
 class SearchEstimator(abc.ABC):
     """An estimator from the modes of the posterior, for a uniform prior on the region of interest.
 
-    Signals that the model cannot explain at the best mode give no fix; see `fit`. If the scenario
-    has a `blocked_probability`, users may lack the direct path; see `alternatives`. Tables are
-    kept in `table_folder` between runs.
+    Signals that the model cannot explain at the best mode give no fix; see `diagnosis`. If the
+    scenario has a `blocked_probability`, users may lack the direct path; see `alternatives`.
+    Tables are kept in `table_folder` between runs.
 
     Parameters
     ----------
     reject_outside
-        Whether the user may also be outside of the region; see `outside`. If this is almost
-        certain (`outside.OUTSIDE_LIMIT`), there is no fix. Otherwise the estimate contains its
+        Whether the user may also be outside of the region. If this is almost certain
+        (`alternatives.OUTSIDE_LIMIT`), there is no fix. Otherwise the estimate contains its
         probability, while position and covariance remain those of a user inside.
     surface
         What is known of the surface, as in `MeasurementModel`; for example a calibration.
@@ -142,14 +130,8 @@ class SearchEstimator(abc.ABC):
 
     @one_blas_thread
     def posterior(self, received: np.ndarray) -> Posterior:
-        """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F].
-
-        Raises
-        ------
-        SignalError
-            If the signals cannot be used, as in `estimate`.
-        """
-        batch = checked_received(self.scenario, self._likelihood.codebook, received)
+        """Compute the posterior for the signals of one phase, complex128 [N_B, N_SB F]."""
+        batch = checked_received(self._likelihood.codebook, received)
         signals = self._likelihood.signals(batch)
         ((located, modes),) = self._locate_block(signals)
         return Posterior(Estimate(*located), modes, signals)
@@ -215,13 +197,15 @@ class SearchEstimator(abc.ABC):
         if self._failures:
             refined = [self._failures.refine(modes.of_phase(phase), signals.repeated(phase))
                        for phase in range(len(aligned))]
-            modes = _joined([one for one, _ in refined])
+            # Each part counts its phases from 0.
+            modes = concatenate(*(one._replace(phases=np.full(len(one.phases), phase))
+                                  for phase, (one, _) in enumerate(refined)))
             conditionals = [sets for _, sets in refined]
         if likelihood.nuisance.is_coarse:
-            samples = Samples(*(np.concatenate(fields) for fields in zip(*(
+            samples = concatenate(*(
                 draw_broad_samples(likelihood, conditionals[phase], self._phases,
                                    signals.repeated(phase), modes.of_phase(phase), self._normal)
-                for phase in range(len(aligned))), strict=True)))
+                for phase in range(len(aligned))))
         else:
             samples = draw_samples(modes, self._normal, self._bounds)
         whitened = likelihood.whitened(aligned, signals)
@@ -254,7 +238,7 @@ class SearchEstimator(abc.ABC):
             # Of signals without a fix, only a residual that nothing explains is evidence against
             # the scenario.
             counts = (reason == self._test.residual_test(residual) if reason
-                      else probabilities[row, 0] >= 1 - DOUBT_LIMIT)
+                      else probabilities[row, 0] >= 1 - _DOUBT_LIMIT)
             by_name = {one.name: float(share) for one, share in zip(
                 self._alternatives, probabilities[row, 1:], strict=True)}
             outside, blocked = (by_name.get(kind.name, np.nan) for kind in ALTERNATIVES)
@@ -280,11 +264,9 @@ class SearchEstimator(abc.ABC):
 
 
 class BayesEstimator(SearchEstimator):
-    """Estimates mean and covariance of the posterior; the prior is uniform on the region.
+    """Mean and covariance of the posterior, from the Gaussians of all modes inside the region.
 
-    The grid gives the modes, Gauss-Newton steps on the exact near-field model refine them, and
-    every mode contributes with the mass of its Gaussian inside the region. Parameters and errors
-    are those of `SearchEstimator`.
+    Parameters and errors are those of `SearchEstimator`.
     """
 
     name = 'bayes'
@@ -299,7 +281,7 @@ class BayesEstimator(SearchEstimator):
         within = within @ np.linalg.solve(within + prior, np.broadcast_to(prior, within.shape))
         share = samples.sums(np.einsum('ms,ms->m', samples.weights, samples.weights))
         covariance += within * share[:, None, None]
-        return mean, (covariance + np.swapaxes(covariance, 1, 2)) / 2
+        return mean, symmetric(covariance)
 
 
 class MlEstimator(SearchEstimator):
@@ -320,48 +302,24 @@ class MlEstimator(SearchEstimator):
         covariance = np.matmul(
             by_point, np.linalg.solve(modes.curvature[best], np.swapaxes(by_point, 1, 2)))
         positions = np.clip(to_positions(points), *self._bounds)
-        return positions, (covariance + np.swapaxes(covariance, 1, 2)) / 2
+        return positions, symmetric(covariance)
 
 
 class WeightedModes(NamedTuple):
-    """The posterior as a mixture of M components, the most probable first.
+    """The posterior as a mixture of M components, the most probable first."""
 
-    Attributes
-    ----------
-    probabilities
-        Float64 [M]; their sum is 1.
-    positions
-        Means of the components, float64 [M, 3] [m].
-    covariances
-        Float64 [M, 3, 3] [m^2].
-    """
-
-    probabilities: np.ndarray
-    positions: np.ndarray
-    covariances: np.ndarray
+    probabilities: np.ndarray  # Float64 [M]; their sum is 1.
+    positions: np.ndarray  # Means of the components, float64 [M, 3] [m].
+    covariances: np.ndarray  # Float64 [M, 3, 3] [m^2].
 
 
 @one_blas_thread
 def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> WeightedModes | None:
-    """Compute the modes of the posterior for the signals of one phase.
+    """Compute the modes for the signals of one phase, complex128 [N_B, N_SB F] or [N_B, N_SB, F].
 
     Mean and covariance of the mixture are those of the estimate of `BayesEstimator`, up to the
-    uncertainty of the mean of its samples.
-
-    Parameters
-    ----------
-    received
-        Complex128 [N_B, N_SB F], or [N_B, N_SB, F].
-
-    Returns
-    -------
-    WeightedModes or None
-        None if the signals determine no position.
-
-    Raises
-    ------
-    SignalError
-        If the signals cannot be used.
+    uncertainty of the mean of its samples. The result is None if there is no position. Raises
+    `SignalError` if the signals cannot be used.
     """
     modes = estimator.posterior(received.reshape(len(received), -1)).modes
     if modes is None:
@@ -381,13 +339,6 @@ def weighted_modes(estimator: SearchEstimator, received: np.ndarray) -> Weighted
 def surface_of(estimator: Estimator) -> Surface | None:
     """Return what an estimator assumes to be known of the surface; None for other estimators."""
     return estimator.surface if isinstance(estimator, SearchEstimator) else None
-
-
-def _joined(parts: Sequence[Modes]) -> Modes:
-    """Join the modes of successive phases, which each part counts from 0."""
-    numbered = [one._replace(phases=np.full(len(one.phases), phase))
-                for phase, one in enumerate(parts)]
-    return Modes(*(np.concatenate(fields) for fields in zip(*numbered, strict=True)))
 
 
 def _no_fix() -> tuple[np.ndarray, np.ndarray]:

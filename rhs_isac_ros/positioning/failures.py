@@ -27,9 +27,9 @@ from rhs_isac_ros.model.impairments.elements import (
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
-from rhs_isac_ros.positioning.expansion import Means
+from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
+from rhs_isac_ros.positioning.lattice import Means
 from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
     Local,
@@ -87,14 +87,9 @@ def can_enumerate(scenario: Scenario) -> bool:
 
 
 class FailedElements:
-    """The posterior of positions if a few elements of the surface may have failed.
+    """The posterior of positions if a few elements of the surface may have failed."""
 
-    Attributes
-    ----------
-    search_margin
-        Extra margin of the search for modes, whose average over sets misjudges each set.
-    """
-
+    # Extra margin of the search for modes, whose average over sets misjudges each set.
     search_margin = 10.0
 
     def __init__(self, likelihood: Likelihood, grid: TemplateTable) -> None:
@@ -108,11 +103,10 @@ class FailedElements:
     def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
         """Return a mode of one phase for every probable set, and the likelihoods of the sets.
 
-        The most likely comes first. Likelihoods are relative to those of the search. The modes
-        are those of the search, and the signals those of the phase, N = 1.
+        The most likely comes first. Takes the modes of the search, and the signals of the phase,
+        N = 1.
         """
-        search = self._search(modes, signals)
-        return self._converge(search, signals)
+        return self._converge(self._search(modes, signals), signals)
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
         """Search for probable sets at the modes and elsewhere."""
@@ -173,27 +167,17 @@ class FailedElements:
             conditionals.append(conditional)
             parts.append(ascend(conditional, self._likelihood, starts, signals, _N_STEPS,
                                 _FIRST_MARGIN, number))
-        modes = Modes(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+        modes = concatenate(*parts)
         order = np.argsort(-modes.roi_log_likelihood)[:_MAX_HYPOTHESES]
         return modes.select(order), conditionals
 
 
 class Surface(NamedTuple):
-    """A set of failed elements.
+    """A set of failed elements."""
 
-    Attributes
-    ----------
-    failed
-        The elements, in ascending order.
-    scattered
-        T V, complex128 [N_B, N_SB F, N_E].
-    covariance
-        Covariance of the signals given the amplitudes of the direct path, complex128
-        [N_B, N_SB F, N_SB F].
-    """
-
-    failed: tuple[int, ...]
-    scattered: np.ndarray
+    failed: tuple[int, ...]  # In ascending order.
+    scattered: np.ndarray  # T V, complex128 [N_B, N_SB F, N_E].
+    # Of the signals given the amplitudes of the direct path, complex128 [N_B, N_SB F, N_SB F].
     covariance: np.ndarray
 
     def whitening(self, prior: NuisancePrior) -> 'Whitening':
@@ -205,44 +189,23 @@ class Surface(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """Factors of the covariances of H sets.
+    """Factors of the covariances of H sets."""
 
-    Attributes
-    ----------
-    whitener
-        Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
-    log_volume
-        Logarithms of the determinants, float64 [H].
-    information
-        Information of a covariance about the nuisance parameters, float64 [Q, Q].
-    """
-
-    whitener: np.ndarray
-    log_volume: np.ndarray
-    information: np.ndarray
+    whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
+    log_volume: np.ndarray  # Logarithms of the determinants, float64 [H].
+    information: np.ndarray  # Of one covariance about the nuisance parameters, float64 [Q, Q].
 
 
 class Site(NamedTuple):
-    """The signals of a phase at a point.
+    """The signals of a phase at a point."""
 
-    Attributes
-    ----------
-    point, values
-        (r [m], u, v), float64 [3], and nuisance parameters, float64 [Q].
-    columns
-        Residual of an intact surface, and derivatives of the mean with respect to the point and
-        the parameters, complex128 [4 + Q, N_B, N_SB F].
-    changes
-        Changes of the columns if an element fails, complex128 [N_E, 4 + Q, N_B, N_SB F].
-    amplitudes
-        Derivatives with respect to the scaled amplitude of a failed element, complex128
-        [N_E, N_B, N_SB F].
-    """
-
-    point: np.ndarray
-    values: np.ndarray
+    point: np.ndarray  # (r [m], u, v), float64 [3].
+    values: np.ndarray  # Nuisance parameters, float64 [Q].
+    # Residual of an intact surface, and derivatives of the mean with respect to the point and the
+    # parameters, complex128 [4 + Q, N_B, N_SB F]; and their changes if an element fails.
     columns: np.ndarray
-    changes: np.ndarray
+    changes: np.ndarray  # Complex128 [N_E, 4 + Q, N_B, N_SB F].
+    # Derivatives by the scaled amplitude of a failed element, complex128 [N_E, N_B, N_SB F].
     amplitudes: np.ndarray
 
 
@@ -252,7 +215,8 @@ class FailedSet:
     Its value includes the prior of the set, and is relative to that of `Likelihood`.
     """
 
-    def __init__(self, likelihood: Likelihood, surface: Surface, log_prior: float) -> None:
+    def __init__(self, likelihood: Likelihood, surface: Surface, amplitudes: np.ndarray,
+                 log_prior: float) -> None:
         self._likelihood, scenario = likelihood, likelihood.scenario
         self._failed = list(surface.failed)
         stuck = np.full(scenario.n_elements, np.nan)
@@ -262,7 +226,7 @@ class FailedSet:
         whitening = surface.whitening(likelihood.nuisance)
         self._whitener, self._information = whitening.whitener[:, 0], whitening.information
         self._offset = log_prior + likelihood.log_volume - whitening.log_volume[0]
-        self._amplitudes = _amplitude_weights(likelihood)[self._failed]
+        self._amplitudes = amplitudes[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
@@ -287,17 +251,6 @@ class FailedSet:
         return local._replace(value=local.value + self._offset)
 
 
-def _amplitude_weights(likelihood: Likelihood) -> np.ndarray:
-    """Weight of each element's direct path per standard deviation of an amplitude.
-
-    Returns complex128 [N_E, N_B, N_SB F].
-    """
-    scenario = likelihood.scenario
-    weights = np.matmul(likelihood.codebook.digital, onboard_matrix(scenario)) / np.sqrt(12)
-    shape = scenario.n_bands, -1, scenario.n_elements
-    return np.ascontiguousarray(np.moveaxis(weights.reshape(shape), 2, 0))
-
-
 class FailureModel:
     """Likelihood of positions and sets of failed elements under the declared share of failures."""
 
@@ -306,15 +259,16 @@ class FailureModel:
         self.likelihood, self.scenario = likelihood, scenario
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
         self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
+        # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: their changes by a failure,
+        # and per standard deviation of the amplitude of a failed element.
         weights = np.matmul(codebook.digital, onboard_matrix(scenario))
-        shift = ((0.5 - codebook.analog[:, None]) * weights).reshape(self._model.radiation.shape)
-        self._shift = np.ascontiguousarray(np.moveaxis(shift, 2, 0))
-        self._amplitudes = _amplitude_weights(likelihood)
+        self._shift, self._amplitudes = (
+            np.ascontiguousarray(np.moveaxis(one.reshape(self._model.radiation.shape), 2, 0))
+            for one in ((0.5 - codebook.analog[:, None]) * weights, weights / np.sqrt(12)))
         self._spatial = multipath_covariance(scenario)
         self._correlation = measurement_correlation(scenario)
         self._intact = Surface((), np.matmul(self._model.radiation, self._spatial),
                                self._model.covariance())
-        self._surfaces: dict[tuple[int, ...], Surface] = {}
         failing = dataclasses.replace(scenario, element_error_rms=0.0)
         self._error = DeclaredElements(failing).error_covariance(failing, codebook)
         self._extensions: dict[tuple[tuple[int, ...], float], Whitening] = {}
@@ -322,27 +276,22 @@ class FailureModel:
         self._log_odds = float(np.log(share / (1 - share)))
         self._log_intact = scenario.n_elements * float(np.log1p(-share))
         # The same set is often probable in successive phases.
-        self.failed_set = functools.lru_cache(maxsize=_MAX_SURFACES)(self._failed_set)
-        self._whitening = functools.lru_cache(maxsize=_MAX_SURFACES)(
-            lambda failed: self.surface(failed).whitening(likelihood.nuisance))
+        cache = functools.lru_cache(maxsize=_MAX_SURFACES)
+        # Surface with failed elements, in ascending order.
+        self.surface = cache(self._surface)
+        self._whitening = cache(lambda failed: self.surface(failed).whitening(likelihood.nuisance))
+        self.failed_set = cache(lambda failed: FailedSet(
+            likelihood, self.surface(failed), self._amplitudes,
+            len(failed) * self._log_odds + self._log_intact))
 
-    def _failed_set(self, failed: tuple[int, ...]) -> FailedSet:
-        return FailedSet(self.likelihood, self.surface(failed),
-                         len(failed) * self._log_odds + self._log_intact)
-
-    def surface(self, failed: tuple[int, ...]) -> Surface:
-        """Return the surface with these failed elements, in ascending order."""
+    def _surface(self, failed: tuple[int, ...]) -> Surface:
         if not failed:
             return self._intact
-        if failed not in self._surfaces:
-            smaller, element = self.surface(failed[:-1]), failed[-1]
-            shift = self._shift[element]
-            scattered = smaller.scattered + shift[..., None] * self._spatial[:, None, element]
-            growth = self._growth(smaller, slice(element, element + 1))[0]
-            if len(self._surfaces) >= _MAX_SURFACES:
-                self._surfaces.clear()
-            self._surfaces[failed] = Surface(failed, scattered, smaller.covariance + growth)
-        return self._surfaces[failed]
+        smaller, element = self.surface(failed[:-1]), failed[-1]
+        shift = self._shift[element]
+        scattered = smaller.scattered + shift[..., None] * self._spatial[:, None, element]
+        growth = self._growth(smaller, slice(element, element + 1))[0]
+        return Surface(failed, scattered, smaller.covariance + growth)
 
     def site(self, point: np.ndarray, values: np.ndarray, signals: Signals) -> Site:
         """Evaluate the signals of a phase, N = 1, at a point [3] with parameters [Q]."""
@@ -365,11 +314,11 @@ class FailureModel:
         return Site(point, values, columns, changes, elements[:, 0] * self._amplitudes)
 
     def weigh(self, surface: Surface, site: Site) -> tuple[float, float]:
-        """Return the log-probability of a surface at a site, and its deviance.
+        """Return the log-probability of a surface at a site, and its deviance, after a step.
 
-        Both are those after a Gauss-Newton step. The log-probability is relative to the prior of
-        an intact surface. The deviance is the energy of the residual plus the cost of the
-        parameters: an unknown gain lowers any energy, at a cost.
+        The log-probability is relative to the prior of an intact surface. The deviance is the
+        energy of the residual plus the cost of the parameters: an unknown gain lowers any energy,
+        at a cost.
         """
         failed, whitening = list(surface.failed), self._whitening(surface.failed)
         columns = site.columns + site.changes[failed].sum(axis=0)
@@ -446,27 +395,14 @@ class FailureModel:
 
 
 class FailureSearch:
-    """Adds failed elements to sets, one at a time, at several sites.
+    """Adds failed elements to sets, one at a time, at several sites, for the signals of a phase.
 
     The order of the extended sets follows from a likelihood that admits a few more failures; see
     `FailureModel.weigh_extensions`. Without them, the best first element of two would often be
     one that imitates the sum of both.
 
-    Parameters
-    ----------
-    signals
-        Signals of the phase, N = 1.
-    margin
-        Growth ends with sets that are less probable than the best by this, in log-probability.
-    usual_residual
-        The growth continues while no hypothesis has a lower deviance.
-
-    Attributes
-    ----------
-    sites
-        The sites.
-    values
-        Logarithm of prior times likelihood of each hypothesis.
+    Growth ends with sets that are less probable than the best by a margin, in log-probability, but
+    continues while no hypothesis has a deviance below the usual residual.
     """
 
     def __init__(self, model: FailureModel, signals: Signals, margin: float,
@@ -474,6 +410,7 @@ class FailureSearch:
         self._model, self._signals, self._margin = model, signals, margin
         self._usual_residual = usual_residual
         self.sites: list[Site] = []
+        # Logarithm of prior times likelihood of each hypothesis.
         self.values: dict[Key, float] = {}
         self._deviances: dict[Key, float] = {}
 
@@ -497,13 +434,8 @@ class FailureSearch:
     def grow(self, parents: list[Key], remainder: float = 0.0, n_extended: int = 8) -> None:
         """Add failures to hypotheses as long as the result is probable.
 
-        Parameters
-        ----------
-        remainder
-            Share of further failures, relative to the declared one, with which the sets are
-            ordered; see `FailureModel.weigh_extensions`.
-        n_extended
-            Number of sets of the same size to extend.
+        Takes the share of further failures that orders the sets, as in
+        `FailureModel.weigh_extensions`, and the number of sets of the same size to extend.
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)

@@ -24,8 +24,7 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
-from rhs_isac_ros.positioning.expansion import Means
-from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.positioning.lattice import Means, Resolution
 
 # Standard deviation of a Gaussian whose density at its centre is that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
@@ -69,22 +68,14 @@ class Signals(NamedTuple):
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
 
-    Attributes
-    ----------
-    value
-        Logarithm of likelihood and prior of the parameters, float64 [M].
-    gradient, information
-        Float64 [M, 3 + Q] and [M, 3 + Q, 3 + Q]. The information is the expected one. Observed
-        curvatures of range and phase differ by noise, and would spoil the marginal, in which the
-        two nearly cancel.
-    residual
-        Energy of the whitened residual, float64 [M].
+    The information is the expected one. Observed curvatures of range and phase differ by noise,
+    and would spoil the marginal, in which the two nearly cancel.
     """
 
-    value: np.ndarray
-    gradient: np.ndarray
-    information: np.ndarray
-    residual: np.ndarray
+    value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
+    gradient: np.ndarray  # Float64 [M, 3 + Q].
+    information: np.ndarray  # Float64 [M, 3 + Q, 3 + Q].
+    residual: np.ndarray  # Energy of the whitened residual, float64 [M].
 
 
 class Conditional(Protocol):
@@ -101,39 +92,20 @@ class NuisancePrior:
     A uniform phase has no prior, and the unit `_UNIFORM_EQUIVALENT`. If the phases of the bands
     are nearly independent, each band has a uniform phase instead of all parameters that turn whole
     bands; the range then follows from delays, amplitudes and wavefronts only.
-
-    Attributes
-    ----------
-    patterns
-        Exponents of the signals per unit, complex128 [Q, N_B, N_SB F].
-    precision
-        Of the prior, 1 or 0, float64 [Q].
-    phases
-        Phase of each band per unit [rad], float64 [N_B, Q].
-    gain
-        Gain of all signals per unit [nepers], float64 [Q].
-    volume
-        Change of the logarithm of the signals' volume per unit, float64 [Q].
-    information
-        Fisher information from the covariance of the signals, see `information_of`.
-    is_coarse
-        Whether every band has a uniform phase.
-    floor
-        Curvature of the log-likelihood in (r, u, v) that is added everywhere, float64 [3].
-    phase_covariance
-        Covariance of the phases of the bands that the scenario declares, float64 [N_B, N_B].
     """
 
     def __init__(self, model: MeasurementModel) -> None:
         nuisance = nuisance_of(model.scenario)
         n_bands, n_rows = model.shape
         patterns, phases = nuisance.scaled_patterns, nuisance.phases
+        # Covariance of the phases of the bands that the scenario declares, float64 [N_B, N_B].
         self.phase_covariance = phases @ phases.T
         centre = np.eye(n_bands) - (1 / n_bands if n_bands > 1 else 0.0)
         relative = np.linalg.eigvalsh(centre @ self.phase_covariance @ centre)[-1]
         # A phase that all bands share leaves rounding errors.
         is_shared = relative <= 1e-9 * np.trace(self.phase_covariance)
         self.relative_phase_std_rad = 0.0 if is_shared else float(np.sqrt(relative))
+        # Whether every band has a uniform phase.
         self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
         keeps = np.ones(len(nuisance), bool)
         if self.is_coarse:
@@ -145,6 +117,9 @@ class NuisancePrior:
         largest = np.abs(phases).max(axis=0, initial=0.0)
         uniform = largest > UNIFORM_STD_RAD
         scale = np.where(uniform, _UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
+        # Per unit: exponents of the signals, complex128 [Q, N_B, N_SB F]; phase of each band
+        # [rad], float64 [N_B, Q]; precision of the prior; gain of all signals [nepers]; and change
+        # of the logarithm of the signals' volume, float64 [Q].
         self.patterns, self.phases = patterns * scale[:, None, None], phases * scale
         self.precision = np.where(uniform, 0.0, 1.0)
         self.gain = self.patterns.real.mean(axis=(1, 2))
@@ -153,6 +128,7 @@ class NuisancePrior:
         self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
+        # Curvature of the log-likelihood in (r, u, v) that is added everywhere, float64 [3].
         self.floor = Resolution.of(model.scenario).curvature_floor
 
     def __len__(self) -> int:
@@ -179,7 +155,7 @@ class NuisancePrior:
         """Compute the Fisher information from a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q].
 
         The multipath reveals gains and offsets of carrier and timing, but no phase. Takes Cholesky
-        factors and their inverses, complex128 [N_B, N_SB F, N_SB F].
+        factors and their inverses.
         """
         operators = self._multiplying(root, whitener)
         both = operators + np.conj(np.swapaxes(operators, 2, 3))
@@ -190,11 +166,11 @@ class NuisancePrior:
         return np.matmul(whitener * self.patterns[:, :, None], root)
 
     def sources(self, mean: np.ndarray, divided: np.ndarray) -> np.ndarray:
-        """Choose the signals whose derivatives contain the information about the parameters.
+        """Choose the signals whose derivatives contain the information, [M, Q, N_B, N_SB F].
 
-        Takes mean signals and received ones without factors, [M, N_B, N_SB F] before or after
-        whitening; returns [M, Q, N_B, N_SB F]. A parameter that moves the multipath is visible in
-        the multipath that was received; the information about it varies from phase to phase.
+        Takes mean signals and received ones without factors, [M, N_B, N_SB F]. A parameter that
+        moves the multipath is visible in the multipath that was received; the information about
+        it varies from phase to phase.
         """
         return np.where(
             self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
@@ -273,19 +249,7 @@ class NuisancePrior:
 class Likelihood:
     """The likelihood with one covariance everywhere: the average over region and surfaces.
 
-    Attributes
-    ----------
-    model
-        Mean and covariance of the signals.
-    nuisance
-        Prior of the nuisance parameters.
-    resolution
-        Lengths over which the signals change.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
+    `CodebookError` if the codebook does not fit the scenario.
     """
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
@@ -355,12 +319,10 @@ class Likelihood:
 def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
              expected: np.ndarray, observed: np.ndarray | None = None, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
-    """Combine whitened columns to the likelihood and its derivatives.
+    """Combine whitened columns to the likelihood and its derivatives at parameters [M, Q].
 
     Parameters
     ----------
-    values
-        Parameters, float64 [M, Q].
     residual
         Signals without factors less their mean, complex128 [M, n].
     expected
@@ -518,8 +480,7 @@ def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
         return magnitude
     angle = np.angle(outputs)
     phase = angle * magnitude / (magnitude + 1 / (2 * std**2))
-    magnitude = magnitude * np.cos(angle - phase) - phase**2 / (4 * std**2)
-    return magnitude
+    return magnitude * np.cos(angle - phase) - phase**2 / (4 * std**2)
 
 
 class Alignment:
@@ -527,11 +488,10 @@ class Alignment:
 
     Offsets of carrier and timing move the signals out of the nulls of the multipath, so that they
     must be known before the search. Whatever the position, it contributes the covariance of the
-    mean signals over the region.
+    mean signals over the region, the `spread` of `tabulate`.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
-        """Take the `spread` of `tabulate`."""
         self._model, self._prior = likelihood.model, likelihood.nuisance
         self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(spread.shape[1])))
 
@@ -562,6 +522,7 @@ class Alignment:
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
+        """Compare values of the parameters whose likelihood has several maxima."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
         n_grid = _N_GRID.get(len(searched), 5)

@@ -9,7 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
+from rhs_isac_ros.positioning.coordinates import (
+    concatenate,
+    jacobian,
+    log_sum,
+    symmetric,
+    to_polar,
+    to_positions,
+)
 
 # Bounds of the intervals of the time between two phases, as shares of it, in which a turn is
 # distinguished. With one interval, the position after an early turn is too unlikely: the Gaussian
@@ -25,21 +32,11 @@ _WEIGHT_MARGIN = 18.0
 
 
 class Mixture(NamedTuple):
-    """A mixture of C Gaussians.
+    """A mixture of C Gaussians."""
 
-    Attributes
-    ----------
-    log_weights
-        Logarithm of the weights, float64 [C].
-    means
-        (r [m], u, v) and its rate [1/s], float64 [C, 6].
-    covariances
-        Float64 [C, 6, 6].
-    """
-
-    log_weights: np.ndarray
-    means: np.ndarray
-    covariances: np.ndarray
+    log_weights: np.ndarray  # Float64 [C].
+    means: np.ndarray  # (r [m], u, v) and its rate [1/s], float64 [C, 6].
+    covariances: np.ndarray  # Float64 [C, 6, 6].
 
     def select(self, chosen: np.ndarray) -> 'Mixture':
         """Return the components with the given indices or mask."""
@@ -50,13 +47,7 @@ class Mixture(NamedTuple):
         return self._replace(log_weights=self.log_weights - log_sum(self.log_weights))
 
     def positions(self, normal: np.ndarray) -> np.ndarray:
-        """Return points that represent each component, float64 [C, S, 3] [m].
-
-        Parameters
-        ----------
-        normal
-            Points that represent a standard Gaussian, float64 [S, 3].
-        """
+        """Map points that represent a standard Gaussian, [S, 3], to positions, [C, S, 3] [m]."""
         factors = np.linalg.cholesky(self.covariances[:, :3, :3])
         points = self.means[:, None, :3] + np.matmul(normal, np.swapaxes(factors, 1, 2))
         return to_positions(points)
@@ -72,18 +63,7 @@ class Mixture(NamedTuple):
                            np.swapaxes(by_rate, 1, 2))
         covariance = np.tensordot(weights, within, axes=1)
         covariance += (weights[:, None] * offsets).T @ offsets
-        return mean, (covariance + covariance.T) / 2
-
-
-def log_sum(log_values: np.ndarray) -> float:
-    """Return the logarithm of the sum of values that are given by their logarithms."""
-    highest = log_values.max()
-    return float(highest + np.log(np.sum(np.exp(log_values - highest))))
-
-
-def concatenate(*mixtures: Mixture) -> Mixture:
-    """Return the mixture of all components."""
-    return Mixture(*(np.concatenate(fields) for fields in zip(*mixtures, strict=True)))
+        return mean, symmetric(covariance)
 
 
 def reduce(mixture: Mixture, max_components: int) -> Mixture:
@@ -100,11 +80,8 @@ def reduce(mixture: Mixture, max_components: int) -> Mixture:
     free = np.ones(len(means), bool)
     group = np.full(len(means), -1)
     n_groups = 0
-    for leader in range(len(means)):
-        if not free[leader]:
-            continue
-        if n_groups == max_components:
-            break
+    while free.any() and n_groups < max_components:
+        leader = int(np.argmax(free))
         offsets = means - means[leader]
         distance = np.einsum('cp,cp->c', offsets @ precisions[leader], offsets)
         members = free & (distance < _MERGE_DISTANCE)
@@ -166,14 +143,10 @@ class Motion:
 
     def start(self, points: np.ndarray, covariances: np.ndarray,
               log_weights: np.ndarray) -> Mixture:
-        """Return a mixture with the given positions and velocities of the stationary process.
+        """Return a mixture with velocities of the stationary process.
 
-        Parameters
-        ----------
-        points, covariances
-            Mean (r [m], u, v), float64 [C, 3], and covariance, float64 [C, 3, 3].
-        log_weights
-            Logarithm of the weights, float64 [C].
+        Takes means (r [m], u, v), float64 [C, 3], covariances, [C, 3, 3], and logarithms of the
+        weights, [C], of the positions.
         """
         n = len(points)
         means, joint = np.zeros((n, 6)), np.zeros((n, 6, 6))

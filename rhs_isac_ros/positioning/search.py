@@ -34,37 +34,18 @@ _N_USUAL_STEPS = 4
 
 
 class Modes(NamedTuple):
-    """Local maxima of the posterior in or near the region of interest (ROI).
+    """Local maxima of the posterior in or near the region of interest (ROI)."""
 
-    Attributes
-    ----------
-    phases
-        Positioning phase of each mode, int [M], ascending.
-    points
-        (r [m], u, v), float64 [M, 3].
-    curvature
-        Curvature of the marginal log-likelihood in these coordinates, float64 [M, 3, 3].
-    log_likelihood
-        Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters, it is
-        minus the squared norm of the whitened residual.
-    roi_offset
-        Offset to the region of interest, from `offset_to_roi`, float64 [M, 3].
-    values
-        Nuisance parameters, float64 [M, Q].
-    residual
-        Energy of the whitened residual, float64 [M].
-    state
-        Number of the state of the surface, int [M]; 0 if there is only one.
-    """
-
-    phases: np.ndarray
-    points: np.ndarray
-    curvature: np.ndarray
+    phases: np.ndarray  # Positioning phase of each mode, int [M], ascending.
+    points: np.ndarray  # (r [m], u, v), float64 [M, 3].
+    curvature: np.ndarray  # Curvature of the marginal log-likelihood there, float64 [M, 3, 3].
+    # Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters, it is
+    # minus the energy of the whitened residual.
     log_likelihood: np.ndarray
-    roi_offset: np.ndarray
-    values: np.ndarray
-    residual: np.ndarray
-    state: np.ndarray
+    roi_offset: np.ndarray  # Offset to the region, from `offset_to_roi`, float64 [M, 3].
+    values: np.ndarray  # Nuisance parameters, float64 [M, Q].
+    residual: np.ndarray  # Energy of the whitened residual, float64 [M].
+    state: np.ndarray  # Number of the state of the surface, int [M]; 0 if there is only one.
 
     @property
     def roi_log_likelihood(self) -> np.ndarray:
@@ -94,14 +75,9 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
                aligned: np.ndarray, extra_margin: float = 0.0) -> Modes:
     """Find the modes of each of N phases with a substantial weight in the posterior.
 
-    Each phase has at least one mode, and its most likely one comes first.
-
-    Parameters
-    ----------
-    aligned
-        Parameters that the signals alone reveal, float64 [N, Q]; 0 for the others.
-    extra_margin
-        Modes may be less likely than the best by this more than usual.
+    Each phase has at least one mode, and its most likely one comes first. Takes the parameters
+    that the signals alone reveal, float64 [N, Q], 0 for the others. Modes may be less likely than
+    the best by the `extra_margin` more than usual.
     """
     starts = grid.starts(
         likelihood.whitened(aligned, signals), likelihood.nuisance, GRID_MARGIN + extra_margin)
@@ -113,14 +89,8 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
            n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
     """Take Gauss-Newton steps from points to the modes of the posterior.
 
-    Parameters
-    ----------
-    conditional
-        The likelihood of the state of the surface.
-    starts
-        Points of N phases, and parameters there.
-    margin
-        Modes that are less likely than the best of a phase by more are dropped.
+    The first argument is the likelihood of the state of the surface. Modes that are less likely
+    than the best of a phase by more than the margin are dropped.
     """
     modes, gain = _step(conditional, likelihood, starts, signals.take(starts.phases), state)
     for number in range(n_steps):

@@ -12,7 +12,7 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.positioning import grid, outside
+from rhs_isac_ros.positioning import alternatives, grid
 from rhs_isac_ros.support.files import write_whole
 
 # Maximum number of tables in a folder; the least recently used ones beyond it are deleted.
@@ -57,7 +57,7 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
 
 
 def _tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
-    return grid.tabulate(model) | outside.tabulate_outside(model)
+    return grid.tabulate(model) | alternatives.tabulate_outside(model)
 
 
 def table_key(model: MeasurementModel, codebook_id: str) -> str:

@@ -12,12 +12,12 @@ import numpy as np
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
-from rhs_isac_ros.positioning.coordinates import is_inside, jacobian
+from rhs_isac_ros.positioning.coordinates import concatenate, is_inside, jacobian, symmetric
 from rhs_isac_ros.positioning.estimate import Estimate
 from rhs_isac_ros.positioning.estimators import SearchEstimator
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
-from rhs_isac_ros.positioning.motion import Mixture, Motion, concatenate, reduce
+from rhs_isac_ros.positioning.motion import Mixture, Motion, reduce
 from rhs_isac_ros.positioning.posterior import Posterior
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -75,20 +75,13 @@ class TrackEstimate(Estimate):
 class Tracker:
     """The track of one user: a Gaussian mixture filter over the modes of the posterior.
 
-    The first position of a track is that of the estimator. A track ends with a gap of more than
+    The first position of a track is the estimate itself. A track ends with a gap of more than
     `MAX_GAP_S`; signals without a position do not change it, and neither do those whose multipath
-    is almost that of the phase before. While the user is blocked, the position is a prediction.
+    is almost equal to the previous phase's. While the user is blocked, the position is a
+    prediction. Positions are inside the region of interest.
 
-    Positions of the track are inside the region of interest. The probabilities of a user outside
-    and of a blocked one are those of the estimator.
-
-    Parameters
-    ----------
-    estimator
-        Estimator of the signals. The attribute may be replaced between phases, for example by
-        the estimator of another codebook.
-    motion
-        Assumed movement.
+    The attribute `estimator` may be replaced between phases, for example by the estimator of
+    another codebook, whose probabilities of a user outside or blocked are part of the estimates.
     """
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
@@ -100,22 +93,11 @@ class Tracker:
 
     @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
-        """Return the position and velocity at the time of a phase, from it and earlier ones.
+        """Return the position and velocity at the time [s] of a phase, from it and earlier ones.
 
-        The position for a phase that is not later than the last one follows from its signals
-        alone, and the track does not change.
-
-        Parameters
-        ----------
-        time_s
-            Time of the phase [s].
-        received
-            Signals, complex128 [N_B, N_SB F].
-
-        Raises
-        ------
-        SignalError
-            If the signals cannot be used; the track does not change.
+        Takes signals, complex128 [N_B, N_SB F]; `SignalError` if they cannot be used. The position
+        for a phase that is not later than the last one follows from its signals alone, and the
+        track does not change.
         """
         posterior = self.estimator.posterior(received)
         if posterior.modes is None:
@@ -202,7 +184,7 @@ class Tracker:
         offsets = points - mean
         covariance = (flat[:, None] * offsets).T @ offsets
         mixture = concatenate(mixture, light).normalised()
-        return mixture, mean, (covariance + covariance.T) / 2
+        return mixture, mean, symmetric(covariance)
 
 
 def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEstimate:
@@ -214,9 +196,9 @@ def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEsti
 def independent_share(scenario: Scenario, elapsed_s: float) -> float:
     """Return the share of a phase's information that the previous phase does not contain.
 
-    With the correlation rho of Eq. (4) between the phases, N phases at one place contain as much
-    information as N (1 - rho) / (1 + rho) independent ones. A negative correlation, which would
-    add information, counts as none. The result is the average over the bands.
+    With the correlation rho of Eq. (4) between the phases, averaged over the bands, N phases at
+    one place contain as much information as N (1 - rho) / (1 + rho) independent ones. A negative
+    correlation, which would add information, counts as none.
     """
     lag = np.array(elapsed_s / scenario.frame_duration_s)
     rho = np.array([float(time_correlation(scenario, band, lag, np.array(0.0)))
@@ -306,14 +288,8 @@ def _evidence(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Integrate the product of two Gaussians, one a density, the other with the maximum 1.
 
-    Returns the logarithm, float64 [...], and the precision of the offset, float64 [..., 3, 3].
-
-    Parameters
-    ----------
-    offsets
-        Differences of the means, float64 [..., 3].
-    predicted, spread
-        Covariance of the density and of the other, float64 [..., 3, 3].
+    Takes the differences of the means, float64 [..., 3], and the covariances of both. Returns the
+    logarithm, float64 [...], and the precision of the offset, float64 [..., 3, 3].
     """
     total = predicted + spread
     precision = np.linalg.inv(total)
@@ -327,5 +303,4 @@ def _shifted(mixture: Mixture, precision: np.ndarray, offsets: np.ndarray) -> Mi
     gain = np.matmul(mixture.covariances[:, :, :3], precision)
     means = mixture.means + np.matmul(gain, offsets[..., None])[..., 0]
     covariances = mixture.covariances - np.matmul(gain, mixture.covariances[:, :3])
-    covariances = (covariances + np.swapaxes(covariances, 1, 2)) / 2
-    return mixture._replace(means=means, covariances=covariances)
+    return mixture._replace(means=means, covariances=symmetric(covariances))

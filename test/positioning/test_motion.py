@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.positioning.coordinates import jacobian, to_polar, to_positions
-from rhs_isac_ros.positioning.motion import Mixture, Motion, concatenate, log_sum, reduce
+from rhs_isac_ros.positioning.coordinates import (
+    concatenate,
+    jacobian,
+    log_sum,
+    to_polar,
+    to_positions,
+)
+from rhs_isac_ros.positioning.motion import Mixture, Motion, reduce
 
 PLACE = np.array([[9.0, -2.0, 0.5], [6.0, 3.0, -0.5]])
 
