@@ -15,7 +15,7 @@ The modules, in the order in which they are best read:
   finds the modes if elements have failed
 * `posterior`, from modes to samples; `alternatives` to a user in the region; and `diagnosis`,
   whether the signals fit the model
-* `motion` and `tracking`; `neural`, the paper's network; `store`, which keeps tables in files
+* `tracking`; `neural`, the paper's network; and `store`, which keeps tables in files
 """
 
 from collections.abc import Callable, Mapping
@@ -33,10 +33,9 @@ from rhs_isac_ros.positioning.estimators import (
     surface_of,
     weighted_modes,
 )
-from rhs_isac_ros.positioning.motion import Motion
 from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator, train
 from rhs_isac_ros.positioning.simulate import simulate_pairs
-from rhs_isac_ros.positioning.tracking import Tracker, TrackEstimate
+from rhs_isac_ros.positioning.tracking import Motion, Tracker, TrackEstimate
 from rhs_isac_ros.support import plugins
 
 ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
@@ -56,15 +55,10 @@ def make_estimator(
         name: str, scenario: Scenario, codebook: Codebook, **options: Any) -> Estimator:
     """Create an estimator by its name.
 
-    Parameters
-    ----------
-    name
-        A key of `ESTIMATORS`, or an entry point of the group `plugins.ESTIMATORS`.
-    **options
-        ``table_folder``, a folder for tables, and ``reject_outside``, whether users outside of
-        the region get no fix, and ``surface``, what is known of the surface, for
-        `REGION_ESTIMATORS`; ``model_file``, a `Network` or its file, for `neural`. Plug-ins define
-        their own options.
+    The options of `REGION_ESTIMATORS` are ``table_folder``, a folder for tables,
+    ``reject_outside``, whether users outside of the region get no fix, and ``surface``, what is
+    known of the surface. `neural` requires ``model_file``, a `Network` or its file. Plug-ins
+    define their own options.
 
     Raises
     ------

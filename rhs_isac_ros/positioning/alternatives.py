@@ -56,24 +56,12 @@ _MARGIN = 30.0
 
 
 class Alternative(Protocol):
-    """An alternative to a user in the region with a direct path.
+    """An alternative to a user in the region with a direct path."""
 
-    Attributes
-    ----------
-    name
-        `Estimate` has the field ``<name>_probability``.
-    reason
-        Why there is no fix.
-    limit
-        Largest probability with a fix, if there are no other alternatives.
-    log_odds
-        Logarithm of the prior probability relative to that of a user in the region in sight.
-    """
-
-    name: str
-    reason: str
-    limit: float
-    log_odds: float
+    name: str  # `Estimate` has the field ``<name>_probability``.
+    reason: str  # Why there is no fix.
+    limit: float  # Largest probability with a fix, if there are no other alternatives.
+    log_odds: float  # Logarithm of the prior odds against a user in the region in sight.
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
                         ) -> float:
@@ -114,18 +102,14 @@ class Blocked:
 
 
 def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
-    """Compute templates of the half space in front of the surface.
+    """Compute the arrays of `Outside`: templates of the half space in front of the surface.
 
     A template is a whitened mean times range and carrier, which depends on the direction and, via
-    the curvature of the wavefront and the delays of the sub-bands, slowly on the range.
-
-    Returns
-    -------
-    dict of numpy.ndarray
-        ``outer_filters``, the conjugate templates for T ranges and V directions, complex64
-        [N_B, T V, N_SB F]; ``outer_energy`` of the templates [m^2], float32 [T, V];
-        ``outer_index``, the template range of each of R ranges, int64 [R]; and ``outer_weights``,
-        the prior probability of ranges and directions, 0 inside the region, float64 [R, V].
+    the curvature of the wavefront and the delays of the sub-bands, slowly on the range. For T
+    template ranges, R ranges and V directions, the arrays are ``outer_filters``, the conjugate
+    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy``, theirs [m^2], float32 [T, V];
+    ``outer_index``, the template of each range, int64 [R]; and ``outer_weights``, the prior
+    probability of ranges and directions, 0 inside the region, float64 [R, V].
     """
     scenario = model.scenario
     ranges, directions = _ranges(scenario), _directions(scenario)
@@ -172,10 +156,7 @@ class Outside:
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
                         ) -> float:
-        """Compute the evidence, as `Alternative` describes.
-
-        The gain is integrated numerically; phases have no effect.
-        """
+        """Compute the evidence, as `Alternative` describes; phases have no effect."""
         gain = np.zeros(1)
         if prior.gain_std:
             n_points = 2 * int(np.ceil(_GAIN_REACH * prior.gain_std / _GAIN_STEP)) + 3
@@ -186,11 +167,7 @@ class Outside:
                 + prior.log_evidence_of_aligned(aligned))
 
     def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
-        """Compute the logarithm of the likelihood averaged over the prior, for factors of signals.
-
-        The likelihood is relative to that of signals without noise, as in `Modes`: at a mean t,
-        it is ``exp(-|y - t|^2)``.
-        """
+        """Average the likelihood ``exp(-|y - t|^2)`` over the prior, for scales of the signals."""
         filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
         # Whatever the range, the log-likelihood is at most that of outputs in phase.
         bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
@@ -221,10 +198,7 @@ ALTERNATIVES: tuple[type[Outside] | type[Blocked], ...] = (Outside, Blocked)
 
 
 def probabilities_of(estimate: object) -> dict[str, float]:
-    """Return the probabilities in an `Estimate` or a message, by the names of the alternatives.
-
-    Those that the estimator does not consider are absent.
-    """
+    """Return the known probabilities in an `Estimate` or a message, by names of alternatives."""
     values = {kind.name: float(getattr(estimate, f'{kind.name}_probability'))
               for kind in ALTERNATIVES}
     return {name: value for name, value in values.items() if not math.isnan(value)}
@@ -244,10 +218,7 @@ def shares(log_weights: np.ndarray) -> np.ndarray:
 
 
 def rejection(alternative: Alternative, probability: float) -> str:
-    """Reject signals for their probability under an alternative, or return an empty text.
-
-    The probability is relative to a user in the region in sight, without other alternatives.
-    """
+    """Reject signals for the probability of an alternative alone, or return an empty text."""
     if probability <= alternative.limit:
         return ''
     return (f'{alternative.reason}: probability {probability:.6g}, expected at most '

@@ -74,18 +74,9 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
     """Compute the offsets from modes to the nearest points of the region of interest.
 
     The offset follows the sphere of the mode's range, the coordinate that the signals determine
-    best. The range then changes with the direction so that the likelihood is highest.
-
-    Parameters
-    ----------
-    points
-        Modes (r [m], u, v), float64 [M, 3]; the offsets, 0 inside, have the same form.
-    curvature
-        Curvature of the log-likelihood at each mode, float64 [M, 3, 3].
-    bounds
-        Lower and upper vertex of the region, float64 [2, 3] [m].
-    tolerance_m
-        Distance from the sphere that counts as zero.
+    best. The range then changes with the direction so that the likelihood is highest. Takes modes
+    (r [m], u, v), float64 [M, 3], the curvature of the log-likelihood there, the bounds of the
+    region, float64 [2, 3], and the distance from the sphere that counts as zero.
     """
     positions = to_positions(points)
     result = np.zeros_like(points)

@@ -59,11 +59,7 @@ _MAX_DISPERSION = 1.2
 
 
 class FitTest:
-    """Tests of whitened signals; each returns a reason, which is empty if the signals pass.
-
-    An energy is the squared norm of a whitened signal, and `n_measurements` is the number of
-    complex measurements of a positioning phase, N_B N_SB F.
-    """
+    """Tests of the energy of N_B N_SB F whitened signals; each returns a reason, or ''."""
 
     def __init__(self, n_measurements: int) -> None:
         # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
@@ -85,15 +81,12 @@ class FitTest:
     def max_energy_test(self, energy: float, max_mean_energy: float) -> str:
         """Reject signals stronger than noise plus the strongest whitened mean in the region."""
         # The norm of a sum is at most the sum of the norms.
-        return _excess(
-            _ENERGY, energy, (max_mean_energy**0.5 + self.max_residual**0.5)**2)
+        return _excess(_ENERGY, energy, (max_mean_energy**0.5 + self.max_residual**0.5)**2)
 
     def weak_test(self, energy: float, residual: float) -> str:
-        """Reject signals that are weaker than the multipath, unless it is a direct path.
-
-        Multipath may be weaker than in the model. The direct path at the best position then
-        explains most of the energy.
-        """
+        """Reject signals that are weaker than the multipath, unless they are a direct path."""
+        # Multipath may be weaker than in the model. The direct path at the best position then
+        # explains most of the energy.
         excess = _excess(_RESIDUAL, residual, self._weak_share * energy)
         if energy >= self.min_energy or not excess:
             return ''
@@ -194,8 +187,7 @@ class _Residual(NamedTuple):
 def _probability(total: _Residual, n: int) -> float:
     """Probability of a sum at least as far from the expected sum of `n` energies, on either side.
 
-    A sum below the expectation counts, too: the assumed multipath is then too strong in some
-    directions of the signals, and may be too weak in others.
+    Below it, the assumed multipath is too strong in some directions, and too weak in others.
     """
     # Every node imports this package, and SciPy takes longer to load than ROS.
     from scipy.special import gammainc, gammaincc
@@ -207,71 +199,56 @@ def _probability(total: _Residual, n: int) -> float:
 
 
 def _spread_probability(total: _Residual, n: int) -> float:
-    """Probability of a sum of `n` squared deviations that is at least as large.
-
-    The sum is approximately a gamma variable. The square of a normalised gamma variable of shape
-    k has the mean 1 and the variance 2 + 6 / k.
-    """
+    """Probability of a sum of `n` squared deviations that is at least as large."""
     from scipy.special import gammaincc
 
+    # The sum is approximately a gamma variable. The square of a normalised gamma variable of
+    # shape k has the mean 1 and the variance 2 + 6 / k.
     mean = n * (1 + _SPREAD_TOLERANCE)
     variance = total.square_variance * (1 + _SPREAD_TOLERANCE)**2
     return float(gammaincc(mean**2 / variance, max(total.square, 0.0) * mean / variance))
-
-
-class _Cycle(NamedTuple):
-    """The estimate of a cycle."""
-
-    subject: str  # Of the reason, empty with a fix.
-    residual: float
-    expected: float
-    probabilities: dict[str, float]
 
 
 class Diagnosis:
     """Fixes, residuals and probabilities of the latest cycles."""
 
     def __init__(self) -> None:
-        self._cycles: collections.deque[_Cycle] = collections.deque(maxlen=WINDOW)
+        self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
     def add(self, estimate: Estimate) -> None:
         """Add the estimate of a cycle."""
-        self._cycles.append(_Cycle(
-            str(estimate.reason).partition(':')[0], float(estimate.residual),
-            float(estimate.expected_residual), probabilities_of(estimate)))
+        self._estimates.append(estimate)
 
     def clear(self) -> None:
         """Forget all cycles."""
-        self._cycles.clear()
+        self._estimates.clear()
 
     def status(self, deviates: bool) -> dict[str, str]:
-        """Return the values for the diagnostics.
+        """Return the values for the diagnostics, as texts.
 
-        Takes whether the residuals deviate from the scenario, so that the probabilities are wrong.
-
-        Returns
-        -------
-        dict
-            ``probability.<alternative>``, the mean over the cycles, which is the share of such
-            users; and if there are cycles without a fix, ``no_fix.share`` and ``no_fix.cause``.
+        They are ``probability.<alternative>``, the share of such users; and if there are cycles
+        without a fix, ``no_fix.share`` and ``no_fix.cause``. If the residuals deviate from the
+        scenario, the probabilities are wrong.
         """
         values = {}
+        probabilities = [probabilities_of(one) for one in self._estimates]
         for kind in ALTERNATIVES:
-            found = [cycle.probabilities[kind.name] for cycle in self._cycles
-                     if kind.name in cycle.probabilities]
+            found = [each[kind.name] for each in probabilities if kind.name in each]
             if found:
                 values[f'probability.{kind.name}'] = f'{np.mean(found):.3f}'
-        subjects = collections.Counter(one.subject for one in self._cycles if one.subject)
+        # What precedes the colon is the subject of a reason.
+        subjects = collections.Counter(
+            str(one.reason).partition(':')[0] for one in self._estimates if one.reason)
         if subjects:
-            values['no_fix.share'] = f'{sum(subjects.values())} of {len(self._cycles)}'
+            values['no_fix.share'] = f'{sum(subjects.values())} of {len(self._estimates)}'
             values['no_fix.cause'] = self._cause(subjects.most_common(1)[0][0], deviates)
         return values
 
     def _cause(self, subject: str, deviates: bool) -> str:
         """Return the likely cause, given the most frequent subject of the reasons."""
         residual, expected = np.array([
-            (one.residual, one.expected) for one in self._cycles
-            if one.residual > 0 and one.expected > 0]).reshape(-1, 2).T
+            (one.residual, one.expected_residual) for one in self._estimates
+            if one.residual > 0 and one.expected_residual > 0]).reshape(-1, 2).T
         is_alternative = subject in {kind.reason for kind in ALTERNATIVES}
         if len(residual) < MIN_FIXES or is_alternative and not deviates:
             return subject

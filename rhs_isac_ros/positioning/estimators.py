@@ -29,7 +29,7 @@ from rhs_isac_ros.positioning.estimate import (
     estimate_each,
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.grid import Starts, TemplateTable, standard_normal
+from rhs_isac_ros.positioning.grid import TemplateTable, standard_normal
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
@@ -87,11 +87,6 @@ class SearchEstimator(abc.ABC):
         probability, while position and covariance remain those of a user inside.
     surface
         What is known of the surface, as in `MeasurementModel`; for example a calibration.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
     """
 
     @one_blas_thread
@@ -99,6 +94,7 @@ class SearchEstimator(abc.ABC):
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None, *, reject_outside: bool = False,
             surface: Surface | None = None) -> None:
+        self.scenario, self.surface = scenario, surface
         self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
         arrays = load_table(likelihood.model, codebook.id, table_folder)
         self._grid = TemplateTable(scenario, arrays)
@@ -110,7 +106,6 @@ class SearchEstimator(abc.ABC):
         prior, n_measurements = likelihood.nuisance, int(np.prod(likelihood.model.shape))
         self._test = FitTest(n_measurements)
         self._bounds = likelihood.resolution.bounds_m
-        self._volume_m3 = likelihood.resolution.volume_m3
         self._alignment = Alignment(likelihood, self._grid.spread)
         self._phases = BandPhases(likelihood)
         self._failures = (FailedElements(likelihood, self._grid)
@@ -120,8 +115,13 @@ class SearchEstimator(abc.ABC):
         # each fitted parameter.
         n_fitted = _N_COORDINATES + len(prior)
         self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
+        # Points that represent a standard Gaussian, float64 [128, 3].
+        self.normal = self._grid.normal
         self._normal = (standard_normal(_N_INFORMATIVE) if self._phases.is_informative
-                        else self._grid.normal)
+                        else self.normal)
+        # The likelihood of positions; None if it also depends on other unknowns.
+        self.exact_likelihood = None if (
+            len(prior) or self._failures or self._dispersed) else likelihood
 
     @one_blas_thread
     def estimate(self, received: np.ndarray) -> Estimate:
@@ -136,44 +136,20 @@ class SearchEstimator(abc.ABC):
         ((located, modes),) = self._locate_block(signals)
         return Posterior(Estimate(*located), modes, signals)
 
-    @property
-    def normal(self) -> np.ndarray:
-        """Points that represent a standard Gaussian, float64 [128, 3]."""
-        return self._grid.normal
-
-    @property
-    def exact_likelihood(self) -> Likelihood | None:
-        """The likelihood of positions; None if it also depends on other unknowns."""
-        is_exact = not (len(self._likelihood.nuisance) or self._failures or self._dispersed)
-        return self._likelihood if is_exact else None
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario of the signals."""
-        return self._likelihood.scenario
-
-    @property
-    def surface(self) -> Surface | None:
-        """What the estimator assumes to be known of the surface."""
-        return self._likelihood.surface
-
     @abc.abstractmethod
-    def _moments(
-            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         """Return positions, [N, 3], and covariances, [N, 3, 3], of N phases."""
 
     def _locate(self, batch: np.ndarray) -> Iterable[Located]:
         signals = self._likelihood.signals(batch)
         blocks = map_blocks(
-            lambda start: self._locate_block(
-                signals.take(np.arange(start, min(start + _BLOCK, len(batch))))),
+            lambda start: self._locate_block(signals.take(slice(start, start + _BLOCK))),
             range(0, len(batch), _BLOCK))
         return (located for located, _ in itertools.chain.from_iterable(blocks))
 
     def _locate_block(self, signals: Signals) -> list[tuple[Located, Modes | None]]:
         """Locate phases together: position or reason, and modes if there is a position."""
-        energies = (np.sum(np.abs(signals.received)**2, axis=(1, 2))
-                    / self.scenario.noise_power_w)
+        energies = np.sum(np.abs(signals.received)**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = [self._test.min_energy_test(energy) for energy in energies.tolist()]
         results: list[tuple[Located, Modes | None]] = [
             ((*_no_fix(), reason), None) for reason in reasons]
@@ -192,8 +168,7 @@ class SearchEstimator(abc.ABC):
         modes = find_modes(likelihood, self._grid, signals, aligned, extra_margin=extra)
         conditionals: list[Sequence[Conditional]] = [[likelihood]] * len(aligned)
         if self._dispersed:
-            starts = Starts(modes.phases, modes.roi_points, modes.values)
-            modes = ascend(self._dispersed, likelihood, starts, signals, 1, np.inf)
+            modes = ascend(self._dispersed, likelihood, modes.starts(), signals, 1, np.inf)
         if self._failures:
             refined = [self._failures.refine(modes.of_phase(phase), signals.repeated(phase))
                        for phase in range(len(aligned))]
@@ -218,8 +193,8 @@ class SearchEstimator(abc.ABC):
         """Yield the position of each phase, or why there is none, and its modes."""
         modes = found.modes
         samples = WeightedSamples.of(found.samples, modes)
-        log_weights = np.column_stack(
-            [samples.log_evidence(self._volume_m3), found.log_weights])
+        log_weights = np.column_stack([
+            samples.log_evidence(self._likelihood.resolution.volume_m3), found.log_weights])
         probabilities = shares(log_weights)
         means, covariances = self._moments(modes, samples)
         # Averaged over the posterior, the energy of a model that holds has the mean of a
@@ -232,8 +207,7 @@ class SearchEstimator(abc.ABC):
             best = start + int(np.argmax(likelihood[start:end]))
             residual = float(modes.residual[best])
             gain = modes.values[best] @ self._likelihood.nuisance.gain
-            reason = self._reason(
-                found.whitened[row] * np.exp(-gain), residual, log_weights[row])
+            reason = self._reason(found.whitened[row] * np.exp(-gain), residual, log_weights[row])
             moments = _no_fix() if reason else (means[row], covariances[row])
             # Of signals without a fix, only a residual that nothing explains is evidence against
             # the scenario.
@@ -247,11 +221,9 @@ class SearchEstimator(abc.ABC):
                    None if reason else modes.select(slice(start, end)))
 
     def _reason(self, whitened: np.ndarray, residual: float, log_weights: np.ndarray) -> str:
-        """Return why there is no fix, empty if there is one.
-
-        If no position of the region explains the signals, an alternative has to explain them to
-        be the reason.
-        """
+        """Return why there is no fix, empty if there is one."""
+        # If no position of the region explains the signals, an alternative has to explain them to
+        # be the reason.
         unexplained = self._test.residual_test(residual) or self._test.weak_test(
             float(np.sum(np.abs(whitened)**2)), residual)
         for index in np.argsort(-log_weights[1:]).tolist():
@@ -264,15 +236,11 @@ class SearchEstimator(abc.ABC):
 
 
 class BayesEstimator(SearchEstimator):
-    """Mean and covariance of the posterior, from the Gaussians of all modes inside the region.
-
-    Parameters and errors are those of `SearchEstimator`.
-    """
+    """Mean and covariance of the posterior, from the Gaussians of all modes inside the region."""
 
     name = 'bayes'
 
-    def _moments(
-            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         mean, covariance = samples.moments()
         # The mean of few samples is itself uncertain; its covariance never exceeds that of the
         # prior.
@@ -285,16 +253,11 @@ class BayesEstimator(SearchEstimator):
 
 
 class MlEstimator(SearchEstimator):
-    """The most likely position in the region of interest.
-
-    The covariance is the inverse curvature of the log-likelihood there and does not account for
-    other modes. Parameters and errors are those of `SearchEstimator`.
-    """
+    """The most likely position in the region, with the inverse curvature as its covariance."""
 
     name = 'ml'
 
-    def _moments(
-            self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self, modes: Modes, samples: WeightedSamples) -> tuple[np.ndarray, np.ndarray]:
         order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
         best = order[samples.starts]
         points = modes.roi_points[best]
@@ -308,9 +271,9 @@ class MlEstimator(SearchEstimator):
 class WeightedModes(NamedTuple):
     """The posterior as a mixture of M components, the most probable first."""
 
-    probabilities: np.ndarray  # Float64 [M]; their sum is 1.
-    positions: np.ndarray  # Means of the components, float64 [M, 3] [m].
-    covariances: np.ndarray  # Float64 [M, 3, 3] [m^2].
+    probabilities: np.ndarray  #: Float64 [M]; their sum is 1.
+    positions: np.ndarray  #: Means of the components, float64 [M, 3] [m].
+    covariances: np.ndarray  #: Float64 [M, 3, 3] [m^2].
 
 
 @one_blas_thread

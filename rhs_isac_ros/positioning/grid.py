@@ -32,6 +32,7 @@ from rhs_isac_ros.positioning.lattice import (
     Resolution,
     lay_grid,
     subband_wavenumbers,
+    whiten,
 )
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
 from rhs_isac_ros.support.threads import map_blocks
@@ -63,16 +64,13 @@ _STEP_ERROR = 0.5
 def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
     """Compute the arrays of a `TemplateTable`, for G templates and C pairs with a range cell.
 
-    Returns
-    -------
-    dict of numpy.ndarray
-        ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``,
-        their derivatives with respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy``
-        of the whitened means, float32 [C]; ``energy_slope``, its derivative, float32 [C, 3];
-        ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``spread``, the mean of the outer
-        products of the whitened means, and ``whitener``, inverse Cholesky factors of the
-        covariance, complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a
-        standard Gaussian, float64 [128, 3].
+    They are ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``,
+    their derivatives with respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of
+    the whitened means, float32 [C]; ``energy_slope``, its derivative, float32 [C, 3];
+    ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``spread``, the mean of the outer
+    products of the whitened means, and ``whitener``, inverse Cholesky factors of the covariance,
+    complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a standard Gaussian,
+    float64 [128, 3].
     """
     grid, (n_bands, n_rows) = lay_grid(model.scenario), model.shape
     points = grid.points
@@ -101,15 +99,10 @@ def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
         spread = np.zeros((n_bands, n_rows, n_rows), complex)
         cells = order[bounds[nodes.start]:bounds[nodes.stop]]
         for part in np.array_split(cells, -(-len(cells) // _BLOCK)):
-            mean, slopes = expansion.at(grid.node[part] - nodes.start, points[part])
-            columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
-            white = np.matmul(columns.reshape(n_bands, -1, n_rows),
-                              np.swapaxes(model.whitener, 1, 2))
-            white = white.reshape(n_bands, len(part), 4, n_rows)
-            spread += np.einsum('icr,ics->irs', white[:, :, 0], white[:, :, 0].conj(),
-                                optimize=True)
-            flat = np.moveaxis(white, 0, 2).reshape(len(part), 4, -1)
-            form = quadratic_form(flat)
+            white = whiten(model, *expansion.at(grid.node[part] - nodes.start, points[part]))
+            mean = np.moveaxis(white[:, 0], 1, 0)
+            spread += np.einsum('icr,ics->irs', mean, mean.conj(), optimize=True)
+            form = quadratic_form(white.reshape(len(part), 4, -1))
             table['energy'][part] = form[:, 0, 0] / 2
             table['energy_slope'][part] = form[:, 0, 1:]
             table['curvature'][part] = form[:, 1:, 1:]
@@ -182,8 +175,7 @@ class TemplateTable:
         carrier and timing; and the negative logarithm of the share of the posterior that points
         may leave out. The points of a phase do not depend on the other phases.
         """
-        weighted = np.swapaxes(
-            np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
+        weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
         energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
         n = max(1, _N_OUTPUTS // (len(self._energy) * len(self._wavenumbers)))
         parts = []
@@ -238,13 +230,11 @@ class TemplateTable:
             step, value = self._step(query, peaks, points, values)
             points = points + step
         error = _STEP_ERROR * self._loss[peaks.cell]
-        value = value - self._loss_outside(
-            peaks.phases, points, peaks.cell, value, margin + error)
+        value = value - self._loss_outside(peaks.phases, points, peaks.cell, value, margin + error)
         order = np.lexsort((-value, peaks.phases))
         order = order[np.isfinite(value[order])]
         firsts = first_of_each(peaks.phases[order])
-        slack = error[order] + np.repeat(
-            error[order[firsts]], np.diff(firsts, append=len(order)))
+        slack = error[order] + np.repeat(error[order[firsts]], np.diff(firsts, append=len(order)))
         order = order[heaviest(peaks.phases[order], value[order], margin + slack)]
         phases, points, values = peaks.phases[order], points[order], values[order]
         chosen = separate(phases, points, self._resolution.separation(prior.is_coarse),
@@ -265,8 +255,7 @@ class TemplateTable:
         rows, others = np.nonzero(bound + self._loss >= limit[:, None])
         if len(rows):
             peaks = concatenate(peaks, self._peaks_of(rows, others, query))
-        likely = np.flatnonzero(
-            peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
+        likely = np.flatnonzero(peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
         likely = likely[np.lexsort((-peaks.value[likely], peaks.phases[likely]))]
         phases = peaks.phases[likely]
         place = np.arange(len(likely)) - np.searchsorted(phases, phases)
@@ -346,10 +335,7 @@ class TemplateTable:
 
     def _step(self, query: '_Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss-Newton steps from peaks, [P, 3], and the likelihood that they predict, [P].
-
-        Between grid points, a sharp mode is much higher.
-        """
+        """Gauss-Newton steps from peaks, [P, 3], and the likelihood that they predict, [P]."""
         grid, prior, node = self._grid, query.prior, self._grid.node[peaks.cell]
         pairs, index = np.unique(peaks.phases * len(grid.nodes) + node, return_inverse=True)
         phase, its_node = np.divmod(pairs, len(grid.nodes))
@@ -388,10 +374,7 @@ class TemplateTable:
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Loss of log-likelihood from points to the region, [P]: 0 inside.
-
-        The loss is infinite for points that are too unlikely even without it.
-        """
+        """Loss of log-likelihood from points to the region, [P]; infinite for unlikely points."""
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         best = np.full(phases.max(initial=0) + 1, -np.inf)

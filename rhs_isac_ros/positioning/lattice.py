@@ -248,6 +248,14 @@ class Expansion(NamedTuple):
         return mean, slopes
 
 
+def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Whiten the results of `Expansion.at`, complex128 [M, 4, N_B, N_SB F]."""
+    n_bands, n_rows = model.shape
+    columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
+    white = np.matmul(columns.reshape(n_bands, -1, n_rows), np.swapaxes(model.whitener, 1, 2))
+    return np.moveaxis(white.reshape(n_bands, len(mean), 4, n_rows), 0, 2)
+
+
 class Means:
     """Mean signals and their derivatives; neighbouring points share one expansion.
 

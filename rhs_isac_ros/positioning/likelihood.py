@@ -11,7 +11,6 @@ and tracks use only `Conditional`, whatever the impairments are.
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -24,7 +23,7 @@ from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
-from rhs_isac_ros.positioning.lattice import Means, Resolution
+from rhs_isac_ros.positioning.lattice import Means, Resolution, whiten
 
 # Standard deviation of a Gaussian whose density at its centre is that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
@@ -123,6 +122,13 @@ class NuisancePrior:
         self.patterns, self.phases = patterns * scale[:, None, None], phases * scale
         self.precision = np.where(uniform, 0.0, 1.0)
         self.gain = self.patterns.real.mean(axis=(1, 2))
+        # Standard deviations of the gain of all signals [nepers], 0 if it is negligible, and of
+        # the phase of each band, infinite if it is uniform, float64 [N_B].
+        gain_std = np.linalg.norm(self.gain)
+        phase_std = np.sqrt(np.diagonal(self.phase_covariance))
+        self.gain_std = float(gain_std) if gain_std > _MIN_GAIN_STD else 0.0
+        self.phase_std_rad = np.where(
+            self.is_coarse | (phase_std > UNIFORM_STD_RAD), np.inf, phase_std)
         self.volume = 2 * self.patterns.real.sum(axis=(1, 2))
         self.needs_search = np.append(nuisance.needs_search[keeps], np.zeros(n_added, bool))
         self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
@@ -135,28 +141,13 @@ class NuisancePrior:
         """Return the number Q of parameters."""
         return len(self.patterns)
 
-    @functools.cached_property
-    def gain_std(self) -> float:
-        """Standard deviation of the gain of all signals [nepers]; 0 if it is negligible."""
-        std = float(np.linalg.norm(self.gain))
-        return std if std > _MIN_GAIN_STD else 0.0
-
-    @functools.cached_property
-    def phase_std_rad(self) -> np.ndarray:
-        """Standard deviation of the phase of each band, infinite if uniform, float64 [N_B]."""
-        std = np.sqrt(np.diagonal(self.phase_covariance))
-        return np.where(self.is_coarse | (std > UNIFORM_STD_RAD), np.inf, std)
-
     def divide(self, received: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Remove the factors of parameters [..., Q] from signals [..., N_B, N_SB F]."""
         return received * np.exp(-np.tensordot(values, self.patterns, axes=1))
 
     def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
-        """Compute the Fisher information from a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q].
-
-        The multipath reveals gains and offsets of carrier and timing, but no phase. Takes Cholesky
-        factors and their inverses.
-        """
+        """Compute the Fisher information of a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q]."""
+        # The multipath reveals gains and offsets of carrier and timing, but no phase.
         operators = self._multiplying(root, whitener)
         both = operators + np.conj(np.swapaxes(operators, 2, 3))
         return np.einsum('aimn,binm->ab', both, both, optimize=True).real
@@ -165,15 +156,21 @@ class NuisancePrior:
         """Compute W P W^-1, which multiplies whitened signals, [Q, N_B, N_SB F, N_SB F]."""
         return np.matmul(whitener * self.patterns[:, :, None], root)
 
-    def sources(self, mean: np.ndarray, divided: np.ndarray) -> np.ndarray:
-        """Choose the signals whose derivatives contain the information, [M, Q, N_B, N_SB F].
+    def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
+                slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
+        """Return the residual and its derivatives at M points, complex128 [M, C, N_B, N_SB F].
 
-        Takes mean signals and received ones without factors, [M, N_B, N_SB F]. A parameter that
-        moves the multipath is visible in the multipath that was received; the information about
-        it varies from phase to phase.
+        After the residual, the columns are the derivatives of the mean with respect to the point,
+        of the signals that contain the information about the parameters, of the mean with respect
+        to further `linear` parameters, and of the received signals with respect to the parameters.
         """
-        return np.where(
-            self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
+        divided = self.divide(received, values)
+        # A parameter that moves the multipath is visible in the multipath that was received; the
+        # information about it varies from phase to phase.
+        sources = np.where(self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
+        return np.concatenate([
+            (divided - mean)[:, None], slopes, self.patterns * sources, *linear,
+            self.patterns * divided[:, None]], axis=1)
 
     def slopes(self, whitened: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
@@ -189,19 +186,13 @@ class NuisancePrior:
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Integrate over the parameters that move the multipath by Laplace's method.
-
-        Takes the values [Q] that the signals alone reveal, relative to which the result is.
-        """
+        """Integrate over the parameters that move the multipath, relative to the aligned [Q]."""
         (moves,) = np.nonzero(self.moves_multipath)
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
-        """Sum the outputs of the bands' matched filters in their most likely phases.
-
-        Takes complex [N_B, ...]. Each rotation costs half of its improbability.
-        """
+        """Sum the outputs of the bands' matched filters, [N_B, ...], in their likely phases."""
         if not self.relative_phase_std_rad:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
@@ -247,10 +238,7 @@ class NuisancePrior:
 
 
 class Likelihood:
-    """The likelihood with one covariance everywhere: the average over region and surfaces.
-
-    `CodebookError` if the codebook does not fit the scenario.
-    """
+    """The likelihood with one covariance everywhere: the average over region and surfaces."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
                  surface: Surface | None = None) -> None:
@@ -260,6 +248,7 @@ class Likelihood:
         self.model = MeasurementModel(scenario, codebook, surface).prepare(jacobian=True)
         self.nuisance = NuisancePrior(self.model)
         self.resolution, self._means = Resolution.of(scenario), Means(self.model)
+        self.log_volume = float(log_determinant(self.model.root).sum())
 
     def signals(self, received: np.ndarray) -> Signals:
         """Whiten signals [N, N_B, N_SB F]."""
@@ -273,34 +262,25 @@ class Likelihood:
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
-        n = len(points)
-        means, slopes = self._means(points)
-        columns = np.moveaxis(np.concatenate([means[:, None], slopes], axis=1), 2, 0)
-        shape = self.model.shape
-        white = np.matmul(columns.reshape(shape[0], -1, shape[1]),
-                          np.swapaxes(self.model.whitener, 1, 2))
-        white = np.moveaxis(white.reshape(shape[0], n, 4, shape[1]), 0, 2)
-        mean, derivative = white[:, 0], white[:, 1:].reshape(n, 3, -1)
-        whitened = self.whitened(values, signals)
-        residual = (whitened - mean).reshape(n, -1)
+        n, white = len(points), whiten(self.model, *self._means(points))
+        mean, whitened = white[:, 0], self.whitened(values, signals)
+        residual, derivative = (whitened - mean).reshape(n, -1), white[:, 1:].reshape(n, 3, -1)
         if len(self.nuisance):
             observed = self.nuisance.slopes(whitened)
             moves = self.nuisance.moves_multipath[:, None]
             expected = np.where(moves, observed, self.nuisance.slopes(mean))
-            return assemble(self.nuisance, values, residual,
-                            np.concatenate([derivative, expected], axis=1), observed)
-        # Re(a^H b) is the inner product of real and imaginary parts.
+            return assemble(self.nuisance, values, np.concatenate(
+                [residual[:, None], derivative, expected, observed], axis=1))
+        # The same as `assemble`, without the copies that take time.
         parts = residual.view(float)
-        information = quadratic_form(derivative) + np.diag(self.nuisance.floor)
         gradient = 2 * np.matmul(derivative.view(float), parts[..., None])[..., 0]
         energy = np.sum(parts**2, axis=1)
+        information = quadratic_form(derivative) + np.diag(self.nuisance.floor)
         return Local(-energy, gradient, information, energy)
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
-        """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones.
-
-        Steps of the range turn the phases many times. Other parameters remain as they are.
-        """
+        """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones."""
+        # Steps of the range turn the phases many times.
         if not self.nuisance.is_coarse:
             return values
         return self.nuisance.with_phases(values, self.outputs(points, values, signals))
@@ -310,45 +290,35 @@ class Likelihood:
         mean = self.model.whiten(self.model.mean(to_positions(points)))
         return np.sum(mean.conj() * self.whitened(values, signals), axis=2)
 
-    @functools.cached_property
-    def log_volume(self) -> float:
-        """Logarithm of the determinants of the covariance."""
-        return float(log_determinant(self.model.root).sum())
 
-
-def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
-             expected: np.ndarray, observed: np.ndarray | None = None, *,
+def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
     """Combine whitened columns to the likelihood and its derivatives at parameters [M, Q].
 
     Parameters
     ----------
-    residual
-        Signals without factors less their mean, complex128 [M, n].
-    expected
-        Derivatives of the mean with respect to the point, and of `sources` with respect to their
-        factors, complex128 [M, 3 + Q, n].
-    observed
-        Derivatives of the signals times their factors, [M, Q, n]; by default those of the mean,
-        with which the gradient predicts no more than the whole energy.
+    white
+        The columns of `NuisancePrior.columns`, complex128 [M, C, n]. The last Q may be absent:
+        with the derivatives of the mean, the gradient predicts no more than the whole energy.
     information_of_covariance
-        Of the parameters, float64 [Q, Q]; by default that of the average covariance.
+        Of the parameters, float64 [Q, Q]; by default from the average covariance.
     n_linear
-        Number of further standard normal parameters in which the mean is linear, and whose
-        derivatives follow in `expected`. They are integrated out.
+        Number of further standard normal parameters in which the mean is linear. They are
+        integrated out.
     """
-    n = 3 + len(prior)
-    parts = np.ascontiguousarray(residual).view(float)
+    n, end = 3 + len(prior), 4 + len(prior) + n_linear
+    expected, observed = white[:, 1:end], white[:, end:]
+    # Re(a^H b) is the inner product of real and imaginary parts.
+    parts = np.ascontiguousarray(white[:, 0]).view(float)
     information = quadratic_form(expected)
     information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
     # The derivatives of parameters that move the multipath include it.
     still = ~prior.moves_multipath
     information[:, 3:n, 3:n] += np.outer(still, still) * (
         prior.information if information_of_covariance is None else information_of_covariance)
-    if observed is not None:
+    if observed.shape[1]:
         expected = np.concatenate([expected[:, :3], observed, expected[:, n:]], axis=1)
-    gradient = 2 * np.matmul(
-        np.ascontiguousarray(expected).view(float), parts[..., None])[..., 0]
+    gradient = 2 * np.matmul(np.ascontiguousarray(expected).view(float), parts[..., None])[..., 0]
     gradient[:, 3:n] -= prior.precision * values + prior.volume
     energy = np.sum(parts**2, axis=1)
     value = prior.log_prior(values) - energy
@@ -387,8 +357,7 @@ class DispersedLikelihood:
         self._offsets = log_weights + likelihood.log_volume
         self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
-        roots = np.linalg.cholesky(
-            least + self._scales[:, None, None, None] * (average - least))
+        roots = np.linalg.cholesky(least + self._scales[:, None, None, None] * (average - least))
         self._information = [likelihood.nuisance.information_of(*both)
                              for both in zip(roots, np.linalg.inv(roots), strict=True)]
 
@@ -408,20 +377,13 @@ class DispersedLikelihood:
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
-        prior, n = self._base.nuisance, len(points)
-        mean, slopes = self._means(points)
-        divided = prior.divide(signals.received, values)
-        columns = np.concatenate([
-            (divided - mean)[:, None], slopes, prior.patterns * prior.sources(mean, divided),
-            prior.patterns * divided[:, None]], axis=1)
-        states, n_expected = [], 4 + len(prior)
+        prior, states = self._base.nuisance, []
+        columns = prior.columns(values, signals.received, *self._means(points))
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
             white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
-            white = np.moveaxis(white, 3, 1).reshape(n, columns.shape[1], -1)
-            local = assemble(
-                prior, values, white[:, 0], white[:, 1:n_expected], white[:, n_expected:],
-                information_of_covariance=information)
+            white = np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
+            local = assemble(prior, values, white, information_of_covariance=information)
             volume = log_determinant(roots).sum(axis=1)
             states.append(local._replace(value=local.value + offset - volume))
         return _average_of(states)

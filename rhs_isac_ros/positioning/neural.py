@@ -38,8 +38,11 @@ _PATIENCE_EPOCHS = 4
 # Per cent of the pairs that precede the validation, and the test.
 _VALIDATION_PERCENT, _TEST_PERCENT = 70, 85
 _FORMAT = 1
-# Keys of the file that differ from the names of the fields.
-_FILE_KEYS = {'max_energy': 'loudest'}
+# Arrays of a network with D inputs and H hidden units.
+_SHAPES = {'input_mean': 'D', 'input_scale': 'D', 'w_in': 'DH', 'b_in': 'H', 'w_out': 'H3',
+           'b_out': '3', 'center': '3', 'covariance': '33', 'max_energy': ''}
+# Their keys in the file.
+_KEYS = {name: 'loudest' if name == 'max_energy' else name for name in _SHAPES}
 
 
 def stack_parts(signals: np.ndarray) -> np.ndarray:
@@ -69,51 +72,30 @@ class Network:
     The input x consists of the real and imaginary parts of the received signals,
     D = 2 N_B N_SB F, or of their magnitudes, D = N_B N_SB F, each scaled to zero mean and unit
     variance. The position is p = center + w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
-
-    Attributes
-    ----------
-    input_mean, input_scale
-        Mean and standard deviation of the inputs in training, float64 [D].
-    w_in, b_in
-        Weights of the hidden layer, float64 [D, H] and [H].
-    w_out, b_out
-        Weights of the output, float64 [H, 3] and [3] [m].
-    center
-        Centre of the region of interest, float64 [3] [m].
-    covariance
-        Second-moment matrix of the residuals of the validation pairs, float64 [3, 3] [m^2].
-    max_energy
-        Largest squared norm of the whitened mean signal at a training position.
-    about
-        ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
-        ``seed``, ``pairs``, ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
-    inputs
-        One of `INPUTS`: ``parts`` or ``magnitudes``.
     """
 
-    input_mean: np.ndarray
-    input_scale: np.ndarray
-    w_in: np.ndarray
-    b_in: np.ndarray
-    w_out: np.ndarray
-    b_out: np.ndarray
-    center: np.ndarray
-    covariance: np.ndarray
-    max_energy: float
+    input_mean: np.ndarray  #: Of the inputs in training, float64 [D].
+    input_scale: np.ndarray  #: Their standard deviation.
+    w_in: np.ndarray  #: Weights of the hidden layer, float64 [D, H].
+    b_in: np.ndarray  #: [H].
+    w_out: np.ndarray  #: Weights of the output, float64 [H, 3] [m].
+    b_out: np.ndarray  #: [3] [m].
+    center: np.ndarray  #: Of the region of interest, float64 [3] [m].
+    covariance: np.ndarray  #: Second moments of the validation residuals, float64 [3, 3] [m^2].
+    max_energy: float  #: Largest energy of the whitened mean signal at a training position.
+    #: ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
+    #: ``seed``, ``pairs``, ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
     about: dict[str, Any]
-    inputs: str = 'parts'
+    inputs: str = 'parts'  #: One of `INPUTS`.
 
     def __post_init__(self) -> None:
         """Check that sizes agree and numbers are finite."""
         if self.inputs not in INPUTS:
             raise ModelError(f'inputs: {self.inputs!r}, expected one of {sorted(INPUTS)}')
         n_inputs, n_hidden = np.shape(self.w_in) if np.ndim(self.w_in) == 2 else (0, 0)
-        shapes: dict[str, tuple[int, ...]] = {
-            'input_mean': (n_inputs,), 'input_scale': (n_inputs,), 'w_in': (n_inputs, n_hidden),
-            'b_in': (n_hidden,), 'w_out': (n_hidden, 3), 'b_out': (3,), 'center': (3,),
-            'covariance': (3, 3), 'max_energy': ()}
-        for name, shape in shapes.items():
-            value = getattr(self, name)
+        sizes = {'D': n_inputs, 'H': n_hidden, '3': 3}
+        for name, letters in _SHAPES.items():
+            value, shape = getattr(self, name), tuple(sizes[letter] for letter in letters)
             if np.shape(value) != shape:
                 raise ModelError(f'{name}: shape {np.shape(value)}, expected {shape}')
             if not np.isfinite(value).all():
@@ -127,41 +109,30 @@ class Network:
 
     def save(self, path: str | Path) -> None:
         """Write an ``.npz`` file; an existing one is kept if there is an `OSError`."""
-        write_archive(
-            path, {key: getattr(self, name) for key, name in self._names_by_key().items()},
-            {'format': _FORMAT, 'inputs': self.inputs, **self.about})
+        write_archive(path, {key: getattr(self, name) for name, key in _KEYS.items()},
+                      {'format': _FORMAT, 'inputs': self.inputs, **self.about})
 
     @classmethod
     def load(cls, path: str | Path) -> 'Network':
         """Read a model from a file, or raise `ModelError`."""
-        names = cls._names_by_key()
         try:
-            arrays, about = read_archive(path, 'model', _FORMAT, set(names))
+            arrays, about = read_archive(path, 'model', _FORMAT, set(_KEYS.values()))
         except ArchiveError as error:
             raise ModelError(str(error)) from error
         inputs = str(about.pop('inputs', 'parts'))
         try:
             fields: dict[str, Any] = {
-                names[key]: array.astype(float) for key, array in arrays.items()}
+                name: arrays[key].astype(float) for name, key in _KEYS.items()}
             return cls(**fields, about=about, inputs=inputs)
         except ValueError as error:
             raise ModelError(f'{path}: {error}') from None
 
-    @classmethod
-    def _names_by_key(cls) -> dict[str, str]:
-        """Map the keys of the arrays in a file to the names of their fields."""
-        names = [field.name for field in dataclasses.fields(cls)
-                 if field.name not in ('about', 'inputs')]
-        return {_FILE_KEYS.get(name, name): name for name in names}
-
 
 class NeuralEstimator:
-    """Positions by a trained network.
+    """Positions by a trained network, all with the covariance of the validation residuals.
 
-    The covariance is the same for all positions: the second-moment matrix of the residuals of the
-    validation pairs. The network cannot test whether signals fit its position. Signals that are
-    weaker than noise, or stronger than those from any position, give no position; all others give
-    one.
+    The network cannot test whether signals fit its position. Only signals that are weaker than
+    noise, or stronger than any position explains, give no position.
 
     Raises
     ------
@@ -187,7 +158,7 @@ class NeuralEstimator:
             self._network, source = model_file, 'model'
         else:
             self._network, source = Network.load(model_file), str(model_file)
-        check_trained_for(self._network, scenario, codebook, source)
+        _check_purpose(self._network, scenario, codebook, source)
         self._test = FitTest(int(np.prod(self._model.shape)))
 
     @one_blas_thread
@@ -205,20 +176,17 @@ class NeuralEstimator:
             yield position, self._network.covariance, reason
 
 
-def check_trained_for(
+def _check_purpose(
         network: Network, scenario: Scenario, codebook: Codebook, source: str) -> None:
-    """Raise `ModelError`, which begins with the source, if a model has another purpose."""
-    about = network.about
-    if about.get('codebook') != codebook.id:
-        raise ModelError(f'{source}: trained for codebook {about.get("codebook")}, expected '
-                         f'{codebook.id}')
-    if about.get('scenario') != scenario.changes():
-        raise ModelError(f'{source}: trained for the scenario {about.get("scenario")}, expected '
-                         f'{scenario.changes()}')
+    for key, subject, expected in (('codebook', 'codebook', codebook.id),
+                                   ('scenario', 'the scenario', scenario.changes())):
+        found = network.about.get(key)
+        if found != expected:
+            raise ModelError(f'{source}: trained for {subject} {found}, expected {expected}')
     n_bands, n_subbands, n_frames, _, _ = codebook.shape
-    expected = (2 if network.inputs == 'parts' else 1) * n_bands * n_subbands * n_frames
-    if len(network.w_in) != expected:
-        raise ModelError(f'{source}: {len(network.w_in)} inputs, expected {expected}')
+    n_inputs = (2 if network.inputs == 'parts' else 1) * n_bands * n_subbands * n_frames
+    if len(network.w_in) != n_inputs:
+        raise ModelError(f'{source}: {len(network.w_in)} inputs, expected {n_inputs}')
 
 
 class Epoch(NamedTuple):
@@ -234,11 +202,10 @@ def train(
         scenario: Scenario, codebook: Codebook, n_pairs: int = DEFAULT_PAIRS, seed: int = 0,
         n_hidden: int = DEFAULT_HIDDEN, max_epochs: int = DEFAULT_EPOCHS,
         progress: Callable[[Epoch], None] | None = None, inputs: str = 'parts') -> Network:
-    """Train a network for a scenario and codebook.
+    """Train a network, and return the one of the epoch with the smallest validation error.
 
-    Returns the network of the epoch with the smallest validation error. The seed is that of the
-    pairs, the initial weights and the order of the pairs, of which there are at least 20;
-    `n_hidden` is the number of units of the hidden layer; and the inputs are one of `INPUTS`.
+    The seed determines the pairs, at least 20, their order and the initial weights. `n_hidden` is
+    the number of units of the hidden layer, and `inputs` a key of `INPUTS`.
 
     Raises
     ------

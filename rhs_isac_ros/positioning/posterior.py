@@ -173,8 +173,7 @@ def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
     squares += np.einsum('ma,ma->m', means, spread) - 2 * points @ spread.T
     exponent = -squares / (2 * _SPREAD**2)
     exponent += np.linalg.slogdet(modes.curvature)[1] / 2
-    return (np.logaddexp.reduce(exponent, axis=1)
-            - 3 * np.log(_SPREAD) - 1.5 * np.log(2 * np.pi))
+    return (np.logaddexp.reduce(exponent, axis=1) - 3 * np.log(_SPREAD) - 1.5 * np.log(2 * np.pi))
 
 
 class BandPhases:
@@ -182,9 +181,8 @@ class BandPhases:
 
     Relative to uniform phases, the likelihood of a position has one factor for each band: the
     density of the phase of the matched filter's output, the wrapped normal distribution broadened
-    by the noise. Along the range, the product of the factors turns with the carriers, far faster
-    than the rest of the posterior: it has peaks of centimetres, whose heights follow the
-    differences of the carriers. It is averaged over one wavelength around each sample.
+    by the noise. Along the range, their product turns with the carriers, far faster than the rest
+    of the posterior. It is averaged over one wavelength around each sample.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
@@ -207,8 +205,8 @@ class BandPhases:
                 ) -> tuple[np.ndarray, np.ndarray]:
         """Average the product of the factors over the wavelength around positions, or not.
 
-        Takes the outputs of the matched filters at the positions, complex128 [N_B, P]. Returns
-        the logarithm of the average, and the mean offset in range [m], float64 [P].
+        Takes the outputs of the matched filters, [N_B, P]. Returns the logarithm of the average,
+        and the mean offset in range [m], [P].
         """
         ranges_m = self._ranges_m if averages else np.zeros(1)
         all_turns = self._wavenumbers[:, None, None] * ranges_m[:, None] + self._common
@@ -251,5 +249,4 @@ def _log_density(angle: np.ndarray, std: np.ndarray) -> np.ndarray:
     ratio = np.exp(-2 * np.pi**2 / std**2)
     slope = 2 * np.pi / std**2 * angle
     wraps = ratio * (np.exp(slope) + np.exp(-slope))
-    return (
-        np.log(np.sqrt(2 * np.pi) / std) - angle**2 / (2 * std**2) + np.log1p(wraps))
+    return (np.log(np.sqrt(2 * np.pi) / std) - angle**2 / (2 * std**2) + np.log1p(wraps))

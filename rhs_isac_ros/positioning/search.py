@@ -57,6 +57,10 @@ class Modes(NamedTuple):
         """For each mode, its most likely point inside the region, (r [m], u, v), [M, 3]."""
         return self.points + self.roi_offset
 
+    def starts(self) -> Starts:
+        """Return the most likely points inside the region as starts of another search."""
+        return Starts(self.phases, self.roi_points, self.values)
+
     def select(self, chosen: np.ndarray | slice) -> 'Modes':
         """Return the modes with the given indices or mask."""
         return Modes(*(field[chosen] for field in self))
@@ -92,7 +96,10 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     The first argument is the likelihood of the state of the surface. Modes that are less likely
     than the best of a phase by more than the margin are dropped.
     """
-    modes, gain = _step(conditional, likelihood, starts, signals.take(starts.phases), state)
+    def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
+        return _step(conditional, likelihood, starts, signals.take(starts.phases), state, moves)
+
+    modes, gain = step(starts)
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = modes.select(chosen), gain[chosen]
@@ -100,16 +107,13 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
         if not len(moving) or number == n_steps - 1:
             break
-        again = Starts(modes.phases[moving], modes.roi_points[moving], modes.values[moving])
-        moved, gain[moving] = _step(
-            conditional, likelihood, again, signals.take(again.phases), state)
+        moved, gain[moving] = step(modes.select(moving).starts())
         modes.replace(moving, moved)
     # A step that has not converged may predict any likelihood.
     (moving,) = np.nonzero((gain > _MIN_GAIN) | (len(likelihood.nuisance) > 0))
     if len(moving):
         again = Starts(modes.phases[moving], modes.points[moving], modes.values[moving])
-        modes.replace(moving, _step(conditional, likelihood, again, signals.take(again.phases),
-                                    state, moves=False)[0])
+        modes.replace(moving, step(again, moves=False)[0])
         gain[moving] = 0.0
         modes = modes.select(_prune(likelihood, modes, gain, margin))
     return modes
@@ -176,14 +180,10 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
     return marginal, whole, rise
 
 
-def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
-           ) -> np.ndarray:
-    """Choose the probable and separate modes of each phase, the most likely first.
-
-    The likelihood of a mode is a prediction. The best is at most the one before the last step,
-    which is computed.
-    """
-    # A step that has not converged may predict any likelihood.
+def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
+    """Choose the probable and separate modes of each phase, the most likely first."""
+    # The likelihood of a mode is a prediction. The best is at most the one before the last step,
+    # which is computed. A step that has not converged may predict any likelihood.
     value = modes.roi_log_likelihood + np.maximum(gain, 0)
     order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
     phases = modes.phases[order]
@@ -194,5 +194,4 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     order = order[heaviest(phases, np.minimum(relative, 0.0), margin)]
     phases = modes.phases[order]
     radii = likelihood.resolution.separation(likelihood.nuisance.is_coarse)
-    return order[separate(
-        phases, modes.roi_points[order], radii, modes.curvature[order])]
+    return order[separate(phases, modes.roi_points[order], radii, modes.curvature[order])]
