@@ -1,13 +1,12 @@
 """The optimiser as a command: options, progress and files."""
 
 import argparse
-import contextlib
 import dataclasses
 import importlib.util
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import yaml
@@ -50,6 +49,7 @@ from rhs_isac_ros.support.arguments import (
 )
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.support.progress import progress_bar
 
 __all__ = ['ERRORS', 'HELD_OUT_POSITIONS', 'INTERRUPTED', 'add_options', 'check', 'run']
 # Positions for the average bound of the result, drawn independently of the samples.
@@ -159,12 +159,14 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
         check_start(codebook, scenario)
 
     def search(scenario: Scenario) -> OptimizeResult:
-        with _progress_bar(options) as show:
+        with progress_bar(options.steps or METHODS[options.method].steps, 'step',
+                          quiet=options.quiet, line_every=50) as show:
             return optimize(
                 scenario, method=options.method, objective=objective,
                 sampling=options.sampling, n_positions=options.positions, seed=options.seed,
                 start=start, resume=resumed, calibration=calibration, max_steps=options.steps,
-                max_evaluations=options.evaluations, progress=show,
+                max_evaluations=options.evaluations,
+                progress=show and (lambda progress: show(progress.step, _value(progress))),
                 keep=lambda result: _save_partial(result, partial))
 
     if options.spectrum:
@@ -255,32 +257,6 @@ def _save(codebook: Codebook, output: Path) -> None:
         rescue = Path(tempfile.mkdtemp(prefix='rhs_isac_ros.')) / output.name
         codebook.save(rescue)
         raise OSError(f'{output}: {error}; the codebook is in {rescue}') from error
-
-
-@contextlib.contextmanager
-def _progress_bar(options: argparse.Namespace) -> Iterator[Callable[[Progress], None] | None]:
-    """Provide a callback that shows a bar with objective, step and time left."""
-    if options.quiet:
-        yield None
-        return
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        yield _print_progress
-        return
-    total = options.steps or METHODS[options.method].steps
-    with tqdm(total=total, unit='step', disable=None if sys.stderr.isatty() else False,
-              mininterval=0.2 if sys.stderr.isatty() else 10.0) as bar:
-        def show(progress: Progress) -> None:
-            bar.set_description(_value(progress), refresh=False)
-            bar.update(progress.step - bar.n)
-        yield show
-
-
-def _print_progress(progress: Progress) -> None:
-    if progress.step % 50 == 0:
-        print(f'step {progress.step}: {_value(progress)} after {progress.elapsed_s:.0f} s',
-              file=sys.stderr)
 
 
 def _value(progress: Progress) -> str:

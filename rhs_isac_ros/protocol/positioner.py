@@ -22,8 +22,7 @@ from rhs_isac_ros.positioning import (
     surface_of,
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
-from rhs_isac_ros.positioning.diagnosis import Diagnosis
-from rhs_isac_ros.positioning.innovation_test import InnovationTest
+from rhs_isac_ros.positioning.diagnosis import Diagnosis, InnovationTest
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_memory import MAX_NAMED, MAX_USERS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.positioning import Estimate, TrackEstimate
-from rhs_isac_ros.positioning.innovation_test import MIN_FIXES, MIN_RETURN, WINDOW
+from rhs_isac_ros.positioning.diagnosis import MIN_FIXES, MIN_RETURN, WINDOW
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, SettingsOffered
 from rhs_isac_ros.protocol.positioner import ResidualWatch

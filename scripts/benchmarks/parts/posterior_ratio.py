@@ -3,13 +3,13 @@
 from typing import Any
 
 import numpy as np
+from parts.exhaustive_posterior import exhaustive_posterior, posterior_with_truth
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.experiments.resampling import reduction
 from rhs_isac_ros.model import ElementErrors, Scenario
-from rhs_isac_ros.positioning import Estimate, exhaustive_posterior
+from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.positioning.failures import can_enumerate
-from rhs_isac_ros.positioning.reference import posterior_with_truth
 
 
 def reference_means(

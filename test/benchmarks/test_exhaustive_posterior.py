@@ -1,6 +1,8 @@
 """The posterior as a weighted sum over the whole region, and with failed elements."""
 
 import dataclasses
+import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +12,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface
 from rhs_isac_ros.model.elements import ElementErrors
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.positioning import exhaustive_posterior, reference, simulate_pairs
-from rhs_isac_ros.positioning.reference import posterior_with_truth
+from rhs_isac_ros.positioning import simulate_pairs
 
 SCENARIO = Scenario(n_subbands=2, n_frames=3, elements_per_side=4, angular_spread_deg=5.0,
                     roi_center_m=(4, 0, 0), roi_size_m=(1, 1, 0.5))
@@ -20,6 +21,19 @@ FAILING = Scenario(
     center_frequencies_hz=(2.5e9, 3.1e9), elements_per_side=6, angular_spread_deg=2.0,
     roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1), failed_element_share=0.02)
 POSITION = np.array([[4.2, 0.3, -0.1]])
+FILE = Path(__file__).parents[2] / 'scripts' / 'benchmarks' / 'parts' / 'exhaustive_posterior.py'
+
+
+def load_reference():
+    spec = importlib.util.spec_from_file_location('exhaustive_posterior', FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+reference = load_reference()
+exhaustive_posterior = reference.exhaustive_posterior
+posterior_with_truth = reference.posterior_with_truth
 
 
 @pytest.fixture(scope='module')

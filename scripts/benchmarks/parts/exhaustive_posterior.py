@@ -15,7 +15,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.elements import ElementErrors
 from rhs_isac_ros.positioning.coordinates import to_polar
-from rhs_isac_ros.positioning.estimate import Estimate, checked_received, stack_parts
+from rhs_isac_ros.positioning.estimate import Estimate, checked_received
 from rhs_isac_ros.positioning.estimators import BayesEstimator
 from rhs_isac_ros.positioning.failures import FailedElements, FailureSearch, can_enumerate
 from rhs_isac_ros.positioning.grid import tabulate
@@ -26,6 +26,7 @@ from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
     Signals,
 )
+from rhs_isac_ros.positioning.neural import stack_parts
 from rhs_isac_ros.positioning.posterior import BandPhases
 from rhs_isac_ros.positioning.search import Modes, marginal_at
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -69,7 +70,7 @@ def exhaustive_posterior(
     from scipy.stats import qmc
 
     codebook.check(scenario)
-    batch = checked_received(scenario, codebook, received)
+    batch = checked_received(codebook, received)
     posterior = _Posterior(scenario, codebook, batch, surface)
     low, high = scenario.roi_bounds_m
     sequence, total = qmc.Sobol(3, seed=seed), 2**log2_points
@@ -181,6 +182,7 @@ class _Posterior:
         average = highest + np.log(np.mean(np.exp(value - highest[:, None]), axis=1))
         return (average + n_values * np.log(_SPREAD)
                 - np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1))
+
 
 def posterior_with_truth(
         scenario: Scenario, codebook: Codebook, received: np.ndarray,
