@@ -6,7 +6,7 @@ import enum
 import functools
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
@@ -207,6 +207,26 @@ def same(one: Message, other: Message) -> bool:
     return type(one) is type(other) and all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name))
         for field in dataclasses.fields(one) if field.name != 'stamp_ns')
+
+
+# The fields that connect the messages of a cycle.
+_SHARED = ('cycle_id', 'user', 'user_instance', 'band', 'codebook_id')
+MessageT = TypeVar('MessageT', bound=Message)
+
+
+def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
+    """Return a message that belongs to the cycle, user, band and codebook of `source`.
+
+    Parameters
+    ----------
+    source
+        A message, or another object with attributes of the same names.
+    fields
+        The other fields, and those that differ from the source.
+    """
+    shared = {name: getattr(source, name) for name in _SHARED
+              if name in kind.__dataclass_fields__ and hasattr(source, name)}
+    return kind(**shared | fields)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -415,3 +435,9 @@ def started(instance: int) -> str:
     """Return the start of an instance [ns since 1970] for a log message."""
     time = datetime.datetime.fromtimestamp(instance // 10**9, datetime.timezone.utc)
     return f'started {time:%Y-%m-%d %H:%M:%S} UTC'
+
+
+def describe_conflict(user: int, instance: int) -> str:
+    """Return a log message about several nodes with one user number, of which one is served."""
+    return (f'user {user}: two nodes have this number; the first one, {started(instance)}, '
+            'is served')
