@@ -11,23 +11,18 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    CodebookOffered,
-    Event,
-    LocateRequested,
-    Outcome,
-    PauseRequested,
-    PeersChanged,
-    Reply,
-    Resumed,
-    ResumeRequested,
-    SettingsOffered,
-    StepRequested,
-    StoodBy,
-    Timeout,
+from rhs_isac_ros.protocol.events import Event, Outcome, Timeout
+from rhs_isac_ros.protocol.role import (
+    ANY,
+    Drops,
+    EventT,
+    NewestDict,
+    StateMachine,
+    Transition,
+    on,
 )
-from rhs_isac_ros.protocol.role import ANY, EventT, NewestDict, StateMachine, Transition
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
 from rhs_isac_ros.protocol.user_registry import (
     LAST_NUMBER,
@@ -97,7 +92,7 @@ class Row(Transition['BaseStation', EventT]):
 def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
     """Return a step that answers an operator; see `BaseStation.fill` for placeholders."""
     def reply(role: 'BaseStation', event: Event) -> None:
-        role.act(Reply(success, role.fill(text)))
+        role.act(events.Reply(success, role.fill(text)))
 
     return reply
 
@@ -124,12 +119,6 @@ class BaseStation(StateMachine):
              m.ProtocolState)
 
     STATES = State
-    EVENT_NAMES = {
-        CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
-        PauseRequested: 'pause', ResumeRequested: 'resume', StepRequested: 'step',
-        LocateRequested: 'locate', StoodBy: 'stood_by', Resumed: 'resumed', Timeout: 'timeout',
-        m.Ack: 'ack', m.RhsConfiguration: 'configured', m.FeedSignals: 'signals',
-        m.PositionEstimate: 'estimate', m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
     BLOCKED_STATES = frozenset({State.WAITING})
     WORLD_STATES = frozenset({State.RESTING})
 
@@ -183,8 +172,9 @@ class BaseStation(StateMachine):
 
     def _ready(self, event: Event) -> bool:
         """Whether no role and no codebook is missing, in view of the event."""
-        missing = event.missing if isinstance(event, PeersChanged) else self._missing
-        return missing == () and (isinstance(event, CodebookOffered) or self._offered is not None)
+        missing = event.missing if isinstance(event, events.PeersChanged) else self._missing
+        has_codebook = self._offered or isinstance(event, events.CodebookOffered)
+        return missing == () and bool(has_codebook)
 
     def _not_ready(self, event: Event) -> bool:
         return not self._ready(event)
@@ -255,21 +245,21 @@ class BaseStation(StateMachine):
 
     # Steps, in the order of a cycle
 
-    def _store_codebook(self, event: CodebookOffered) -> None:
+    def _store_codebook(self, event: events.CodebookOffered) -> None:
         self._offered = event.codebook
 
-    def _store_peers(self, event: PeersChanged) -> None:
+    def _store_peers(self, event: events.PeersChanged) -> None:
         self._missing = event.missing
 
-    def _forget_peers(self, event: StoodBy) -> None:
+    def _forget_peers(self, event: events.StoodBy) -> None:
         """Forget which roles are missing, so that no cycle begins until they are known again."""
         self._missing = None
 
-    def _skip_cycles(self, event: Resumed) -> None:
+    def _skip_cycles(self, event: events.Resumed) -> None:
         """Skip the ids of cycles that another base station has used."""
         self._cycle.cycle_id = max(event.first_cycle_id - 1, self._cycle.cycle_id)
 
-    def _store_settings(self, event: SettingsOffered) -> None:
+    def _store_settings(self, event: events.SettingsOffered) -> None:
         self._settings.latest = event.settings
 
     def _apply_settings(self, event: Event) -> None:
@@ -299,17 +289,17 @@ class BaseStation(StateMachine):
         roles = ('the other roles',) if self._missing is None else self._missing
         return roles if self._offered else (*roles, 'codebook')
 
-    def _prefer_user(self, event: LocateRequested) -> None:
+    def _prefer_user(self, event: events.LocateRequested) -> None:
         self._users.request(event.user)
 
-    def _pause(self, event: PauseRequested) -> None:
+    def _pause(self, event: events.PauseRequested) -> None:
         self._pause_requested = True
 
-    def _resume(self, event: ResumeRequested) -> None:
+    def _resume(self, event: events.ResumeRequested) -> None:
         self._pause_requested = False
         self.log('resumed')
 
-    def _log_paused(self, event: PauseRequested | Timeout) -> None:
+    def _log_paused(self, event: events.PauseRequested | Timeout) -> None:
         self.log(f'paused after cycle {self._cycle.cycle_id}')
 
     def _log_unanswered(self, event: Timeout) -> None:
@@ -318,7 +308,6 @@ class BaseStation(StateMachine):
     def _begin_cycle(self, event: Event) -> None:
         self._logged_lacking = ()
         self._cycle = Cycle(self._cycle.cycle_id + 1)
-        self._users.begin_cycle()
         self._beacon()
 
     def _beacon_again(self, event: Timeout) -> None:
@@ -472,163 +461,129 @@ class BaseStation(StateMachine):
         self._send(m.ProtocolState, phase=phase, outcome=outcome, began_s=began_s - beacon_s,
                    elapsed_s=float(self.now_s - beacon_s))
 
-    # Messages that are dropped in every state, before the rows of the table.
-    DROPS = {
-        m.Ack: {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN},
-        m.RhsConfiguration: {_wrong_cycle: Outcome.WRONG_CYCLE,
-                             _wrong_codebook: Outcome.WRONG_CODEBOOK},
-        m.FeedSignals: {_wrong_cycle: Outcome.WRONG_CYCLE, _wrong_user: Outcome.WRONG_USER,
-                        _wrong_instance: Outcome.WRONG_INSTANCE,
-                        _duplicate_signals: Outcome.DUPLICATE},
-        **dict.fromkeys((m.PositionEstimate, m.NoFix, m.Beam), {
-            _wrong_cycle: Outcome.WRONG_CYCLE, _wrong_user: Outcome.WRONG_USER,
-            _wrong_codebook: Outcome.WRONG_CODEBOOK}),
-        m.Data: {_not_delivered_uplink: None, _wrong_cycle: Outcome.WRONG_CYCLE,
-                 _wrong_user: Outcome.WRONG_USER}}
+    # What a message of a cycle must match.
+    _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
+    _OF_USER: Drops = _OF_CYCLE | {_wrong_user: Outcome.WRONG_USER}
+    _DELIVERED: Drops = {_not_delivered_uplink: None}
+    _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
 
     # Every event, in the order in which its rows are tried.
     TABLE = (
-        # Offers and presence. A new codebook and new settings take effect with the next cycle.
-        Row((State.WAITING,), CodebookOffered, guard=_ready,
-            actions=(_store_codebook, _begin_cycle), target=State.BEACONING),
-        Row((State.WAITING,), CodebookOffered, actions=(_store_codebook, _log_not_ready)),
-        Row(ANY, CodebookOffered, actions=(_store_codebook,)),
-
-        Row((State.WAITING,), PeersChanged, guard=_ready,
-            actions=(_store_peers, _begin_cycle), target=State.BEACONING),
-        Row((State.WAITING,), PeersChanged, actions=(_store_peers, _log_not_ready)),
-        Row(ANY, PeersChanged, actions=(_store_peers,)),
-
-        Row((State.WAITING, State.PAUSED), SettingsOffered,
-            actions=(_store_settings, _apply_settings)),
-        Row((State.RESTING,), SettingsOffered, actions=(_store_settings, _apply_settings),
-            restart_timeout=True),
-        Row(ANY, SettingsOffered, actions=(_store_settings,)),
-
-        # A newer base station serves, or has gone. A pause outlasts both.
-        Row(ANY, StoodBy, guard=_pausing, actions=(_forget_peers,), target=State.PAUSED),
-        Row(ANY, StoodBy, actions=(_forget_peers,), target=State.WAITING),
-        Row((State.WAITING, State.PAUSED), Resumed, actions=(_skip_cycles,)),
-
-        # Requests of an operator. A pause begins between two cycles; a step runs one cycle of it.
-        Row((State.PAUSED,), PauseRequested, actions=(reply(True, 'already paused'),)),
-        Row((State.WAITING, State.RESTING), PauseRequested,
-            actions=(_pause, _log_paused, reply(True, 'paused')), target=State.PAUSED),
-        Row(ANY, PauseRequested,
-            actions=(_pause, reply(True, 'the pause begins after cycle {cycle}'))),
-
-        Row((State.PAUSED,), ResumeRequested, guard=_not_ready,
-            actions=(_resume, _log_not_ready, reply_resumed), target=State.WAITING),
-        Row((State.PAUSED,), ResumeRequested, actions=(_resume, _begin_cycle, reply_resumed),
-            target=State.BEACONING),
-        Row(ANY, ResumeRequested, guard=_pausing, actions=(_resume, reply_resumed)),
-        Row(ANY, ResumeRequested, actions=(reply(True, 'not paused'),)),
-
-        Row((State.PAUSED,), StepRequested, guard=_not_ready,
-            actions=(reply(False, 'waiting for {lacking}'),)),
-        Row((State.PAUSED,), StepRequested,
-            actions=(_begin_cycle, reply(True, 'cycle {cycle} begins')), target=State.BEACONING),
-        Row(ANY, StepRequested, guard=_pausing,
-            actions=(reply(False, 'cycle {cycle} has not ended'),)),
-        Row(ANY, StepRequested, actions=(reply(False, 'not paused; a step requires a pause'),)),
-        Row(ANY, LocateRequested, actions=(_prefer_user,)),
-
-        # Timeouts.
-        Row((State.RESTING,), Timeout, guard=_pausing, actions=(_log_paused,),
-            target=State.PAUSED),
-        Row((State.RESTING,), Timeout, guard=_not_ready, actions=(_log_not_ready,),
-            target=State.WAITING),
-        Row((State.RESTING,), Timeout, actions=(_begin_cycle,), target=State.BEACONING),
-
-        Row((State.BEACONING,), Timeout, guard=_some_acks,
-            actions=(_grant, _command_bands, _announce_positioning), target=State.CONFIGURING),
-        Row((State.BEACONING,), Timeout, guard=_pausing,
-            actions=(_apply_settings, _log_unanswered), target=State.PAUSED),
-        Row((State.BEACONING,), Timeout, guard=_not_ready, actions=(_log_not_ready,),
-            target=State.WAITING),
-        Row((State.BEACONING,), Timeout, actions=(_apply_settings, _beacon_again),
-            outcome=Outcome.UNANSWERED, restart_timeout=True),
-
-        Row((State.CONFIGURING,), Timeout, guard=_may_retry, actions=(_command_bands,),
-            outcome=Outcome.RETRY_RHS, restart_timeout=True),
-        Row((State.CONFIGURING,), Timeout, actions=(_abandon,), target=State.RESTING,
-            outcome=Outcome.RHS_SILENT),
-
-        # Repeat the command too, because the channel may have missed the report of the RHS.
-        Row((State.SOUNDING,), Timeout, guard=_may_retry,
-            actions=(_command_silent_bands, _request_pilots), outcome=Outcome.RETRY_BAND,
-            restart_timeout=True),
-        Row((State.SOUNDING,), Timeout, actions=(_remove_user, _abandon), target=State.RESTING,
-            outcome=Outcome.USER_GONE),
-
-        Row((State.ESTIMATING,), Timeout, guard=_may_retry, actions=(_resend_signals,),
-            outcome=Outcome.RETRY_POSITION, restart_timeout=True),
-        Row((State.ESTIMATING,), Timeout, actions=(_abandon,), target=State.RESTING,
-            outcome=Outcome.POSITIONER_SILENT),
-
-        # Each role repeats its reply to a repeated message, so the signals also repeat the beam.
-        Row((State.STEERING,), Timeout, guard=_may_retry, actions=(_resend_signals,),
-            outcome=Outcome.RETRY_BEAM, restart_timeout=True),
-        Row((State.STEERING,), Timeout, actions=(_abandon,), target=State.RESTING,
-            outcome=Outcome.TRANSMISSION_SILENT),
-
-        # The channel may have missed the beam or its configuration.
-        Row((State.TRANSMITTING,), Timeout, guard=_may_retry,
-            actions=(_resend_signals, _send_downlink), outcome=Outcome.RETRY_DATA,
-            restart_timeout=True),
-        Row((State.TRANSMITTING,), Timeout, actions=(_abandon,), target=State.RESTING,
-            outcome=Outcome.DATA_LOST),
-
-        # Acks. All that are not dropped count towards the rate of their user.
-        Row(ANY, m.Ack, guard=_wrong_cycle, actions=(_count_ack,), outcome=Outcome.WRONG_CYCLE),
-        # Of several nodes with the same number, the first is served.
-        Row(ANY, m.Ack, guard=_number_taken, actions=(_count_ack, _reject_number),
-            outcome=Outcome.NUMBER_TAKEN),
-        Row(ANY, m.Ack, guard=_duplicate_ack, actions=(_count_ack,), outcome=Outcome.DUPLICATE),
-        # A late ack: this cycle no longer collects acks; the user is registered for the next one.
-        Row(NOT_BEACONING, m.Ack, actions=(_count_ack, _register_user), outcome=Outcome.LATE_ACK),
-        Row((State.BEACONING,), m.Ack, guard=_last_ack,
-            actions=(_count_ack, _accept_ack, _grant, _command_bands, _announce_positioning),
-            target=State.CONFIGURING),
-        Row((State.BEACONING,), m.Ack, actions=(_count_ack, _accept_ack)),
-
-        # Reports of the RHS: a band's configurations, or the configuration of the beam.
-        Row((State.CONFIGURING,), m.RhsConfiguration, guard=_last_configuration,
-            actions=(_store_configured, _request_pilots), target=State.SOUNDING),
-        Row((State.CONFIGURING, State.SOUNDING), m.RhsConfiguration, guard=_for_positioning,
-            actions=(_store_configured,)),
-        Row((State.ESTIMATING, State.STEERING, State.TRANSMITTING), m.RhsConfiguration,
-            guard=_for_positioning, outcome=Outcome.DUPLICATE),
-        # The beam and its configuration come from two roles, in either order.
-        Row((State.ESTIMATING,), m.RhsConfiguration, actions=(_store_beam_applied,),
-            target=State.STEERING),
-        Row((State.STEERING,), m.RhsConfiguration, guard=_beam_known,
-            actions=(_begin_transmission,), target=State.TRANSMITTING),
-        Row((State.STEERING,), m.RhsConfiguration, actions=(_store_beam_applied,)),
-        # A repeated request may be answered twice.
-        Row((State.TRANSMITTING,), m.RhsConfiguration, outcome=Outcome.DUPLICATE),
-
-        # Feed signals.
-        Row((State.SOUNDING,), m.FeedSignals, guard=_last_signals,
-            actions=(_store_signals, _send_signals), target=State.ESTIMATING),
-        Row((State.SOUNDING,), m.FeedSignals, actions=(_store_signals,), target=State.SOUNDING),
-
-        # Position estimates.
-        Row((State.ESTIMATING,), m.PositionEstimate, target=State.STEERING),
-        Row((State.STEERING,), m.PositionEstimate),
-        Row((State.TRANSMITTING,), m.PositionEstimate, outcome=Outcome.DUPLICATE),
-
-        Row((State.ESTIMATING,), m.NoFix, actions=(_abandon,), target=State.RESTING,
-            outcome=Outcome.NO_FIX),
-
-        # Beams.
-        Row((State.ESTIMATING,), m.Beam, actions=(_store_beam,), target=State.STEERING),
-        Row((State.STEERING,), m.Beam, guard=_beam_applied,
-            actions=(_store_beam, _begin_transmission), target=State.TRANSMITTING),
-        Row((State.STEERING,), m.Beam, actions=(_store_beam,)),
-        Row((State.TRANSMITTING,), m.Beam, outcome=Outcome.DUPLICATE),
-
-        # Data. Delivered uplink data end the cycle.
-        Row((State.TRANSMITTING,), m.Data, actions=(_finish,), target=State.RESTING),
-        Row((State.PAUSED, State.RESTING), m.Data, outcome=Outcome.DUPLICATE),
+        *on(events.CodebookOffered, 'codebook')(
+            # A new codebook takes effect with the next cycle, as do new settings.
+            Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING, guard=_ready),
+            Row((State.WAITING,), (_store_codebook, _log_not_ready)),
+            Row(ANY, (_store_codebook,))),
+        *on(events.PeersChanged, 'peers')(
+            Row((State.WAITING,), (_store_peers, _begin_cycle), State.BEACONING, guard=_ready),
+            Row((State.WAITING,), (_store_peers, _log_not_ready)),
+            Row(ANY, (_store_peers,))),
+        *on(events.SettingsOffered, 'settings')(
+            Row((State.WAITING, State.PAUSED), (_store_settings, _apply_settings)),
+            Row((State.RESTING,), (_store_settings, _apply_settings), restart_timeout=True),
+            Row(ANY, (_store_settings,))),
+        *on(events.StoodBy, 'stood_by')(
+            # A newer base station serves, or has gone. A pause outlasts both.
+            Row(ANY, (_forget_peers,), State.PAUSED, guard=_pausing),
+            Row(ANY, (_forget_peers,), State.WAITING)),
+        *on(events.Resumed, 'resumed')(
+            Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
+        *on(events.PauseRequested, 'pause')(
+            # A pause begins between two cycles; a step runs one cycle of it.
+            Row((State.PAUSED,), (reply(True, 'already paused'),)),
+            Row((State.WAITING, State.RESTING), (_pause, _log_paused, reply(True, 'paused')),
+                State.PAUSED),
+            Row(ANY, (_pause, reply(True, 'the pause begins after cycle {cycle}')))),
+        *on(events.ResumeRequested, 'resume')(
+            Row((State.PAUSED,), (_resume, _log_not_ready, reply_resumed), State.WAITING,
+                guard=_not_ready),
+            Row((State.PAUSED,), (_resume, _begin_cycle, reply_resumed), State.BEACONING),
+            Row(ANY, (_resume, reply_resumed), guard=_pausing),
+            Row(ANY, (reply(True, 'not paused'),))),
+        *on(events.StepRequested, 'step')(
+            Row((State.PAUSED,), (reply(False, 'waiting for {lacking}'),), guard=_not_ready),
+            Row((State.PAUSED,), (_begin_cycle, reply(True, 'cycle {cycle} begins')),
+                State.BEACONING),
+            Row(ANY, (reply(False, 'cycle {cycle} has not ended'),), guard=_pausing),
+            Row(ANY, (reply(False, 'not paused; a step requires a pause'),))),
+        *on(events.LocateRequested, 'locate')(
+            Row(ANY, (_prefer_user,))),
+        *on(Timeout, 'timeout')(
+            Row((State.RESTING,), (_log_paused,), State.PAUSED, guard=_pausing),
+            Row((State.RESTING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
+            Row((State.RESTING,), (_begin_cycle,), State.BEACONING),
+            Row((State.BEACONING,), (_grant, _command_bands, _announce_positioning),
+                State.CONFIGURING, guard=_some_acks),
+            Row((State.BEACONING,), (_apply_settings, _log_unanswered), State.PAUSED,
+                guard=_pausing),
+            Row((State.BEACONING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
+            Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
+                restart_timeout=True),
+            Row((State.CONFIGURING,), (_command_bands,), guard=_may_retry,
+                outcome=Outcome.RETRY_RHS, restart_timeout=True),
+            Row((State.CONFIGURING,), (_abandon,), State.RESTING, outcome=Outcome.RHS_SILENT),
+            # Repeat the command too, because the channel may have missed the report of the RHS.
+            Row((State.SOUNDING,), (_command_silent_bands, _request_pilots), guard=_may_retry,
+                outcome=Outcome.RETRY_BAND, restart_timeout=True),
+            Row((State.SOUNDING,), (_remove_user, _abandon), State.RESTING,
+                outcome=Outcome.USER_GONE),
+            Row((State.ESTIMATING,), (_resend_signals,), guard=_may_retry,
+                outcome=Outcome.RETRY_POSITION, restart_timeout=True),
+            Row((State.ESTIMATING,), (_abandon,), State.RESTING,
+                outcome=Outcome.POSITIONER_SILENT),
+            # Roles repeat their replies to a repeated message, so the signals repeat the beam.
+            Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
+                outcome=Outcome.RETRY_BEAM, restart_timeout=True),
+            Row((State.STEERING,), (_abandon,), State.RESTING,
+                outcome=Outcome.TRANSMISSION_SILENT),
+            # The channel may have missed the beam or its configuration.
+            Row((State.TRANSMITTING,), (_resend_signals, _send_downlink), guard=_may_retry,
+                outcome=Outcome.RETRY_DATA, restart_timeout=True),
+            Row((State.TRANSMITTING,), (_abandon,), State.RESTING, outcome=Outcome.DATA_LOST)),
+        *on(m.Ack, 'ack', {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN})(
+            # All that are not dropped count towards the rate of their user.
+            Row(ANY, (_count_ack,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+            # Of several nodes with the same number, the first is served.
+            Row(ANY, (_count_ack, _reject_number), guard=_number_taken,
+                outcome=Outcome.NUMBER_TAKEN),
+            Row(ANY, (_count_ack,), guard=_duplicate_ack, outcome=Outcome.DUPLICATE),
+            # This cycle no longer collects acks; the user is registered for the next one.
+            Row(NOT_BEACONING, (_count_ack, _register_user), outcome=Outcome.LATE_ACK),
+            Row((State.BEACONING,),
+                (_count_ack, _accept_ack, _grant, _command_bands, _announce_positioning),
+                State.CONFIGURING, guard=_last_ack),
+            Row((State.BEACONING,), (_count_ack, _accept_ack))),
+        *on(m.RhsConfiguration, 'configured', _OF_CYCLE | _OF_CODEBOOK)(
+            # A band's configurations, or the configuration of the beam.
+            Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
+                guard=_last_configuration),
+            Row((State.CONFIGURING, State.SOUNDING), (_store_configured,), guard=_for_positioning),
+            Row((State.ESTIMATING, State.STEERING, State.TRANSMITTING), guard=_for_positioning,
+                outcome=Outcome.DUPLICATE),
+            # The beam and its configuration come from two roles, in either order.
+            Row((State.ESTIMATING,), (_store_beam_applied,), State.STEERING),
+            Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_beam_known),
+            Row((State.STEERING,), (_store_beam_applied,)),
+            # A repeated request may be answered twice.
+            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+        *on(m.FeedSignals, 'signals', _OF_USER | {_wrong_instance: Outcome.WRONG_INSTANCE,
+                                        _duplicate_signals: Outcome.DUPLICATE})(
+            Row((State.SOUNDING,), (_store_signals, _send_signals), State.ESTIMATING,
+                guard=_last_signals),
+            Row((State.SOUNDING,), (_store_signals,), State.SOUNDING)),
+        *on(m.PositionEstimate, 'estimate', _OF_USER | _OF_CODEBOOK)(
+            Row((State.ESTIMATING,), target=State.STEERING),
+            Row((State.STEERING,)),
+            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+        *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
+            Row((State.ESTIMATING,), (_abandon,), State.RESTING, outcome=Outcome.NO_FIX)),
+        *on(m.Beam, 'beam', _OF_USER | _OF_CODEBOOK)(
+            Row((State.ESTIMATING,), (_store_beam,), State.STEERING),
+            Row((State.STEERING,), (_store_beam, _begin_transmission), State.TRANSMITTING,
+                guard=_beam_applied),
+            Row((State.STEERING,), (_store_beam,)),
+            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+        *on(m.Data, 'delivered', _DELIVERED | _OF_USER)(
+            Row((State.TRANSMITTING,), (_finish,), State.RESTING),
+            Row((State.PAUSED, State.RESTING), outcome=Outcome.DUPLICATE)),
     )

@@ -6,7 +6,7 @@ import enum
 import functools
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -56,17 +56,7 @@ def optional_float() -> Any:
     return dataclasses.field(metadata={'nan_allowed': True})
 
 
-class Checkable(Protocol):
-    """A dataclass with the fields declared here."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-    def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return sizes that depend on the content, by symbol."""
-        ...
-
-
-def check(message: Checkable, sizes: Mapping[str, int]) -> None:
+def check(message: 'Message', sizes: Mapping[str, int]) -> None:
     """Check the arrays, indices and numbers of a message.
 
     Parameters
@@ -82,7 +72,8 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
-    for name, meta in _fields(type(message)):
+    kind: type = type(message)
+    for name, meta in _fields(kind):
         value = getattr(message, name)
         problem = ''
         if 'dims' in meta:
@@ -97,11 +88,11 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
         elif 'low' in meta and not meta['low'] <= value <= meta['high']:
             problem = f'{value}, expected {meta["low"]:g} to {meta["high"]:g}'
         if problem:
-            raise MessageError(f'{type(message).__name__}.{name}: {problem}')
+            raise MessageError(f'{kind.__name__}.{name}: {problem}')
 
 
 @functools.cache
-def _fields(kind: type[Checkable]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+def _fields(kind: type) -> tuple[tuple[str, Mapping[str, Any]], ...]:
     """Return name and declaration of every field whose values are restricted."""
     return tuple((field.name, field.metadata) for field in dataclasses.fields(kind)
                  if field.metadata or field.type is float)

@@ -13,6 +13,7 @@ from rhs_isac_ros.protocol.role import (
     NewestDict,
     StateMachine,
     Transition,
+    on,
 )
 
 # Number of cycles kept to recognise late and repeated messages.
@@ -40,8 +41,6 @@ class RhsController(StateMachine):
     SENDS = (m.RhsConfiguration,)
 
     STATES = State
-    EVENT_NAMES = {CodebookOffered: 'codebook', m.Grant: 'grant', m.RhsCommand: 'command',
-                   m.Beam: 'beam'}
 
     def __init__(self) -> None:
         super().__init__(State.IDLE)
@@ -69,14 +68,10 @@ class RhsController(StateMachine):
     def _repeats_command(self, event: m.RhsCommand) -> bool:
         """Whether a command of the current cycle was executed before."""
         return (self.state is State.POSITIONING and event.cycle_id == self._cycle_id
-                and self._is_applied(event))
+                and self._was_executed(event))
 
-    def _stale_command(self, event: m.RhsCommand) -> bool:
-        """Whether a command was executed before, and its cycle or its positioning has ended."""
-        return self._is_applied(event)
-
-    def _is_applied(self, command: m.RhsCommand) -> bool:
-        return (command.band, command.codebook_id) in self._applied.get(command.cycle_id, ())
+    def _was_executed(self, event: m.RhsCommand) -> bool:
+        return (event.band, event.codebook_id) in self._applied.get(event.cycle_id, ())
 
     def _wrong_cycle(self, event: m.Beam) -> bool:
         return event.cycle_id != self._cycle_id
@@ -93,7 +88,7 @@ class RhsController(StateMachine):
     def _wrong_codebook(self, event: m.Beam) -> bool:
         return event.codebook_id != self._codebooks.in_use
 
-    # Actions
+    # Steps
 
     def _store_codebook(self, event: CodebookOffered) -> None:
         self._codebooks.put(event.codebook.id, event.codebook)
@@ -127,24 +122,23 @@ class RhsController(StateMachine):
                      f'{self._codebooks.in_use!r}, available: {list(self._codebooks)}',
                      warning=True)
 
-    # Messages that are dropped in every state, before the rows of the table.
-    DROPS = {m.Beam: {_wrong_cycle: Outcome.WRONG_CYCLE, _wrong_user: Outcome.WRONG_USER,
-                      _wrong_instance: Outcome.WRONG_INSTANCE}}
-
     TABLE = (
-        Row(ANY, CodebookOffered, actions=(_store_codebook, _log_codebook)),
-        Row(ANY, m.Grant, actions=(_store_grant,)),
-
-        Row(ANY, m.RhsCommand, guard=_unknown_codebook, actions=(_log_unknown_codebook,),
-            outcome=Outcome.WRONG_CODEBOOK),
-        # The base station repeats a command if it may have missed the report.
-        Row(ANY, m.RhsCommand, guard=_repeats_command, actions=(_apply_band,),
-            outcome=Outcome.DUPLICATE),
-        Row(ANY, m.RhsCommand, guard=_stale_command, outcome=Outcome.STALE_COMMAND),
-        Row(ANY, m.RhsCommand, actions=(_apply_band,), target=State.POSITIONING),
-
-        Row(ANY, m.Beam, guard=_wrong_codebook, actions=(_log_unknown_codebook,),
-            outcome=Outcome.WRONG_CODEBOOK),
-        Row((State.POSITIONING,), m.Beam, actions=(_apply_beam,), target=State.TRANSMITTING),
-        Row((State.TRANSMITTING,), m.Beam, actions=(_apply_beam,), outcome=Outcome.DUPLICATE),
+        *on(CodebookOffered, 'codebook')(
+            Row(ANY, (_store_codebook, _log_codebook))),
+        *on(m.Grant, 'grant')(
+            Row(ANY, (_store_grant,))),
+        *on(m.RhsCommand, 'command')(
+            Row(ANY, (_log_unknown_codebook,), guard=_unknown_codebook,
+                outcome=Outcome.WRONG_CODEBOOK),
+            # The base station repeats a command if it may have missed the report.
+            Row(ANY, (_apply_band,), guard=_repeats_command, outcome=Outcome.DUPLICATE),
+            Row(ANY, guard=_was_executed, outcome=Outcome.STALE_COMMAND),
+            Row(ANY, (_apply_band,), State.POSITIONING)),
+        *on(m.Beam, 'beam', {_wrong_cycle: Outcome.WRONG_CYCLE,
+                     _wrong_user: Outcome.WRONG_USER,
+                     _wrong_instance: Outcome.WRONG_INSTANCE})(
+            Row(ANY, (_log_unknown_codebook,), guard=_wrong_codebook,
+                outcome=Outcome.WRONG_CODEBOOK),
+            Row((State.POSITIONING,), (_apply_beam,), State.TRANSMITTING),
+            Row((State.TRANSMITTING,), (_apply_beam,), outcome=Outcome.DUPLICATE)),
     )

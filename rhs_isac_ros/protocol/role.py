@@ -140,7 +140,7 @@ class CodebookCache(NewestDict[str, Value]):
 
 
 RoleT = TypeVar('RoleT')
-EventT = TypeVar('EventT')
+EventT = TypeVar('EventT', contravariant=True)
 
 # As a source: any state. As a target: the current state, which is not entered again.
 ANY = None
@@ -157,17 +157,34 @@ class Transition(Generic[RoleT, EventT]):
     """One row of a table."""
 
     source: tuple[enum.Enum, ...] | None  # states in which it applies, or ANY
-    event: type[EventT]
+    actions: tuple[Callable[[RoleT, EventT], None], ...] = ()  # steps to carry out, in order
+    target: enum.Enum | None = SAME  # state to enter, with a new timeout, or SAME
     # Condition on role and event, without side effects.
     guard: Callable[[RoleT, EventT], bool] = always
-    # Steps to carry out, in order.
-    actions: tuple[Callable[[RoleT, EventT], None], ...] = ()
-    target: enum.Enum | None = SAME  # state to enter, with a new timeout, or SAME
     outcome: Outcome | None = None  # what to count, if anything
     restart_timeout: bool = False  # whether that of the current state starts again
+    # The class of its event, and the name of the event in the counters; set by `on`.
+    event: type = object
+    event_name: str = ''
 
 
 AnyRow = Transition[Any, Any]
+# Conditions on which a message is dropped in every state, each with the outcome to count, or None.
+Drops = dict[Callable[..., bool], Outcome | None]
+
+
+class on(Generic[EventT]):
+    """Returns the rows of an event, in order: ``on(event, its name, drops)(*rows)``."""
+
+    def __init__(self, event: type[EventT], name: str, drops: Drops | None = None) -> None:
+        self._event, self._name, self._drops = event, name, drops or {}
+
+    def __call__(self, *rows: Transition[Any, EventT]) -> tuple[AnyRow, ...]:
+        """Return the rows that drop messages, followed by others."""
+        drops = [Transition[Any, EventT](ANY, guard=wrong, outcome=outcome)
+                 for wrong, outcome in self._drops.items()]
+        return tuple(dataclasses.replace(row, event=self._event, event_name=self._name)
+                     for row in (*drops, *rows))
 
 
 class StateMachine(Role):
@@ -186,26 +203,19 @@ class StateMachine(Role):
 
     STATES: ClassVar[type[enum.Enum]]
     TABLE: ClassVar[tuple[AnyRow, ...]]
-    # By message: the conditions on which it is dropped in every state, each with the outcome to
-    # count, or None. They precede the rows of the table.
-    DROPS: ClassVar[Mapping[type, Mapping[Callable[..., bool], Outcome | None]]] = {}
-    # All events, and their names in the counters of unexpected events.
+    # All events, and their names in the counters of unexpected events; derived from the table.
     EVENT_NAMES: ClassVar[Mapping[type, str]]
 
     _rows: ClassVar[Mapping[tuple[enum.Enum | None, type], tuple[AnyRow, ...]]]
 
     def __init_subclass__(cls) -> None:
-        """Add the rows of `DROPS` to a new table, and group its rows by state and event class."""
+        """Derive the events from a new table, and group its rows by state and event."""
         super().__init_subclass__()
         if 'TABLE' in vars(cls):
-            cls.RECEIVES = tuple(kind for kind in cls.EVENT_NAMES if issubclass(kind, Message))
-            events = dict.fromkeys(row.event for row in cls.TABLE)
-            cls.TABLE = tuple(row for event in events for row in (
-                *(Transition(ANY, event, guard=wrong, outcome=outcome)
-                  for wrong, outcome in cls.DROPS.get(event, {}).items()),
-                *(row for row in cls.TABLE if row.event is event)))
+            cls.EVENT_NAMES = {row.event: row.event_name for row in cls.TABLE}
+            cls.RECEIVES = tuple(event for event in cls.EVENT_NAMES if issubclass(event, Message))
             cls._rows = {(state, event): tuple(rows_for(cls.TABLE, state, event))
-                         for state in cls.STATES for event in events}
+                         for state in cls.STATES for event in cls.EVENT_NAMES}
 
     def __init__(self, initial: enum.Enum) -> None:
         super().__init__()

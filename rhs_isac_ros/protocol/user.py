@@ -9,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
-from rhs_isac_ros.protocol.role import ANY, EventT, NewestDict, StateMachine, Transition
+from rhs_isac_ros.protocol.role import ANY, EventT, NewestDict, StateMachine, Transition, on
 
 # Number of cycles kept; no message of an older cycle can still be in transit.
 _MAX_REMEMBERED = 8
@@ -28,20 +28,6 @@ class State(enum.Enum):
     GRANTED = 'granted'            # a user is being positioned and served
 
 
-def timeouts(step_s: float, beacon_s: float) -> dict[enum.Enum, float]:
-    """Return the timeouts by state [s].
-
-    Parameters
-    ----------
-    step_s
-        Time that the base station waits for each step [s].
-    beacon_s
-        Time without a beacon after which the user logs a warning [s].
-    """
-    return {State.LISTENING: beacon_s, State.ACKNOWLEDGED: step_s,
-            State.GRANTED: _SILENT_STEPS * step_s}
-
-
 class Row(Transition['User', EventT]):
     """A row of the table."""
 
@@ -55,8 +41,10 @@ class User(StateMachine):
     ----------
     mobilities
         By id, from 1: the position of each user as a function of time.
-    timeouts_s
-        Timeouts by state [s].
+    step_s
+        Time that the base station waits for each step [s].
+    beacon_s
+        Time without a beacon after which the user logs a warning [s].
     instance
         Instance of the node; only the instance that a grant names answers it.
     world_s
@@ -66,15 +54,13 @@ class User(StateMachine):
     SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
 
     STATES = State
-    EVENT_NAMES = {PeersChanged: 'peers', Timeout: 'timeout', m.Beacon: 'beacon', m.Grant: 'grant',
-                   m.PilotRequest: 'pilot_request', m.Data: 'downlink'}
     BLOCKED_STATES = frozenset({State.DISCONNECTED, State.NO_BEACON})
 
     def __init__(
-            self, mobilities: Mapping[int, Mobility], timeouts_s: Mapping[enum.Enum, float],
+            self, mobilities: Mapping[int, Mobility], step_s: float, beacon_s: float,
             instance: int = 0, world_s: Callable[[], float] | None = None) -> None:
         super().__init__(State.DISCONNECTED)
-        self._timeouts_s = dict(timeouts_s)
+        self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
         # By user: describes the node with the same number that is served instead.
         self._conflicts: dict[int, str] = {}
@@ -113,7 +99,10 @@ class User(StateMachine):
 
     def timeout_s(self, state: enum.Enum) -> float | None:
         """Return the timeout of a state [s], or None."""
-        return self._timeouts_s.get(state)
+        timeouts: dict[enum.Enum, float] = {
+            State.LISTENING: self._beacon_s, State.ACKNOWLEDGED: self._step_s,
+            State.GRANTED: _SILENT_STEPS * self._step_s}
+        return timeouts.get(state)
 
     def status(self) -> Mapping[str, str]:
         """Return ``conflict.user_<n>`` while another node with the same number is served."""
@@ -172,7 +161,7 @@ class User(StateMachine):
         """Whether data are anything other than downlink data delivered by the channel."""
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.UPLINK
 
-    # Actions
+    # Steps
 
     def _log_connected(self, event: PeersChanged) -> None:
         self.log('listening for beacons')
@@ -181,8 +170,7 @@ class User(StateMachine):
         self.log(f'waiting for {", ".join(event.missing)}', warning=True)
 
     def _log_no_beacon(self, event: Timeout) -> None:
-        wait_s = self._timeouts_s[State.LISTENING]
-        self.log(f'no beacon for {wait_s:g} s', warning=True)
+        self.log(f'no beacon for {self._beacon_s:g} s', warning=True)
 
     def _log_resumed(self, event: m.Beacon | m.Grant) -> None:
         self.log('beacons resumed')
@@ -223,67 +211,56 @@ class User(StateMachine):
         self.send(m.derive(m.Data, event, direction=m.Direction.UPLINK, stage=m.Stage.OFFERED,
                            duration_s=event.duration_s, bits=event.bits))
 
-    # Messages that are dropped in every state, before the rows of the table.
-    DROPS = {
-        m.PilotRequest: {_other_user: None, _other_instance: None,
-                         _wrong_cycle: Outcome.WRONG_CYCLE, _other_granted: Outcome.WRONG_USER},
-        m.Data: {_not_delivered_downlink: None, _other_user: None,
-                 _wrong_cycle: Outcome.WRONG_CYCLE, _not_granted: None}}
-
     TABLE = (
-        Row(ANY, PeersChanged, guard=_peers_missing, actions=(_log_missing_peers,),
-            target=State.DISCONNECTED),
-        Row((State.DISCONNECTED,), PeersChanged, actions=(_log_connected,),
-            target=State.LISTENING),
-        Row(ANY, PeersChanged),
-
-        Row((State.LISTENING,), Timeout, actions=(_log_no_beacon,), target=State.NO_BEACON,
-            outcome=Outcome.NO_BEACON),
-        Row((State.ACKNOWLEDGED,), Timeout, target=State.LISTENING, outcome=Outcome.NOT_GRANTED),
-        Row((State.GRANTED,), Timeout, target=State.LISTENING, outcome=Outcome.BS_SILENT),
-
-        Row(ANY, m.Beacon, guard=_stale_beacon, outcome=Outcome.STALE_BEACON),
-        Row((State.DISCONNECTED,), m.Beacon),
-        # A beacon to other users shows that the base station is active, and ends the cycle before.
-        Row((State.LISTENING,), m.Beacon, guard=_invites_others, actions=(_note_beacon,),
-            restart_timeout=True),
-        Row((State.NO_BEACON,), m.Beacon, guard=_invites_others,
-            actions=(_log_resumed, _note_beacon), target=State.LISTENING),
-        Row((State.ACKNOWLEDGED,), m.Beacon, guard=_invites_others, actions=(_note_beacon,),
-            target=State.LISTENING),
-        Row((State.GRANTED,), m.Beacon, guard=_invites_others, actions=(_note_beacon,),
-            target=State.LISTENING, outcome=Outcome.ABANDONED),
-        Row((State.LISTENING,), m.Beacon, actions=(_acknowledge,), target=State.ACKNOWLEDGED),
-        Row((State.NO_BEACON,), m.Beacon, actions=(_log_resumed, _acknowledge),
-            target=State.ACKNOWLEDGED),
-        Row((State.ACKNOWLEDGED,), m.Beacon, actions=(_acknowledge,), restart_timeout=True),
-        Row((State.GRANTED,), m.Beacon, actions=(_acknowledge,), target=State.ACKNOWLEDGED,
-            outcome=Outcome.ABANDONED),
-
-        Row((State.ACKNOWLEDGED,), m.Grant, guard=_other_user_granted, target=State.LISTENING),
-        Row(ANY, m.Grant, guard=_other_user),
-        Row((State.ACKNOWLEDGED,), m.Grant, guard=_other_instance_granted,
-            actions=(_log_other_instance,), target=State.LISTENING, outcome=Outcome.NUMBER_TAKEN),
-        Row(ANY, m.Grant, guard=_other_instance, actions=(_log_other_instance,),
-            outcome=Outcome.NUMBER_TAKEN),
-        Row(ANY, m.Grant, guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
-        Row(ANY, m.Grant, guard=_late_grant, outcome=Outcome.LATE_GRANT),
-        # The base station may wait for longer than the user did.
-        Row((State.LISTENING, State.ACKNOWLEDGED), m.Grant, actions=(_publish_position,),
-            target=State.GRANTED),
-        Row((State.NO_BEACON,), m.Grant, actions=(_log_resumed, _publish_position),
-            target=State.GRANTED),
-        Row((State.GRANTED,), m.Grant),
-
-        # A request that overtakes the grant implies it.
-        Row((State.ACKNOWLEDGED,), m.PilotRequest, guard=_new_request,
-            actions=(_publish_position, _send_pilots), target=State.GRANTED),
-        Row((State.GRANTED,), m.PilotRequest, guard=_new_request, actions=(_send_pilots,),
-            restart_timeout=True),
-        # The channel may have missed the pilots or the position.
-        Row((State.GRANTED,), m.PilotRequest, actions=(_publish_position, _send_pilots),
-            outcome=Outcome.ASKED_AGAIN, restart_timeout=True),
-
-        Row((State.GRANTED,), m.Data, actions=(_send_uplink,), target=State.LISTENING),
-        Row((State.LISTENING,), m.Data, actions=(_send_uplink,), outcome=Outcome.ASKED_AGAIN),
+        *on(PeersChanged, 'peers')(
+            Row(ANY, (_log_missing_peers,), State.DISCONNECTED, guard=_peers_missing),
+            Row((State.DISCONNECTED,), (_log_connected,), State.LISTENING),
+            Row(ANY)),
+        *on(Timeout, 'timeout')(
+            Row((State.LISTENING,), (_log_no_beacon,), State.NO_BEACON, outcome=Outcome.NO_BEACON),
+            Row((State.ACKNOWLEDGED,), target=State.LISTENING, outcome=Outcome.NOT_GRANTED),
+            Row((State.GRANTED,), target=State.LISTENING, outcome=Outcome.BS_SILENT)),
+        *on(m.Beacon, 'beacon')(
+            Row(ANY, guard=_stale_beacon, outcome=Outcome.STALE_BEACON),
+            Row((State.DISCONNECTED,)),
+            # A beacon to others shows that the base station is active, and ends the cycle before.
+            Row((State.LISTENING,), (_note_beacon,), guard=_invites_others, restart_timeout=True),
+            Row((State.NO_BEACON,), (_log_resumed, _note_beacon), State.LISTENING,
+                guard=_invites_others),
+            Row((State.ACKNOWLEDGED,), (_note_beacon,), State.LISTENING, guard=_invites_others),
+            Row((State.GRANTED,), (_note_beacon,), State.LISTENING, guard=_invites_others,
+                outcome=Outcome.ABANDONED),
+            Row((State.LISTENING,), (_acknowledge,), State.ACKNOWLEDGED),
+            Row((State.NO_BEACON,), (_log_resumed, _acknowledge), State.ACKNOWLEDGED),
+            Row((State.ACKNOWLEDGED,), (_acknowledge,), restart_timeout=True),
+            Row((State.GRANTED,), (_acknowledge,), State.ACKNOWLEDGED, outcome=Outcome.ABANDONED)),
+        *on(m.Grant, 'grant')(
+            Row((State.ACKNOWLEDGED,), target=State.LISTENING, guard=_other_user_granted),
+            Row(ANY, guard=_other_user),
+            Row((State.ACKNOWLEDGED,), (_log_other_instance,), State.LISTENING,
+                guard=_other_instance_granted, outcome=Outcome.NUMBER_TAKEN),
+            Row(ANY, (_log_other_instance,), guard=_other_instance, outcome=Outcome.NUMBER_TAKEN),
+            Row(ANY, guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+            Row(ANY, guard=_late_grant, outcome=Outcome.LATE_GRANT),
+            # The base station may wait for longer than the user did.
+            Row((State.LISTENING, State.ACKNOWLEDGED), (_publish_position,), State.GRANTED),
+            Row((State.NO_BEACON,), (_log_resumed, _publish_position), State.GRANTED),
+            Row((State.GRANTED,))),
+        *on(m.PilotRequest, 'pilot_request', {_other_user: None,
+                             _other_instance: None,
+                             _wrong_cycle: Outcome.WRONG_CYCLE,
+                             _other_granted: Outcome.WRONG_USER})(
+            # A request that overtakes the grant implies it.
+            Row((State.ACKNOWLEDGED,), (_publish_position, _send_pilots), State.GRANTED,
+                guard=_new_request),
+            Row((State.GRANTED,), (_send_pilots,), guard=_new_request, restart_timeout=True),
+            # The channel may have missed the pilots or the position.
+            Row((State.GRANTED,), (_publish_position, _send_pilots), outcome=Outcome.ASKED_AGAIN,
+                restart_timeout=True)),
+        *on(m.Data, 'downlink', {_not_delivered_downlink: None,
+                     _other_user: None,
+                     _wrong_cycle: Outcome.WRONG_CYCLE,
+                     _not_granted: None})(
+            Row((State.GRANTED,), (_send_uplink,), State.LISTENING),
+            Row((State.LISTENING,), (_send_uplink,), outcome=Outcome.ASKED_AGAIN)),
     )

@@ -29,28 +29,15 @@ _CONFLICT_S = 5.0
 
 @dataclasses.dataclass
 class _User:
-    """A registered user, and the node that owns its number: the first that answered.
+    """A registered user, and the node that owns its number: the first that answered."""
 
-    Attributes
-    ----------
-    turn
-        (turn, 1, number) if it was served in that turn, (turn, 0, number) if it was registered
-        after it and not served yet.
-    missed
-        Consecutive beacons without an answer.
-    instance
-        Instance of the owner; 0 if unknown.
-    answered_s
-        Time of its last ack [s].
-    rejected
-        Acks of other instances since then.
-    """
-
+    # (turn, 1, number) if it was served in that turn, (turn, 0, number) if it was registered after
+    # it and not served yet.
     turn: tuple[int, int, int]
-    missed: int = 0
-    instance: int = 0
-    answered_s: float = 0.0
-    rejected: int = 0
+    missed: int = 0  # consecutive beacons without an answer
+    instance: int = 0  # of the owner; 0 if unknown
+    answered_s: float = 0.0  # time of its last ack [s]
+    rejected: int = 0  # acks of other instances since then
 
 
 class UserRegistry:
@@ -92,22 +79,14 @@ class UserRegistry:
         """Return the number of registered users."""
         return len(self._users)
 
-    def begin_cycle(self) -> None:
-        """Clear the answers, and wait for all registered users until `invite` is called."""
-        self.answered = {}
-        self.all_invited, self._awaited = True, set(self._users)
-
     def invite(self, attempt: int) -> tuple[int, int]:
         """Choose the users to wait for, and return their first and last number.
 
         The range contains the user whose turn it is. The ranges of all turns cover every number,
-        so that new users are invited within a round.
-
-        Parameters
-        ----------
-        attempt
-            Number of beacons of this cycle that nobody answered; each extends the range.
+        so that new users are invited within a round. Each of the beacons of the cycle that nobody
+        answered, `attempt` of them, extends the range.
         """
+        self.answered = {}
         numbers, size = self._numbers, INVITED * _EXTENSION**min(attempt, 8)
         self.all_invited = size >= len(numbers)
         if self.all_invited:

@@ -105,7 +105,7 @@ def test_lost_users_are_logged_in_one_message(outages, users, text):
         station._users.register(user)
     logged = []
     for _ in range(3):
-        station._users.begin_cycle()
+        station._users.invite(1)
         station._users.add_answer(50)
         logged += outages.end(0, State.BEACONING, Timeout())
     assert logged == [LogMessage(text, warning=True)]

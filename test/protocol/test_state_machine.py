@@ -6,7 +6,7 @@ import enum
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage, Outcome
-from rhs_isac_ros.protocol.role import ANY, StateMachine, Transition, rows_for
+from rhs_isac_ros.protocol.role import ANY, StateMachine, Transition, on, rows_for
 
 
 class State(enum.Enum):
@@ -70,24 +70,22 @@ class LightSteps(StateMachine):
 
 class Light(LightSteps):
     STATES = State
-    EVENT_NAMES = {Go: 'go', Stop: 'stop', Blink: 'blink', Wait: 'wait', Fail: 'fail',
-                   Renew: 'renew'}
     TABLE = (
-        Transition(ANY, Go, guard=LightSteps.past, outcome=Outcome.STALE),
-        Transition((State.RED,), Go, guard=LightSteps.fast, target=State.GREEN,
-                   outcome=Outcome.OVERFLOW),
-        Transition((State.RED,), Go, target=State.GREEN,
-                   actions=(LightSteps.note, LightSteps.record, LightSteps.note)),
-        Transition((State.GREEN,), Go),
-        Transition((State.GREEN,), Stop, target=State.RED),
-        Transition((State.GREEN,), Fail, actions=(LightSteps.shorten,),
-                   target=State.RED),
-        Transition((State.RED,), Wait),
-        Transition((State.RED, State.GREEN), Blink, restart_timeout=True),
-        Transition((State.RED,), Renew, target=State.RED),
-        Transition(ANY, Blink, actions=(LightSteps.note,), outcome=Outcome.DUPLICATE),
-        Transition(ANY, Fail, actions=(LightSteps.note,), target=State.DARK,
-                   outcome=Outcome.OVERFLOW),
+        *on(Go, 'go', {LightSteps.past: Outcome.STALE})(
+            Transition((State.RED,), target=State.GREEN, guard=LightSteps.fast,
+                       outcome=Outcome.OVERFLOW),
+            Transition((State.RED,), (LightSteps.note, LightSteps.record, LightSteps.note),
+                       State.GREEN),
+            Transition((State.GREEN,))),
+        *on(Stop, 'stop')(Transition((State.GREEN,), target=State.RED)),
+        *on(Fail, 'fail')(
+            Transition((State.GREEN,), (LightSteps.shorten,), State.RED),
+            Transition(ANY, (LightSteps.note,), State.DARK, outcome=Outcome.OVERFLOW)),
+        *on(Wait, 'wait')(Transition((State.RED,))),
+        *on(Blink, 'blink')(
+            Transition((State.RED, State.GREEN), restart_timeout=True),
+            Transition(ANY, (LightSteps.note,), outcome=Outcome.DUPLICATE)),
+        *on(Renew, 'renew')(Transition((State.RED,), target=State.RED)),
     )
 
 

@@ -66,14 +66,12 @@ def role(request):
 def machine(scenario):
     """Function that returns the machine of a role, with timeouts of 1 s."""
     def make(name):
-        role = ROLES[name]
         if name == 'bs':
             def receive(codebook, feeds, user, cycle_id, noise):
                 return np.zeros((2, 3, 2), complex)
             return bs.BaseStation(scenario, settings(), np.random.default_rng(0), receive)
         if name == 'user':
-            timeouts_s = {state: 1.0 for state in user.State if state not in role.endless}
-            return user.User({1: mobility.Static((10, 0, 0))}, timeouts_s)
+            return user.User({1: mobility.Static((10, 0, 0))}, step_s=1.0, beacon_s=1.0)
         return rhs_controller.RhsController()
     return make
 
@@ -369,7 +367,8 @@ def test_machines_take_the_first_row_that_matches(
         if subject.state is not state and deadline_s is not None:
             # There is no rest before a pause.
             pauses = subject.state is State.RESTING and subject._pause_requested
-            assert deadline_s == now_s + (0.0 if pauses else 1.0)
+            steps = 4.0 if subject.state is user.State.GRANTED else 1.0
+            assert deadline_s == now_s + (0.0 if pauses else steps)
     assert len(visited) >= 3
     assert sent
     # An idle RHS controller rejects all beams but one without a codebook.

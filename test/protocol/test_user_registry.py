@@ -24,7 +24,7 @@ def make():
 
 def cycle(registry, *users):
     """Return the user served in a cycle in which these users answer, in this order."""
-    registry.begin_cycle()
+    registry.invite(0)
     for user in users:
         registry.add_answer(user)
     registry.remove_absent()
@@ -108,13 +108,13 @@ def test_a_cycle_begins_without_answers(make):
     registry = make()
     cycle(registry, 1, 2)
     assert list(registry.answered) == [1, 2]
-    registry.begin_cycle()
+    registry.invite(0)
     assert not registry.answered
 
 
 def test_without_registered_users_one_answer_is_enough(make):
     registry = make()
-    registry.begin_cycle()
+    registry.invite(0)
     assert registry.is_complete_with(5)
 
 
@@ -122,7 +122,7 @@ def test_without_registered_users_one_answer_is_enough(make):
 def test_the_selection_waits_for_all_registered_users(make, policy):
     registry = make(policy)
     cycle(registry, 1, 2, 3)
-    registry.begin_cycle()
+    registry.invite(0)
     assert not registry.is_complete_with(1)
     registry.add_answer(1)
     assert not registry.is_complete_with(4)
@@ -135,7 +135,7 @@ def test_the_selection_waits_for_all_registered_users(make, policy):
 def test_first_needs_one_answer_only(make):
     registry = make('first')
     cycle(registry, 1, 2, 3)
-    registry.begin_cycle()
+    registry.invite(0)
     assert registry.is_complete_with(2)
 
 
@@ -143,12 +143,12 @@ def test_a_user_is_removed_after_three_missed_beacons(make):
     registry = make()
     cycle(registry, 1, 2)
     for _ in range(3):
-        registry.begin_cycle()
+        registry.invite(0)
         assert not registry.is_complete_with(1)
         registry.add_answer(1)
         registry.remove_absent()
         registry.select()
-    registry.begin_cycle()
+    registry.invite(0)
     assert registry.is_complete_with(1)
 
 
@@ -159,7 +159,7 @@ def test_an_answer_resets_the_count_of_missed_beacons(make):
         cycle(registry, 1)
     cycle(registry, 1, 2)
     for _ in range(3):
-        registry.begin_cycle()
+        registry.invite(0)
         assert not registry.is_complete_with(1)
         registry.add_answer(1)
         registry.remove_absent()
@@ -170,13 +170,13 @@ def test_a_removed_user_is_not_waited_for_until_it_answers(make):
     registry = make()
     cycle(registry, 1, 2)
     registry.remove(2)
-    registry.begin_cycle()
+    registry.invite(0)
     assert registry.is_complete_with(1)
     registry.add_answer(1)
     registry.add_answer(2)
     registry.remove_absent()
     registry.select()
-    registry.begin_cycle()
+    registry.invite(0)
     assert not registry.is_complete_with(1)
 
 
@@ -185,7 +185,7 @@ def test_a_registered_user_is_waited_for_but_has_not_answered(make):
     cycle(registry, 1)
     registry.register(2)
     assert list(registry.answered) == [1]
-    registry.begin_cycle()
+    registry.invite(0)
     assert not registry.is_complete_with(1)
     registry.add_answer(1)
     registry.remove_absent()
@@ -216,7 +216,6 @@ def served_in_turn(registry, present, n):
     """Return the users served in cycles in which the invited ones of `present` answer."""
     served = []
     for _ in range(n):
-        registry.begin_cycle()
         answering, attempt = [], 0
         while not answering:
             first, last = registry.invite(attempt)
@@ -248,7 +247,6 @@ def test_of_many_users_few_are_invited(make, policy):
         registry.register(user)
     ranges = set()
     for _ in range(400):
-        registry.begin_cycle()
         first, last = registry.invite(0)
         ranges.add((first, last))
         invited = [user for user in numbers if first <= user <= last]
@@ -309,7 +307,6 @@ def test_only_invited_users_miss_a_beacon(make):
     registry = make()
     served_in_turn(registry, range(1, 101), 100)
     for _ in range(5):
-        registry.begin_cycle()
         registry.invite(0)
         registry.add_answer(1)
         lost = registry.remove_absent()
