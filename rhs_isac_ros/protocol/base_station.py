@@ -234,7 +234,7 @@ class BaseStation(StateMachine):
         return event.mode is m.Mode.POSITIONING
 
     def _last_configuration(self, event: m.RhsConfiguration) -> bool:
-        return (event.mode is m.Mode.POSITIONING
+        return (self._for_positioning(event)
                 and self._cycle.configured | {event.band} == self._bands)
 
     def _beam_known(self, event: m.RhsConfiguration) -> bool:
@@ -346,10 +346,13 @@ class BaseStation(StateMachine):
         self.log(self._users.register(event.user, event.sender, self.now_s), warning=True)
 
     def _grant(self, event: m.Ack | Timeout) -> None:
+        """Grant the cycle to one of the users that answered, and begin to position it."""
         self._lose_absent()
         self._cycle.user = self._users.select()
         self._cycle.user_instance = self._users.owner(self._cycle.user)
         self._send(m.Grant)
+        self._command_bands(event)
+        self._announce(m.Phase.POSITIONING)
 
     def _lose_absent(self) -> None:
         """Count the invited users that did not answer, and remove those that no longer do."""
@@ -358,9 +361,6 @@ class BaseStation(StateMachine):
         if lost:
             plural, verb = ('s', 'answer') if len(lost) > 1 else ('', 'answers')
             self.log(f'user{plural} {join_users(lost)} no longer {verb}', warning=True)
-
-    def _announce_positioning(self, event: Event) -> None:
-        self._announce(m.Phase.POSITIONING)
 
     def _command_bands(self, event: Event) -> None:
         for band in sorted(self._bands - self._cycle.configured):
@@ -464,8 +464,8 @@ class BaseStation(StateMachine):
     # What a message of a cycle must match.
     _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
     _OF_USER: Drops = _OF_CYCLE | {_wrong_user: Outcome.WRONG_USER}
-    _DELIVERED: Drops = {_not_delivered_uplink: None}
     _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
+    _DELIVERED: Drops = {_not_delivered_uplink: None}
 
     # Every event, in the order in which its rows are tried.
     TABLE = (
@@ -512,8 +512,7 @@ class BaseStation(StateMachine):
             Row((State.RESTING,), (_log_paused,), State.PAUSED, guard=_pausing),
             Row((State.RESTING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
             Row((State.RESTING,), (_begin_cycle,), State.BEACONING),
-            Row((State.BEACONING,), (_grant, _command_bands, _announce_positioning),
-                State.CONFIGURING, guard=_some_acks),
+            Row((State.BEACONING,), (_grant,), State.CONFIGURING, guard=_some_acks),
             Row((State.BEACONING,), (_apply_settings, _log_unanswered), State.PAUSED,
                 guard=_pausing),
             Row((State.BEACONING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
@@ -549,9 +548,8 @@ class BaseStation(StateMachine):
             Row(ANY, (_count_ack,), guard=_duplicate_ack, outcome=Outcome.DUPLICATE),
             # This cycle no longer collects acks; the user is registered for the next one.
             Row(NOT_BEACONING, (_count_ack, _register_user), outcome=Outcome.LATE_ACK),
-            Row((State.BEACONING,),
-                (_count_ack, _accept_ack, _grant, _command_bands, _announce_positioning),
-                State.CONFIGURING, guard=_last_ack),
+            Row((State.BEACONING,), (_count_ack, _accept_ack, _grant), State.CONFIGURING,
+                guard=_last_ack),
             Row((State.BEACONING,), (_count_ack, _accept_ack))),
         *on(m.RhsConfiguration, 'configured', _OF_CYCLE | _OF_CODEBOOK)(
             # A band's configurations, or the configuration of the beam.

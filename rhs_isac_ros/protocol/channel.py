@@ -16,7 +16,7 @@ from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, Outcome, SettingsOffered
-from rhs_isac_ros.protocol.role import NewestDict, Role
+from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, NewestDict, Role
 from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
 from rhs_isac_ros.support import streams
 
@@ -26,8 +26,6 @@ _MAX_USERS = 32
 # Maximum number of messages of each kind kept until related messages arrive. The cycle of an older
 # message can no longer be completed.
 _MAX_PENDING = 256
-# Number of cycles kept to recognise late and duplicate positions.
-_MAX_REMEMBERED = 8
 
 
 class Fading:
@@ -110,25 +108,15 @@ class Air:
 
 @dataclasses.dataclass(frozen=True)
 class _Cycle:
-    """The true position of a cycle and the channel that results from it.
-
-    Attributes
-    ----------
-    multipath
-        Multipath gains of each band, complex128 [N_SB, F, N_E].
-    blocked
-        Whether the user has no direct path, bool [1]; None if no user is blocked.
-    los
-        Gains of the direct path or of the paths of a channel file in each band, complex128
-        [N_SB, N_E].
-    factors
-        Factors of all signals, complex128 [N_B, N_SB, F]; None if all are 1.
-    """
+    """The true position of a cycle and the channel that results from it."""
 
     truth: m.GroundTruth
-    multipath: list[np.ndarray]
+    multipath: list[np.ndarray]  # of each band, complex128 [N_SB, F, N_E]
+    # Whether the user has no direct path, bool [1]; None if no user is blocked.
     blocked: np.ndarray | None
+    # Gains of the other paths of each band, complex128 [N_SB, N_E]: direct, or of a channel file.
     los: list[np.ndarray]
+    # Factors of all signals, complex128 [N_B, N_SB, F]; None if all are 1.
     factors: np.ndarray | None
 
 
@@ -161,7 +149,7 @@ class Channel(Role):
         self._fading = Fading(scenario, seed)
         self._air = Air(streams.generator(seed, streams.AIR))
         # Cycle, user, instance and position of the cycles begun.
-        self._begun: NewestDict[tuple[float, ...], None] = NewestDict(_MAX_REMEMBERED)
+        self._begun: NewestDict[tuple[float, ...], None] = NewestDict(REMEMBERED_CYCLES)
         # Configurations and beams of the current and of future cycles.
         self._configurations: NewestDict[tuple[int, m.Mode, int], np.ndarray] = NewestDict(
             _MAX_PENDING)

@@ -206,14 +206,9 @@ MessageT = TypeVar('MessageT', bound=Message)
 
 
 def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
-    """Return a message that belongs to the cycle, user, band and codebook of `source`.
+    """Return a message with other fields, and the cycle, user, band and codebook of a source.
 
-    Parameters
-    ----------
-    source
-        A message, or another object with attributes of the same names.
-    fields
-        The other fields, and those that differ from the source.
+    The source is a message, or another object with attributes of the same names.
     """
     shared = {name: getattr(source, name) for name in _SHARED
               if name in kind.__dataclass_fields__ and hasattr(source, name)}

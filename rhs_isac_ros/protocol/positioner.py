@@ -24,18 +24,9 @@ from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities
 from rhs_isac_ros.positioning.diagnosis import Diagnosis
 from rhs_isac_ros.positioning.innovation_test import InnovationTest
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    Action,
-    BuildEstimator,
-    CodebookOffered,
-    EstimatorBuilt,
-    Event,
-    Outcome,
-    PublishTrack,
-    RevertSettings,
-    SettingsOffered,
-)
+from rhs_isac_ros.protocol.events import EstimatorBuilt, Event, Outcome
 from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
 from rhs_isac_ros.protocol.user_registry import MAX_NAMED, MAX_USERS
@@ -69,10 +60,6 @@ class Tracks:
 
     def __init__(self) -> None:
         self._tracks: NewestDict[int, _Track] = NewestDict(MAX_USERS)
-
-    def __len__(self) -> int:
-        """Return the number of tracks."""
-        return len(self._tracks)
 
     def clear(self) -> None:
         """End all tracks."""
@@ -261,7 +248,7 @@ class Positioner(Role):
         self._lost: NewestDict[int, _Loss] = NewestDict(MAX_USERS)
         self._residuals = ResidualWatch()
         # The last signals that were answered, and the answer.
-        self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
+        self._answered: tuple[m.ReceivedSignals, list[events.Action]] | None = None
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and codebook in use, pending settings and the last failure."""
@@ -272,10 +259,10 @@ class Positioner(Role):
     def react(self, event: Event) -> None:
         """Process an event: send an estimate, or request an estimator."""
         match event:
-            case CodebookOffered(codebook):
+            case events.CodebookOffered(codebook):
                 self._codebook = codebook
                 self._request(_Job(codebook, self._settings.latest))
-            case SettingsOffered(settings):
+            case events.SettingsOffered(settings):
                 self._settings.latest, self._failure = settings, ''
                 if self._codebook:
                     self._request(_Job(self._codebook, settings))
@@ -301,7 +288,7 @@ class Positioner(Role):
             self._next = job
         else:
             self._building = job
-            self.act(BuildEstimator(job.codebook, job.settings))
+            self.act(events.BuildEstimator(job.codebook, job.settings))
 
     def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> None:
         """Store an estimator, unless other settings were offered meanwhile."""
@@ -326,7 +313,7 @@ class Positioner(Role):
             self._next = _Job((self._next or job).codebook, kept)
             self.log(f'cannot build estimator {job.settings.estimator}, keeping '
                      f'{kept.estimator}: {reason}', warning=True)
-            self.act(RevertSettings(kept))
+            self.act(events.RevertSettings(kept))
 
     def _continue(self) -> None:
         """Request the next estimator and process the signals that waited for the last one."""
@@ -382,7 +369,7 @@ class Positioner(Role):
         """Publish the track if there is one; log whether it predicts the position."""
         user, loss = received.user, None
         if isinstance(estimate, TrackEstimate):
-            self.act(PublishTrack(user, estimate, received.stamp_ns))
+            self.act(events.PublishTrack(user, estimate, received.stamp_ns))
             loss = _Loss.BLOCKED if estimate.is_predicted else None
         self._log_change(received, loss, f'the track of user {user} predicts its position: '
                          f'{describe_doubts(estimate)}')

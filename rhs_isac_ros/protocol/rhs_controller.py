@@ -8,6 +8,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered, Outcome
 from rhs_isac_ros.protocol.role import (
     ANY,
+    REMEMBERED_CYCLES,
     CodebookCache,
     EventT,
     NewestDict,
@@ -15,9 +16,6 @@ from rhs_isac_ros.protocol.role import (
     Transition,
     on,
 )
-
-# Number of cycles kept to recognise late and repeated messages.
-_MAX_REMEMBERED = 8
 
 
 class State(enum.Enum):
@@ -49,9 +47,9 @@ class RhsController(StateMachine):
         # Instance that sent the beam applied last.
         self._beam_sender = 0
         # The user of each granted cycle.
-        self._granted: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
+        self._granted: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
         # Band and codebook of the executed commands of each cycle.
-        self._applied: NewestDict[int, set[tuple[int, str]]] = NewestDict(_MAX_REMEMBERED)
+        self._applied: NewestDict[int, set[tuple[int, str]]] = NewestDict(REMEMBERED_CYCLES)
         # Reset by the next executed command, so that each outage is logged once.
         self._unknown_logged = False
 
@@ -91,10 +89,8 @@ class RhsController(StateMachine):
     # Steps
 
     def _store_codebook(self, event: CodebookOffered) -> None:
+        """Store a codebook; commands can be executed with it."""
         self._codebooks.put(event.codebook.id, event.codebook)
-
-    def _log_codebook(self, event: CodebookOffered) -> None:
-        """Log that commands with the codebook can be executed."""
         self.log(f'serving: codebook {event.codebook.id}')
 
     def _store_grant(self, event: m.Grant) -> None:
@@ -124,7 +120,7 @@ class RhsController(StateMachine):
 
     TABLE = (
         *on(CodebookOffered, 'codebook')(
-            Row(ANY, (_store_codebook, _log_codebook))),
+            Row(ANY, (_store_codebook,))),
         *on(m.Grant, 'grant')(
             Row(ANY, (_store_grant,))),
         *on(m.RhsCommand, 'command')(

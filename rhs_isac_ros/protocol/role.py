@@ -81,6 +81,9 @@ class Role:
         return {}
 
 
+# Number of cycles whose messages roles remember; no message of an older cycle is in transit.
+REMEMBERED_CYCLES = 8
+
 Key = TypeVar('Key')
 Value = TypeVar('Value')
 

@@ -18,21 +18,14 @@ from rhs_isac_ros.link import (
 )
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    CodebookOffered,
-    Event,
-    Outcome,
-    SettingsOffered,
-    Timeout,
-)
-from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
+from rhs_isac_ros.protocol.events import Event, Outcome
+from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
 # Fields of a report for which statistics are computed, named as in `CapacityStatistics`.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
-# Number of cycles whose reports may still arrive.
-_MAX_REMEMBERED = 8
 # Time without messages of a cycle after which the role computes a report [s]. In a process with
 # other roles, the rest of the cycle then comes first.
 _IDLE_S = 5e-3
@@ -85,10 +78,10 @@ class Transmission(Role):
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
         # By cycle. `_counted` holds the cycles that the statistics already include.
-        self._steered: NewestDict[int, _Steered] = NewestDict(_MAX_REMEMBERED)
+        self._steered: NewestDict[int, _Steered] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
-            _MAX_REMEMBERED + _MAX_WAITING)
-        self._counted: NewestDict[int, None] = NewestDict(_MAX_REMEMBERED)
+            REMEMBERED_CYCLES + _MAX_WAITING)
+        self._counted: NewestDict[int, None] = NewestDict(REMEMBERED_CYCLES)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
         self._quartiles = RunningQuartiles(len(_FIGURES))
@@ -98,14 +91,14 @@ class Transmission(Role):
         if isinstance(event, m.Message) and event.cycle_id:
             self._active_s = self.now_s
         match event:
-            case Timeout() if self._waiting:
+            case events.Timeout() if self._waiting:
                 # Messages that have arrived meanwhile precede the next report.
                 self._active_s = self.now_s
                 self._report_next()
-            case CodebookOffered(codebook):
+            case events.CodebookOffered(codebook):
                 self._codebooks.put(codebook.id, None)
                 self.log(f'serving: codebook {codebook.id}')
-            case SettingsOffered(settings):
+            case events.SettingsOffered(settings):
                 # A cycle that has a beam keeps its bands.
                 self._settings.latest = settings
                 for change in self._settings.apply():

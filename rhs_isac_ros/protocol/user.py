@@ -9,10 +9,16 @@ import numpy as np
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome, PeersChanged, Timeout
-from rhs_isac_ros.protocol.role import ANY, EventT, NewestDict, StateMachine, Transition, on
+from rhs_isac_ros.protocol.role import (
+    ANY,
+    REMEMBERED_CYCLES,
+    EventT,
+    NewestDict,
+    StateMachine,
+    Transition,
+    on,
+)
 
-# Number of cycles kept; no message of an older cycle can still be in transit.
-_MAX_REMEMBERED = 8
 # Steps of a cycle during which the user may receive nothing: the signals of the last band, the
 # position, the beam and the data.
 _SILENT_STEPS = 4
@@ -71,22 +77,8 @@ class User(StateMachine):
         self._sounded = (0, 0, 0)
         # By cycle: the highest attempt received. By cycle and user: the position, fixed for the
         # whole cycle.
-        self._attempts: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
-        self._truths: NewestDict[tuple[int, int], m.GroundTruth] = NewestDict(_MAX_REMEMBERED)
-
-    def ground_truth(self, user: int, now_s: float, cycle_id: int = 0) -> m.GroundTruth:
-        """Return the position and velocity of a user.
-
-        Parameters
-        ----------
-        now_s
-            Time on the clock of `handle` [s].
-        cycle_id
-            The cycle to which the position applies; 0 for none.
-        """
-        position, velocity = self._mobilities[user].state(self._time_s(now_s))
-        return m.GroundTruth(
-            cycle_id=cycle_id, user=user, position=position, velocity=velocity)
+        self._attempts: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
+        self._truths: NewestDict[tuple[int, int], m.GroundTruth] = NewestDict(REMEMBERED_CYCLES)
 
     def ground_truths(self, now_s: float) -> m.GroundTruths:
         """Return the positions and velocities of all users at a time on the clock of `handle`."""
@@ -195,7 +187,10 @@ class User(StateMachine):
         """Publish the position that applies to the cycle."""
         self._conflicts.pop(event.user, None)
         key = event.cycle_id, event.user
-        truth = self._truths.get(key) or self.ground_truth(event.user, self.now_s, event.cycle_id)
+        truth = self._truths.get(key)
+        if truth is None:
+            position, velocity = self._mobilities[event.user].state(self._time_s(self.now_s))
+            truth = m.derive(m.GroundTruth, event, position=position, velocity=velocity)
         self._truths.put(key, truth)
         self.send(truth)
 

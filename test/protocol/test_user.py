@@ -63,18 +63,12 @@ def test_every_further_beacon_is_answered_and_restarts_the_timeout(user, cycle_i
 
 
 def test_a_grant_is_answered_with_the_present_position(user):
-    user.ground_truth(4, 8.0)
+    assert [truth.cycle_id for truth in user.ground_truths(8.0).each()] == [0]
     (truth,) = grant(user)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
     np.testing.assert_allclose(truth.position, (7, 0, 0))
     np.testing.assert_allclose(truth.velocity, (0.5, 0, 0))
     assert user.next_deadline() == 18.0
-
-
-def test_a_true_position_has_cycle_0_unless_given(user):
-    assert user.ground_truth(4, 0.0).cycle_id == 0
-    assert user.ground_truth(4, 0.0, 9).cycle_id == 9
-    assert user.ground_truth(4, 0.0).user == 4
 
 
 def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
