@@ -403,8 +403,8 @@ class Network:
                 return BaseStation(scenario, self.settings, rng, self._receive, first)
             case 'user':
                 return user_role.User(
-                    self._mobilities[name],
-                    user_role.timeouts(step_s, self._beacon_timeout_s), self.instances[name])
+                    self._mobilities[name], step_s, self._beacon_timeout_s,
+                    self.instances[name])
             case 'rhs_controller':
                 return RhsController()
             case 'channel':

@@ -30,8 +30,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     Action,
     BuildEstimator,
-    EstimatorFailed,
-    EstimatorReady,
+    EstimatorBuilt,
     PublishTrack,
 )
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
@@ -146,9 +145,9 @@ class PositionerNode(RoleNode[Positioner]):
         for publisher in self._user_odometry.publishers(track.user):
             publisher.publish(odometry)
 
-    def _on_estimator(self, event: EstimatorReady | EstimatorFailed) -> None:
+    def _on_estimator(self, event: EstimatorBuilt) -> None:
         self.dispatch(event)
-        if isinstance(event, EstimatorReady):
+        if event.estimator is not None:
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:

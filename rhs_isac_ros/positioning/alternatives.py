@@ -68,8 +68,8 @@ class Alternative(Protocol):
         """Compute the logarithm of the evidence with the nuisance parameters integrated out.
 
         Takes whitened signals of one phase, complex128 [N_B, N_SB F], without the aligned
-        parameters, which the signals alone reveal, float64 [Q]; they are 0 for the others. The residual
-        is the whitened energy that the best position in the region leaves.
+        parameters, which the signals alone reveal, float64 [Q]; they are 0 for the others. The
+        residual is the whitened energy that the best position in the region leaves.
         """
         ...
 

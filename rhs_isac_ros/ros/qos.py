@@ -8,7 +8,7 @@ from rclpy.qos import (
 )
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 
 # For handshakes and signals, which must all arrive and are useless to late joiners. The depth
 # holds the acks of the users of a beacon, and messages that arrive during a computation.
