@@ -127,7 +127,7 @@ def parameter_help(executable: str) -> str:
 
 
 def _describe(parameter: Parameter) -> str:
-    details = [parameter.kind, f'default {_text(parameter)}']
+    details = [parameter.type, f'default {parameter.default_text}']
     if parameter.range:
         details.append(parameter.range)
     if parameter.dynamic:
@@ -135,17 +135,9 @@ def _describe(parameter: Parameter) -> str:
     return f'  {parameter.name} ({"; ".join(details)})\n      {parameter.text}'
 
 
-def _text(parameter: Parameter) -> str:
-    """Return the default of a parameter as YAML."""
-    if parameter.default in ('', []):
-        return 'empty'
-    text = str(parameter.default)
-    return text.lower() if isinstance(parameter.default, bool) else text
-
-
 def _example(parameters: Sequence[Parameter]) -> str:
     """Return an assignment to the most specific parameter with a default."""
     chosen = next((parameter for parameter in parameters
                    if parameter.name not in ('scenario_file', 'seed')), parameters[0])
-    value = 'my.yaml' if chosen.default == '' else _text(chosen)
+    value = 'my.yaml' if chosen.default == '' else chosen.default_text
     return f'{chosen.name}:={value}'
