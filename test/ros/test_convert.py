@@ -47,12 +47,13 @@ def random_scalar(field, rng):
 def random_array(meta, rng):
     """Return an array with a random number of frames, which only `check` restricts."""
     shape = [SIZES.get(d) or int(d if d.isdigit() else rng.integers(1, 6)) for d in meta['dims']]
-    if meta['kind'] is complex:
+    declared = meta['declared']
+    if declared.kind is complex:
         return rng.normal(size=(*shape, 2)) @ [1, 1j] * 10.0**rng.integers(-200, 200)
-    if meta['kind'] is int:
-        return rng.integers(meta['low'], meta['high'], shape)
-    if math.isfinite(meta['low']):
-        return rng.uniform(meta['low'], meta['high'], shape)
+    if declared.kind is int:
+        return rng.integers(declared.low, declared.high, shape)
+    if declared.range:
+        return rng.uniform(declared.low, declared.high, shape)
     return rng.normal(size=shape) * 10.0**rng.integers(-200, 200)
 
 
