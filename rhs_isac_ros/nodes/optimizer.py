@@ -227,9 +227,9 @@ class OptimizerNode(ParameterizedNode):
         self._codebook_id = codebook.id
         if self._publisher is None:
             return
-        stamp = self.get_clock().now().to_msg()
-        self._publisher.publish(convert.codebook_to_ros(
-            codebook, stamp, self._instance, self._scenario.id))
+        self._publisher.publish(convert.to_bytes(
+            convert.CodebookMessage.of(codebook, self._instance, self._scenario.id),
+            self.get_clock().now().nanoseconds))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 

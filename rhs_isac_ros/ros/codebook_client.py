@@ -11,7 +11,6 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
@@ -68,11 +67,10 @@ class CodebookClient:
 
     def _on_announcement(self, content: bytes) -> None:
         try:
-            message = deserialize_message(content, ros.Codebook)
-            codebook = convert.codebook_from_ros(message)
-        # Anything may be published on the topic, and rclpy raises a RuntimeError without a public
-        # class.
-        except (CodebookError, RuntimeError, ValueError):
+            message = convert.from_bytes(convert.CodebookMessage, content)
+            codebook = message.codebook()
+        # Anything may be published on the topic.
+        except ValueError:
             return
         if message.codebook_id != codebook.id or not self._fits(message, codebook):
             return
@@ -84,7 +82,7 @@ class CodebookClient:
         self._timer.reset()
         self._request()
 
-    def _fits(self, message: ros.Codebook, codebook: Codebook) -> bool:
+    def _fits(self, message: convert.CodebookMessage, codebook: Codebook) -> bool:
         """Return whether a codebook fits the scenario, or log that it does not."""
         try:
             codebook.check(self._scenario)

@@ -1,11 +1,8 @@
 """Conversions between the plain messages of the protocol and ROS messages."""
 
-from __future__ import annotations
-
-import array
-import json
+import dataclasses
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -28,13 +25,51 @@ from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 _UNKNOWN_ROTATION_VARIANCE = 1e6
 
 
-def ros_type(kind: type[Message]) -> Any:
-    """Return the class of `rhs_isac_msgs.msg` with the name of a message class."""
-    return getattr(ros, kind.__name__)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class CodebookMessage:
+    """A codebook as it is announced; `sender` and `scenario_id` are as in `Message`."""
+
+    sender: int = 0
+    scenario_id: str = ''
+    codebook_id: str
+    analog: np.ndarray
+    digital: np.ndarray
+    average_crlb_m2: float
+
+    @classmethod
+    def of(cls, codebook: Codebook, sender: int = 0, scenario_id: str = '') -> 'CodebookMessage':
+        """Return the announcement of a codebook."""
+        return cls(
+            sender=sender, scenario_id=scenario_id, codebook_id=codebook.id,
+            analog=codebook.analog, digital=codebook.digital,
+            average_crlb_m2=codebook.average_crlb_m2)
+
+    def codebook(self) -> Codebook:
+        """Return the codebook.
+
+        Raises
+        ------
+        CodebookError
+            If the arrays are not a valid codebook.
+        """
+        return Codebook(self.analog, self.digital, self.average_crlb_m2)
+
+
+_ROS_TYPES: dict[type, Any] = {
+    **{kind: getattr(ros, kind.__name__) for kind in NAMES},
+    CodebookMessage: ros.Codebook, Presence: ros.Presence}
+_CODECS = {kind: cdr.Codec(kind, own.get_fields_and_field_types())
+           for kind, own in _ROS_TYPES.items()}
+_MessageT = TypeVar('_MessageT', bound=Message | CodebookMessage | Presence)
+
+
+def ros_type(kind: type[_MessageT]) -> Any:
+    """Return the class of `rhs_isac_msgs.msg` of a message class."""
+    return _ROS_TYPES[kind]
 
 
 def to_ros(
-        message: Message, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
+        message: _MessageT, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
     """Convert a message to ROS.
 
     Parameters
@@ -54,7 +89,7 @@ def to_ros(
 
 
 def to_bytes(
-        message: Message, stamp_ns: int, identity: tuple[int, str] | None = None,
+        message: _MessageT, stamp_ns: int, identity: tuple[int, str] | None = None,
         frame: str = RHS_FRAME) -> bytes:
     """Serialize a message (CDR), as a publisher of `ros_type` accepts it.
 
@@ -76,7 +111,7 @@ def to_bytes(
     return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)
 
 
-def from_ros(kind: type[Message], message: Any) -> Message:
+def from_ros(kind: type[_MessageT], message: Any) -> _MessageT:
     """Convert a message of `ros_type` from ROS.
 
     Raises
@@ -96,7 +131,7 @@ def from_ros(kind: type[Message], message: Any) -> Message:
     return _CODECS[kind].decode(serialized)
 
 
-def from_bytes(kind: type[Message], serialized: bytes) -> Message:
+def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     """Convert a serialized message (CDR), as a raw subscription receives it.
 
     Other subscriptions of rclpy silently drop what they cannot deserialize.
@@ -119,16 +154,6 @@ def from_bytes(kind: type[Message], serialized: bytes) -> Message:
     return from_ros(kind, message)
 
 
-def codebook_to_ros(
-        codebook: Codebook, stamp: Time, sender: int = 0, scenario_id: str = '') -> ros.Codebook:
-    """Convert a codebook to ROS; `sender` and `scenario_id` are as in `Message`."""
-    return ros.Codebook(
-        header=Header(stamp=stamp, frame_id=RHS_FRAME), sender=sender, scenario_id=scenario_id,
-        codebook_id=codebook.id,
-        analog=_encode_real(codebook.analog), digital=_encode_complex(codebook.digital),
-        average_crlb_m2=float(codebook.average_crlb_m2))
-
-
 def codebook_from_ros(message: ros.Codebook) -> Codebook:
     """Convert a codebook from ROS.
 
@@ -139,34 +164,7 @@ def codebook_from_ros(message: ros.Codebook) -> Codebook:
     CodebookError
         If the arrays are not a valid codebook.
     """
-    try:
-        analog, digital = _decode_real(message.analog), _decode_complex(message.digital)
-    except ValueError as error:
-        raise MessageError(f'Codebook: {error}') from None
-    return Codebook(analog, digital, message.average_crlb_m2)
-
-
-def presence_to_ros(presence: Presence, stamp: Time) -> ros.Presence:
-    """Convert an announcement to ROS."""
-    return ros.Presence(
-        header=Header(stamp=stamp), sender=presence.sender, scenario_id=presence.scenario_id,
-        role=presence.role, node=presence.node,
-        scenario=json.dumps(dict(presence.scenario)))
-
-
-def presence_from_ros(message: ros.Presence) -> Presence:
-    """Convert an announcement from ROS.
-
-    Raises
-    ------
-    ValueError
-        If the scenario is not a mapping in JSON.
-    """
-    # JSON is YAML without the references that let a short text describe an enormous value.
-    scenario = json.loads(message.scenario)
-    if not isinstance(scenario, dict):
-        raise MessageError('Presence.scenario: expected a mapping of field names to values')
-    return Presence(message.sender, message.scenario_id, message.role, message.node, scenario)
+    return from_ros(CodebookMessage, message).codebook()
 
 
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
@@ -224,39 +222,6 @@ def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
     return both.ravel()
 
 
-def _encode_real(values: np.ndarray) -> ros.RealArray:
-    return ros.RealArray(
-        shape=array.array('I', values.shape), data=array.array('d', values.tobytes()))
-
-
-def _encode_complex(values: np.ndarray) -> ros.ComplexArray:
-    # tobytes is sixty times faster than the conversion of an iterable.
-    return ros.ComplexArray(
-        shape=array.array('I', values.shape), re=array.array('d', values.real.tobytes()),
-        im=array.array('d', values.imag.tobytes()))
-
-
-def _decode_real(message: ros.RealArray) -> np.ndarray:
-    return _reshape(message.data, message.shape)
-
-
-def _decode_complex(message: ros.ComplexArray) -> np.ndarray:
-    real, imag = _reshape(message.re, message.shape), _reshape(message.im, message.shape)
-    result = np.empty(real.shape, complex)
-    result.real, result.imag = real, imag
-    return result
-
-
-def _reshape(values: array.array[float], shape: array.array[int]) -> np.ndarray:
-    if len(values) != math.prod(shape) or not len(values):
-        raise ValueError(
-            f'{len(values)} values, expected shape {list(shape)} with at least one value')
-    return np.frombuffer(values).reshape(tuple(shape))
-
-
 def _encode_vector(kind: Any, values: np.ndarray) -> Any:
     x, y, z = values.tolist()
     return kind(x=x, y=y, z=z)
-
-
-_CODECS = {kind: cdr.Codec(kind, ros_type(kind).get_fields_and_field_types()) for kind in NAMES}

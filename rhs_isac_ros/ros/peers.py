@@ -8,11 +8,11 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
-from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.protocol.presences import Presence, Presences
 from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.endpoints import create_publisher, refusals, steady_timer, subscribe
@@ -194,15 +194,14 @@ class Peers:
     # Other nodes of the same role
 
     def _announce(self) -> None:
-        self._publisher.publish(convert.presence_to_ros(
-            self._presences.own, self._node.get_clock().now().to_msg()))
+        self._publisher.publish(convert.to_bytes(
+            self._presences.own, self._node.get_clock().now().nanoseconds, frame=''))
 
     def _receive(self, content: bytes) -> None:
         try:
-            presence = convert.presence_from_ros(deserialize_message(content, ros.Presence))
-        # Anything may be published on the topic, and rclpy raises a RuntimeError without a public
-        # class.
-        except (RuntimeError, ValueError):
+            presence = convert.from_bytes(Presence, content)
+        # Anything may be published on the topic.
+        except MessageError:
             return
         self._apply(lambda presences: presences.add(presence, time.time_ns()))
         if self._presences.others:

@@ -392,8 +392,8 @@ def test_the_serving_optimizer_announces_again_after_an_older_one_has_returned(
     bench.until(lambda: not newer._peers.conflicts(), 'its absence')
     codebooks = probe.create_publisher(ros.Codebook, topics.CODEBOOK, qos.LATCHED)
     bench.until(codebooks.get_subscription_count, 'the subscription')
-    codebooks.publish(convert.codebook_to_ros(
-        second, probe.get_clock().now().to_msg(), newer._instance - 1, small.scenario.id))
+    codebooks.publish(convert.to_bytes(convert.CodebookMessage.of(
+        second, newer._instance - 1, small.scenario.id), 0))
     bench.until(lambda: got == [first.id, second.id], 'the codebook of the older one')
     announce()
     bench.until(lambda: got == [first.id, second.id, first.id], 'the codebook of the newer one')

@@ -330,7 +330,8 @@ def test_the_tool_ends_with_one_line_if_the_disk_is_full(bench, probe, tmp_path)
 def test_nodes_receive_a_recording_that_is_played_with_its_recorded_qos(bench, tmp_path):
     """As ``ros2 bag play`` does, which reads the quality of service from the file."""
     codebook = Codebook.load(default_codebook_file())
-    message = convert.codebook_to_ros(codebook, Time(), 1, Scenario().id)
+    message = convert.to_ros(
+        convert.CodebookMessage.of(codebook, 1, Scenario().id), Time())
     player = bench.add(Node, 'player')
     (recorded,) = yaml.safe_load(_offered_qos(recorded_topics()[topics.CODEBOOK][1]))
     assert recorded['liveliness_lease_duration'] == recorded['deadline']
