@@ -25,16 +25,13 @@ from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options, chec
 from rhs_isac_ros.codebook.command import run as run_command
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.ros import convert, parameters, qos, topics
-from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
+from rhs_isac_ros.ros import convert, parameters, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import create_publisher
-from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
-from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
+from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
+from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, ParameterizedNode, same_value
 from rhs_isac_ros.ros.peers import Peers, new_instance
-from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
+from rhs_isac_ros.ros.run import check_parameters, parameter_help, parse, run
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES, SecurityError, one_line, prepare
 from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_file
 
 
@@ -220,7 +217,7 @@ class OptimizerNode(ParameterizedNode):
             self._publisher = None
         if not stands_by:
             self._publisher = self._publisher or create_publisher(
-                self, ros.Codebook, topics.CODEBOOK, qos.LATCHED)
+                self, ros.Codebook, topics.CODEBOOK, LATCHED)
             self._publish(self._codebook_of(self._codebook_values()))
 
     def _publish(self, codebook: Codebook) -> None:

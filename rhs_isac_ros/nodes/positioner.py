@@ -36,9 +36,8 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.background import BackgroundWorker
-from rhs_isac_ros.ros.endpoints import UserTopics, create_publisher
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, BackgroundWorker, UserTopics, create_publisher
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
@@ -55,7 +54,7 @@ class PositionerNode(RoleNode[Positioner]):
         self._worker = BackgroundWorker(self)
         self._frame = Frame.of(self, self.values)
         self._pose = create_publisher(
-            self, PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE, overridable=True)
+            self, PoseWithCovarianceStamped, topics.POSITION, EXCHANGE, overridable=True)
         limit = self.values.user_topics
         self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped}, limit)
         self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry}, limit)

@@ -15,9 +15,9 @@ from rclpy.parameter import parameter_value_to_python
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.diagnostics import LogOnce
-from rhs_isac_ros.ros.endpoints import create_or_refuse, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import LATCHED, create_or_refuse, steady_timer, subscribe
 from rhs_isac_ros.ros.parameters import CODEBOOK
 
 _NAMES = list(CODEBOOK)
@@ -62,7 +62,7 @@ class CodebookClient:
         self._log_once = LogOnce(node)
         self.codebook_id = ''
         subscribe(
-            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, qos.LATCHED, raw=True)
+            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, LATCHED, raw=True)
         self._timer = steady_timer(node, _RETRY_S, self._request)
 
     def _on_announcement(self, content: bytes) -> None:

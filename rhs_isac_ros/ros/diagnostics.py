@@ -9,8 +9,8 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.ros import qos, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, create_publisher, steady_timer, subscribe
 
 _PERIOD_S = 1.0
 
@@ -49,7 +49,7 @@ def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> N
     def receive(message: DiagnosticArray) -> None:
         for name, report in from_ros(message, namespace):
             on_report(name, report)
-    subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, qos.EXCHANGE)
+    subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, EXCHANGE)
 
 
 class Diagnostics:
@@ -58,7 +58,7 @@ class Diagnostics:
     def __init__(self, node: Node, report: Callable[[], Report]) -> None:
         self._node, self._report = node, report
         self._publisher = create_publisher(
-            node, DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE)
+            node, DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE)
         steady_timer(node, _PERIOD_S, self._publish)
 
     def _publish(self) -> None:

@@ -1,15 +1,18 @@
-"""Timers, and publishers and subscriptions without event handlers.
+"""Timers, quality of service, publishers and subscriptions, and a thread for slow work.
 
-Those of subscriptions slow down executors. Those of publishers end a node that destroys one while
-an observer with an incompatible quality of service is present (ros2/rclpy#1644).
+Publishers and subscriptions have no event handlers. Those of subscriptions slow down executors.
+Those of publishers end a node that destroys one while an observer with an incompatible quality of
+service is present (ros2/rclpy#1644).
 
 The middleware may refuse to create an endpoint, as without a permission. The node then runs
 without it, logs the refusal, and reports it in its diagnostics.
 """
 
+import collections
 import functools
 import weakref
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from rclpy.clock import Clock
@@ -18,12 +21,62 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
+from rhs_isac_ros.ros import convert, topics
+
+# For handshakes and signals, which must all arrive and are useless to late joiners. The depth
+# holds the acks of the users of a beacon, and messages that arrive during a computation.
+EXCHANGE = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+
+# For acks: all users answer the beacon of a base station to which they are new.
+ACKS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=MAX_USERS, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+
+# For the same messages, received by an observer of the whole network: its queue must hold those
+# of several seconds in which a busy machine does not run the observer.
+OBSERVATION = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=4096, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE)
+
+# For a current value, which late joiners receive as well.
+LATCHED = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# For `LATCHED` values of many publishers, of which a subscription keeps one each.
+PRESENCES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# For the positions of robots, whose drivers and simulators often publish best effort.
+SENSOR = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE)
+
+_LATCHED_MESSAGES = {m.CapacityStatistics}
+
+
+def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSProfile:
+    """Return `LATCHED` for messages that represent a current value, otherwise `exchange`.
+
+    Acks need a deeper queue than `EXCHANGE`.
+    """
+    if kind is m.Ack and exchange is EXCHANGE:
+        return ACKS
+    return LATCHED if kind in _LATCHED_MESSAGES else exchange
 
 
 def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
@@ -117,7 +170,7 @@ def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         on_message: Callable[[m.Message], None],
         on_error: Callable[[m.MessageError], None] | None = None,
-        scenario_id: str = '', exchange: QoSProfile = qos.EXCHANGE) -> None:
+        scenario_id: str = '', exchange: QoSProfile = EXCHANGE) -> None:
     """Subscribe to messages of the protocol; malformed ones are dropped.
 
     Parameters
@@ -147,7 +200,7 @@ def subscribe_messages(
         on_message(plain)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
-                  functools.partial(receive, kind), qos.profile_for(kind, exchange), raw=True)
+                  functools.partial(receive, kind), profile_for(kind, exchange), raw=True)
 
 
 class UserTopics:
@@ -176,7 +229,7 @@ class UserTopics:
         if user not in self._publishers:
             self._publishers[user] = tuple(
                 create_publisher(
-                    self._node, kind, name.format(user=user), qos.EXCHANGE, overridable=True)
+                    self._node, kind, name.format(user=user), EXCHANGE, overridable=True)
                 for name, kind in self._kinds.items())
         return self._publishers[user]
 
@@ -184,3 +237,56 @@ class UserTopics:
         """Destroy the publishers for a user, if any."""
         for publisher in self._publishers.pop(user, ()):
             self._node.destroy_publisher(publisher)
+
+
+_Result = TypeVar('_Result')
+_IMMEDIATE_S = 1e-6
+
+
+class BackgroundWorker:
+    """A thread that runs jobs one after the other.
+
+    Results are delivered in the thread that spins the node, as messages are.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._is_open = True
+        self._done: collections.deque[tuple[Future[Any], Callable[[Any], None]]] = (
+            collections.deque())
+        self._timer = steady_timer(node, _IMMEDIATE_S, self._deliver)
+        self._timer.cancel()
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
+
+    def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
+        """Queue a job.
+
+        Parameters
+        ----------
+        on_result
+            Called with the result in the thread that spins the node. An exception
+            raised by the job is re-raised there instead.
+        """
+        def hand_over(future: Future[_Result]) -> None:
+            self._done.append((future, on_result))
+            executor = self._node.executor
+            if self._is_open and executor is not None:
+                executor.create_task(self._wake)
+        self._pool.submit(job).add_done_callback(hand_over)
+
+    def close(self) -> None:
+        """Wait for the running job, cancel the others and discard all results."""
+        self._is_open = False
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _wake(self) -> None:
+        # The task only starts the timer: an exception in a task would stop the events executor,
+        # and a task may outlast the node.
+        if self._is_open:
+            self._timer.reset()
+
+    def _deliver(self) -> None:
+        self._timer.cancel()
+        while self._done:
+            future, on_result = self._done.popleft()
+            on_result(future.result())

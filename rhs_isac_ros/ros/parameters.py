@@ -1,15 +1,25 @@
-"""The declarations of all ROS parameters: the source of descriptors, checks and documentation.
+"""The declarations of all ROS parameters, and nodes whose parameters may change while they run.
 
-Parameters that belong to the settings of a role are declared there.
+Descriptors, checks and documentation derive from the declarations. Parameters that belong to the
+settings of a role are declared there.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import difflib
 import types
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Protocol, TypeVar
+
+import numpy as np
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.model import Scenario, mobility
@@ -76,10 +86,6 @@ def _parameter(
         name: str, default: bool | int | float | str | list[float], text: str,
         **declared: Any) -> Parameter:
     return Parameter(kind=type(default), text=text, name=name, default=default, **declared)
-
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
 
 
 class _Dataclass(Protocol):
@@ -212,7 +218,7 @@ def declare(node: Node, executable: str) -> types.SimpleNamespace:
 def check_overrides(node: Node) -> None:
     """Warn once of values given to a node at its start that belong to no known parameter.
 
-    Robots share one parameter file among all their nodes; `command_line.check_parameters` rejects
+    Robots share one parameter file among all their nodes; `run.check_parameters` rejects
     unknown names after ``-p``.
     """
     known = known_names()
@@ -237,11 +243,6 @@ def hint(name: str) -> str:
 
 
 def _declare_one(node: Node, parameter: Parameter) -> Any:
-    # Imported here, so that the table can be read without ROS.
-    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-    from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-    from rclpy.parameter import Parameter as RosParameter
-
     default, low, high = parameter.default, parameter.low, parameter.high
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
@@ -306,3 +307,123 @@ def scenario_of(values: types.SimpleNamespace) -> Scenario:
     """
     file = values.scenario_file
     return Scenario.from_yaml(file) if file else Scenario()
+
+
+_FLOATING = (RosParameter.Type.DOUBLE, RosParameter.Type.DOUBLE_ARRAY)
+
+
+def same_value(one: RosParameter, other: RosParameter) -> bool:
+    """Return whether two parameters have the same type and value; NaN equals NaN."""
+    return one.type_ == other.type_ and bool(np.array_equal(
+        one.value, other.value, equal_nan=one.type_ in _FLOATING))
+
+
+class ParameterizedNode(Node):
+    """A node that checks each change of its parameters as a whole and converts it to settings.
+
+    Parameters
+    ----------
+    executable
+        Name of the executable, which determines the parameters.
+    name
+        Name of the node; by default that of the executable.
+
+    Attributes
+    ----------
+    values
+        Initial values of the parameters, by name.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is invalid.
+    """
+
+    def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
+        super().__init__(name or executable, **node_options)
+        self.values = declare(self, executable)
+        self._dynamic = {parameter.name: parameter for parameter in NODES[executable]
+                         if parameter.dynamic}
+        self._current_values = self.values
+        # The settings made by the last check; the change that was checked may still be rejected.
+        self._checked_settings: Any = None
+        self._is_reverting = False
+        self.add_on_set_parameters_callback(self._check)
+        self.add_post_set_parameters_callback(self._on_set)
+
+    def make_settings(self, values: types.SimpleNamespace) -> Any:
+        """Return the settings for parameter values; nodes with dynamic parameters override this.
+
+        Returns
+        -------
+        Any
+            A dataclass whose fields have the names of parameters.
+
+        Raises
+        ------
+        ParameterError
+            If the values contradict each other, the scenario or a file.
+        """
+        return None
+
+    def on_settings_changed(self, settings: Any) -> None:
+        """Handle new settings, made from parameters that were just set."""
+
+    def revert_parameters(self, settings: Any) -> None:
+        """Set the parameters back to the settings in use, which are not checked again."""
+        self._is_reverting = True
+        try:
+            self.set_parameters_atomically([
+                RosParameter(name, value=value)
+                for name, value in dataclasses.asdict(settings).items() if name in self._dynamic])
+        finally:
+            self._is_reverting = False
+
+    def set_parameters_atomically(
+            self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """Set parameters together, as the parameter services do.
+
+        Unlike that of rclpy, the reason for a rejection states the value and the valid range, and
+        read-only parameters may be given if they keep their values, as in a dump of the node.
+        """
+        parameter_list = [p for p in parameter_list if not self._is_kept(p)]
+        if not parameter_list:
+            return SetParametersResult(successful=True)
+        try:
+            self._check_each(parameter_list)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return super().set_parameters_atomically(parameter_list)
+
+    def _is_kept(self, parameter: RosParameter) -> bool:
+        """Return whether a parameter is read-only and keeps its value."""
+        name = parameter.name
+        return (self.has_parameter(name) and self.describe_parameter(name).read_only
+                and same_value(self.get_parameter(name), parameter))
+
+    def _dynamic_values(self, changes: Iterable[RosParameter]) -> dict[str, Any]:
+        return {p.name: p.value for p in changes if p.name in self._dynamic}
+
+    def _check_each(self, changes: Iterable[RosParameter]) -> None:
+        for name, value in self._dynamic_values(changes).items():
+            self._dynamic[name].check(value)
+
+    def _with(self, changes: Iterable[RosParameter]) -> types.SimpleNamespace:
+        return types.SimpleNamespace(
+            **{**vars(self._current_values), **self._dynamic_values(changes)})
+
+    def _check(self, changes: list[RosParameter]) -> SetParametersResult:
+        if self._dynamic_values(changes) and not self._is_reverting:
+            try:
+                self._check_each(changes)
+                self._checked_settings = self.make_settings(self._with(changes))
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _on_set(self, changes: list[RosParameter]) -> None:
+        if not self._dynamic_values(changes):
+            return
+        self._current_values = self._with(changes)
+        if not self._is_reverting:
+            self.on_settings_changed(self._checked_settings)

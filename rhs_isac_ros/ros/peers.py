@@ -14,8 +14,15 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
 from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.protocol.presences import Presence, Presences
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, refusals, steady_timer, subscribe
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import (
+    LATCHED,
+    PRESENCES,
+    create_publisher,
+    refusals,
+    steady_timer,
+    subscribe,
+)
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
 # Poll period while a role is missing or nodes are in conflict, and otherwise. A poll takes half a
@@ -82,8 +89,8 @@ class Peers:
         # Whether the last poll found that a node in conflict has gone.
         self._is_short = False
         if self._is_announced:
-            self._publisher = create_publisher(node, ros.Presence, topics.PRESENCE, qos.LATCHED)
-            subscribe(node, ros.Presence, topics.PRESENCE, self._receive, qos.PRESENCES, raw=True)
+            self._publisher = create_publisher(node, ros.Presence, topics.PRESENCE, LATCHED)
+            subscribe(node, ros.Presence, topics.PRESENCE, self._receive, PRESENCES, raw=True)
             self._announce()
         self._timer = steady_timer(node, _POLL_S, self._poll)
         self.restart()

@@ -14,7 +14,7 @@ from typing import Any
 from ament_index_python.packages import get_package_prefix
 
 from rhs_isac_ros.executables import PARENT_ID
-from rhs_isac_ros.ros.security import OVERRIDE
+from rhs_isac_ros.ros.startup import OVERRIDE
 
 # Maximum number of users with nodes of their own, unless more are requested; more share one node,
 # because every process takes memory and CPU time, also between its cycles.

@@ -1,12 +1,13 @@
-"""Recordings: self-contained MCAP files in the format of ``ros2 bag``.
+"""Recordings of a network and observation of its cycles.
 
-Foxglove, ``ros2 bag info`` and ``ros2 bag play`` read them. The library mcap is optional.
+Recordings are self-contained MCAP files in the format of ``ros2 bag``. Foxglove, ``ros2 bag info``
+and ``ros2 bag play`` read them. The library mcap is optional.
 """
 
 import contextlib
 import re
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,18 @@ from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.monitoring import cycle_log
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import (
+    EXCHANGE,
+    LATCHED,
+    OBSERVATION,
+    PRESENCES,
+    profile_for,
+    subscribe,
+    subscribe_messages,
+)
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
@@ -36,12 +47,12 @@ class RecordingError(Exception):
 
 def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
     """Return the type and the quality of service of each recorded topic, by relative name."""
-    found = {name: (convert.ros_type(kind), qos.profile_for(kind))
+    found = {name: (convert.ros_type(kind), profile_for(kind))
              for kind, name in topics.NAMES.items()}
-    found[topics.POSITION] = PoseWithCovarianceStamped, qos.EXCHANGE
-    found[topics.CODEBOOK] = ros.Codebook, qos.LATCHED
-    found[topics.PRESENCE] = ros.Presence, qos.PRESENCES
-    found[topics.DIAGNOSTICS] = DiagnosticArray, qos.EXCHANGE
+    found[topics.POSITION] = PoseWithCovarianceStamped, EXCHANGE
+    found[topics.CODEBOOK] = ros.Codebook, LATCHED
+    found[topics.PRESENCE] = ros.Presence, PRESENCES
+    found[topics.DIAGNOSTICS] = DiagnosticArray, EXCHANGE
     return found
 
 
@@ -269,3 +280,57 @@ def _opened(path: str | Path) -> Iterator[Any]:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except McapError as error:
         raise RecordingError(f'{path}: not a complete recording: {error!r}') from None
+
+
+class CycleObserver(Node):
+    """Collects the cycles of the network in its namespace.
+
+    Parameters
+    ----------
+    recorder
+        Records all topics of the namespace; the caller closes it. If given, the observer
+        receives exactly the recorded messages of the types `cycle_log.RECEIVES`, and ignores
+        the following parameters.
+    receives
+        Types of the messages to receive.
+    sizes
+        Required sizes by symbol, as in `Scenario.sizes`; None: any.
+    on_malformed
+        Called with the error of each malformed message; by default it is logged.
+    log
+        Collects the cycles; by default a new log.
+
+    Attributes
+    ----------
+    log
+        The cycles, with times of `time.monotonic`.
+    """
+
+    def __init__(
+            self, recorder: Recorder | None = None,
+            receives: Iterable[type[m.Message]] = cycle_log.RECEIVES,
+            sizes: Mapping[str, int] | None = None,
+            on_malformed: Callable[[m.MessageError], None] | None = None,
+            log: cycle_log.CycleLog | None = None, **node_options: Any) -> None:
+        super().__init__('cycle_observer', **node_options)
+        self.log = log or cycle_log.CycleLog()
+        if recorder is not None:
+            # One subscription for both, so that a replay yields the same cycles in the same order.
+            kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
+            recorder.record_topics(self, lambda name, message: self._on_recorded(
+                kinds.get(name), message))
+            return
+        subscribe_messages(self, receives, sizes, self._on_message, on_malformed,
+                           exchange=OBSERVATION)
+
+    def observe(self, message: m.Message, now_s: float) -> None:
+        """Process a message that arrived at `now_s` [s]; subclasses may extend this."""
+        if isinstance(message, cycle_log.RECEIVES):
+            self.log.add(message, now_s)
+
+    def _on_recorded(self, kind: type[m.Message] | None, message: bytes) -> None:
+        if kind is not None:
+            self._on_message(convert.from_bytes(kind, message))
+
+    def _on_message(self, message: m.Message) -> None:
+        self.observe(message, time.monotonic())

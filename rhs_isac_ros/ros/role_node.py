@@ -25,13 +25,12 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
-from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import create_publisher, profile_for, steady_timer, subscribe
 from rhs_isac_ros.ros.frames import surface_frame
-from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
-from rhs_isac_ros.ros.parameters import scenario_of
+from rhs_isac_ros.ros.parameters import ParameterizedNode, scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.roster import ROSTER
 
@@ -183,7 +182,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         for kind in () if self._stands_by else self.role.SENDS:
             if kind not in self._sending:
                 self._sending[kind] = create_publisher(
-                    self, convert.ros_type(kind), topics.NAMES[kind], qos.profile_for(kind))
+                    self, convert.ros_type(kind), topics.NAMES[kind], profile_for(kind))
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
@@ -191,7 +190,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             if kind not in self._receiving:
                 self._receiving.add(kind)
                 subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
-                          functools.partial(self._receive_bytes, kind), qos.profile_for(kind),
+                          functools.partial(self._receive_bytes, kind), profile_for(kind),
                           raw=True)
 
     def report(self) -> Report:

@@ -30,9 +30,9 @@ from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
 from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import use_discovery_profile
 from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.process_network import check_users, start_network

@@ -5,7 +5,7 @@ import threading
 import pytest
 from rclpy.node import Node
 
-from rhs_isac_ros.ros.background import BackgroundWorker
+from rhs_isac_ros.ros.endpoints import BackgroundWorker
 
 
 @pytest.fixture

@@ -7,8 +7,9 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics, from_ros, to_ros
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 
 @pytest.mark.parametrize(('fault', 'level'), [
@@ -31,7 +32,7 @@ def test_a_round_trip_preserves_a_report(fault):
 
 def test_a_report_is_published_once_a_second(bench, probe):
     received, reports = [], []
-    probe.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, received.append, qos.EXCHANGE)
+    probe.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, received.append, EXCHANGE)
 
     def report():
         reports.append(None)

@@ -11,7 +11,7 @@ from rhs_isac_ros.link import beam_pattern, steer
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import markers
+from rhs_isac_ros.ros import scene
 from rhs_isac_ros.ros.frames import Frame
 
 STAMP = Time(sec=3)
@@ -40,7 +40,7 @@ def an_estimate(covariance_m2, user=1):
 @pytest.mark.parametrize('seed', range(4))
 def test_the_ellipsoid_is_that_of_the_covariance(seed):
     root = np.random.default_rng(seed).normal(size=(3, 3))
-    marker = markers.estimate(an_estimate(root @ root.T), STAMP)
+    marker = scene.estimate(an_estimate(root @ root.T), STAMP)
     assert marker.type == Marker.SPHERE
     assert of(marker.pose.position) == pytest.approx([9.0, -1.0, 0.5])
     turn = rotation(marker.pose.orientation)
@@ -51,7 +51,7 @@ def test_the_ellipsoid_is_that_of_the_covariance(seed):
 
 
 def test_a_position_without_variance_is_visible():
-    marker = markers.estimate(an_estimate(np.zeros((3, 3))), STAMP)
+    marker = scene.estimate(an_estimate(np.zeros((3, 3))), STAMP)
     assert of(marker.scale).min() > 0
 
 
@@ -59,9 +59,9 @@ def test_each_user_has_one_hue_for_truth_and_estimate():
     hues = {}
     for user in (1, 2, 2**32 - 1):
         position = np.array([user % 7, 0.0, 0.0], float)
-        one = markers.truth(m.GroundTruth(
+        one = scene.truth(m.GroundTruth(
             cycle_id=0, user=user, position=position, velocity=np.zeros(3)), STAMP)
-        other = markers.estimate(an_estimate(np.eye(3), user), STAMP)
+        other = scene.estimate(an_estimate(np.eye(3), user), STAMP)
         assert of(one.pose.position) == pytest.approx(position)
         assert (one.ns, one.id) != (other.ns, other.id)
         assert (one.color.r, one.color.g, one.color.b) == (
@@ -73,25 +73,25 @@ def test_each_user_has_one_hue_for_truth_and_estimate():
 
 def test_the_board_shows_its_configuration(small):
     configuration = np.linspace(0, 1, 2 * small.scenario.n_elements).reshape(2, -1)
-    marker = markers.board(small.scenario, configuration, STAMP)
+    marker = scene.board(small.scenario, configuration, STAMP)
     assert np.array([of(point) for point in marker.points]) == pytest.approx(
         element_positions(small.scenario))
     assert [color.r for color in marker.colors] == pytest.approx(configuration.mean(axis=0))
     places = np.unique(element_positions(small.scenario)[:, 1])
     assert 0 < marker.scale.y == marker.scale.z < np.diff(places).min()
-    unknown = markers.board(small.scenario, None, STAMP)
+    unknown = scene.board(small.scenario, None, STAMP)
     assert len({color.r for color in unknown.colors}) == 1
 
 
 def test_a_flat_region_is_visible(small):
     flat = dataclasses.replace(small.scenario, roi_size_m=(4.0, 3.0, 0.0))
-    scale = of(markers.region(flat, STAMP).scale)
+    scale = of(scene.region(flat, STAMP).scale)
     assert scale[:2].tolist() == [4.0, 3.0]
     assert 0 < scale[2] < 0.01
 
 
 def test_the_region_has_the_bounds_of_the_scenario(small):
-    marker = markers.region(small.scenario, STAMP)
+    marker = scene.region(small.scenario, STAMP)
     low, high = small.scenario.roi_bounds_m
     assert of(marker.pose.position) - of(marker.scale) / 2 == pytest.approx(low)
     assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
@@ -102,7 +102,7 @@ def test_the_region_has_the_bounds_of_the_scenario(small):
 def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     scenario, place = Scenario(), np.array([9.0, 3.0, 0.3])
     found = beam_pattern(scenario, steer(scenario, place), 10.0)
-    marker = markers.beam(found, 3, STAMP)
+    marker = scene.beam(found, 3, STAMP)
     corners = np.array([of(point) for point in marker.points]).reshape(-1, 3, 3)
     assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'rhs_link')
     lengths = np.linalg.norm(corners, axis=-1)
@@ -113,12 +113,12 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum('nu,nu->n', normals, corners.mean(axis=1)) >= -1e-9).all()
     assert 0 < marker.color.a < 1
-    assert marker.color.r == markers.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
+    assert marker.color.r == scene.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
 
 
 def test_a_path_contains_its_positions_in_order():
     places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
-    path = markers.path(places, STAMP, Frame())
+    path = scene.path(places, STAMP, Frame())
     assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
     assert np.array([of(pose.pose.position) for pose in path.poses]) == pytest.approx(places)
     assert all(pose.header == path.header and pose.pose.orientation.w == 1
@@ -126,5 +126,5 @@ def test_a_path_contains_its_positions_in_order():
 
 
 def test_a_deletion_names_its_marker():
-    marker = markers.deletion('truth', 4, STAMP)
+    marker = scene.deletion('truth', 4, STAMP)
     assert (marker.ns, marker.id, marker.action) == ('truth', 4, Marker.DELETE)

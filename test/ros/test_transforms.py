@@ -8,14 +8,15 @@ from builtin_interfaces.msg import Time
 
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics, transforms
+from rhs_isac_ros.ros import convert, scene, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED
 from rhs_isac_ros.ros.frames import Frame
 
 HAS_TF2 = importlib.util.find_spec('tf2_msgs') is not None
 
 
 def test_the_surface_is_at_the_origin_of_the_map():
-    transform = transforms.surface(Frame(), Time(sec=3))
+    transform = scene.surface_transform(Frame(), Time(sec=3))
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'rhs_link')
     assert transform.header.stamp.sec == 3
     assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [0.0] * 3
@@ -23,7 +24,7 @@ def test_the_surface_is_at_the_origin_of_the_map():
 
 
 def test_a_user_is_at_its_estimate():
-    transform = transforms.user(Frame(), 7, np.array([9.0, -1.5, 0.25]), Time(sec=4))
+    transform = scene.user_transform(Frame(), 7, np.array([9.0, -1.5, 0.25]), Time(sec=4))
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'user_7')
     assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [9.0, -1.5, 0.25]
     assert [getattr(transform.transform.rotation, axis) for axis in 'xyzw'] == [0.0, 0.0, 0.0, 1.0]
@@ -45,8 +46,8 @@ def test_the_visualizer_publishes_transforms(bench, probe):
 
     def store(message):
         found.update({one.child_frame_id: one.transform.translation for one in message.transforms})
-    probe.create_subscription(TFMessage, topics.TF_STATIC, store, qos.LATCHED)
-    probe.create_subscription(TFMessage, topics.TF, store, qos.EXCHANGE)
+    probe.create_subscription(TFMessage, topics.TF_STATIC, store, LATCHED)
+    probe.create_subscription(TFMessage, topics.TF, store, EXCHANGE)
     bench.until(lambda: topics.RHS_FRAME in found, 'the surface')
     bench.until(lambda: probe.count_publishers(topics.TF), 'the publisher')
     estimates = bench.publisher(probe, m.PositionEstimate)

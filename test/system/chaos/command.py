@@ -17,9 +17,9 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
 from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import use_discovery_profile
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,

@@ -12,8 +12,8 @@ from rclpy.node import Node
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import LATCHED, subscribe
 from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.roster import UNIQUE
 from system.chaos.crashes import PUBLISHES
@@ -99,7 +99,7 @@ def _incompatible_observer() -> Iterator[None]:
     """Run a node that requests the latest message of every topic, which most do not offer."""
     node = Node('incompatible')
     for kind, name in topics.NAMES.items():
-        subscribe(node, convert.ros_type(kind), name, lambda content: None, qos.LATCHED, raw=True)
+        subscribe(node, convert.ros_type(kind), name, lambda content: None, LATCHED, raw=True)
     try:
         yield
     finally:

@@ -14,8 +14,8 @@ from rclpy.signals import SignalHandlerOptions
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.ros.early import discovery_profile_file
 from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.startup import discovery_profile_file
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,

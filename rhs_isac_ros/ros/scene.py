@@ -1,14 +1,24 @@
-"""The scene of a network as markers for RViz, in metres in the frame of the surface.
+"""The scene of a network for RViz: markers, paths and transforms.
 
-`place` moves a marker to the frame of standard messages.
+Markers are in metres in the frame of the surface; `place` moves them to the frame of standard
+messages.
 """
 
 from collections.abc import Iterable
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Vector3,
+)
 from nav_msgs.msg import Path
+from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
@@ -17,8 +27,10 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_interval_m, element_positions
 from rhs_isac_ros.monitoring.shapes import ellipsoid_95, lobe_m, user_colour
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import endpoints
+from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.topics import RHS_FRAME
+from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
 _USER_SIZE_M = 0.25
 # RViz rejects bodies without extent [m].
@@ -137,3 +149,61 @@ def _point(values: np.ndarray) -> Point:
 def _vector(values: np.ndarray) -> Vector3:
     x, y, z = np.asarray(values).tolist()
     return Vector3(x=x, y=y, z=z)
+
+
+_NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def surface_transform(frame: Frame, stamp: Time) -> TransformStamped:
+    """Return the transform of the surface."""
+    return _transform(frame, frame.surface, frame.origin, frame.orientation, stamp)
+
+
+def user_transform(
+        frame: Frame, number: int, position: np.ndarray, stamp: Time) -> TransformStamped:
+    """Return the transform of a user at a position, float64 [3] [m], of unknown orientation.
+
+    The position is in the frame of the surface.
+    """
+    return _transform(frame, frame.user(number), frame.from_surface(position), _NO_TURN, stamp)
+
+
+def _transform(
+        frame: Frame, child: str, position: np.ndarray, orientation: np.ndarray, stamp: Time
+) -> TransformStamped:
+    x, y, z = position.tolist()
+    qx, qy, qz, qw = orientation.tolist()
+    return TransformStamped(
+        header=Header(stamp=stamp, frame_id=frame.name), child_frame_id=child,
+        transform=Transform(
+            translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw)))
+
+
+class TransformPublisher:
+    """Publishes transforms, provided that ``tf2_msgs`` is installed, which has no wheel.
+
+    The constructor publishes the transform of the surface, latched.
+
+    Attributes
+    ----------
+    available
+        Whether ``tf2_msgs`` is installed; if not, nothing is published.
+    """
+
+    def __init__(self, node: Node, frame: Frame) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            self.available = False
+            return
+        self.available = True
+        self._message = TFMessage
+        self._dynamic = create_publisher(node, TFMessage, TF, endpoints.EXCHANGE)
+        self._static = create_publisher(node, TFMessage, TF_STATIC, endpoints.LATCHED)
+        self._static.publish(TFMessage(transforms=[
+            surface_transform(frame, node.get_clock().now().to_msg())]))
+
+    def publish(self, transform: TransformStamped) -> None:
+        """Publish a transform that changes."""
+        if self.available:
+            self._dynamic.publish(self._message(transforms=[transform]))
