@@ -38,16 +38,9 @@ from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_
 class GroupParameterService(ParameterService):
     """The parameter services of a node of which some parameters belong together.
 
-    The service ``set_parameters`` of rclpy sets the parameters of a request one by one. ``ros2
-    param load`` uses this service. Here, the parameters of the group in one request are set
-    together, or not at all.
-
-    Parameters
-    ----------
-    node
-        A node that was created with ``start_parameter_services=False``.
-    prefix
-        Prefix of the names of the group.
+    The service ``set_parameters`` of rclpy, which ``ros2 param load`` uses, sets the parameters of
+    a request one by one. Here, those whose names begin with a prefix are set together, or not at
+    all. The node is created with ``start_parameter_services=False``.
     """
 
     def __init__(self, node: Node, prefix: str) -> None:
@@ -83,11 +76,6 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
     """Set a codebook as the parameters of the optimizer in the namespace of the node.
 
     This function blocks and spins the node, so it must not be called from a callback.
-
-    Parameters
-    ----------
-    timeout_s
-        Maximum time to wait for the optimizer and for its response [s].
 
     Raises
     ------
@@ -236,22 +224,12 @@ def _given_codebook_values(changes: list[Parameter]) -> dict[str, Any]:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the executable.
+    """Run the executable, and return its exit code.
 
     Without options, this holds a codebook. With options, it first optimises a codebook, writes it
     to a file and holds it; with ``--push``, it instead sends the codebook to the optimizer of a
-    running network.
-
-    Parameters
-    ----------
-    args
-        Command line; by default that of the process.
-
-    Returns
-    -------
-    int
-        Exit code: 0 on success or after a signal; 1 if a network did not accept the codebook; 2 if
-        an argument or a file is invalid.
+    running network. The exit code is 0 on success or after a signal; 1 if a network did not accept
+    the codebook; 2 if an argument or a file is invalid.
     """
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
     parser = _parser()
@@ -312,7 +290,3 @@ def _push(codebook: Codebook, args: Sequence[str]) -> int:
         try_shutdown()
     print(f'codebook {codebook.id} is set')
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import sys
 import time
 import types
 from pathlib import Path
@@ -26,20 +25,14 @@ from rhs_isac_ros.positioning import (
     make_estimator,
 )
 from rhs_isac_ros.positioning.store import default_folder
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    Action,
-    BuildEstimator,
-    EstimatorFailed,
-    EstimatorReady,
-    PublishTrack,
-)
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, BackgroundWorker, UserTopics, create_publisher
 from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
+from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
@@ -61,17 +54,11 @@ class PositionerNode(RoleNode[Positioner]):
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
-        """Return the settings for parameter values.
+        """Return the settings for parameter values, with files and plug-ins that can be loaded.
 
         Whether a model fits the codebook is only checked when the estimator is built.
-
-        Raises
-        ------
-        ParameterError
-            If the estimator cannot be loaded, needs a model that is missing or unreadable, or
-            cannot use the calibration.
         """
-        settings = settings_of(PositionerSettings, values)
+        settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
         if settings.estimator not in ESTIMATORS:
             self._check_plugin(settings.estimator)
@@ -117,18 +104,12 @@ class PositionerNode(RoleNode[Positioner]):
             self.scenario, codebook, center, np.random.default_rng(0))[0])
         return estimator
 
-    def execute(self, action: Action) -> None:
-        """Build an estimator in the background, or publish the odometry of a track.
-
-        Raises
-        ------
-        TypeError
-            If the action is another one.
-        """
-        if isinstance(action, PublishTrack):
+    def execute(self, action: events.Action) -> None:
+        """Build an estimator in the background, or publish the odometry of a track."""
+        if isinstance(action, events.PublishTrack):
             self._publish_track(action)
             return
-        if not isinstance(action, BuildEstimator):
+        if not isinstance(action, events.BuildEstimator):
             super().execute(action)
             return
         self._worker.run(
@@ -137,7 +118,7 @@ class PositionerNode(RoleNode[Positioner]):
                 functools.partial(self._make_estimator, action.settings), time.perf_counter),
             self._on_estimator)
 
-    def _publish_track(self, track: PublishTrack) -> None:
+    def _publish_track(self, track: events.PublishTrack) -> None:
         if self.is_standing_by:
             return
         odometry = convert.odometry(
@@ -145,9 +126,9 @@ class PositionerNode(RoleNode[Positioner]):
         for publisher in self._user_odometry.publishers(track.user):
             publisher.publish(odometry)
 
-    def _on_estimator(self, event: EstimatorReady | EstimatorFailed) -> None:
+    def _on_estimator(self, event: events.EstimatorReady | events.EstimatorFailed) -> None:
         self.dispatch(event)
-        if isinstance(event, EstimatorReady):
+        if isinstance(event, events.EstimatorReady):
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
@@ -166,7 +147,3 @@ class PositionerNode(RoleNode[Positioner]):
 
 
 main = entry('positioner', lambda: [PositionerNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

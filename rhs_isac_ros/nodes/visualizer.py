@@ -2,7 +2,6 @@
 
 import copy
 import math
-import sys
 import time
 from typing import Any
 
@@ -108,7 +107,3 @@ class VisualizerNode(Node):
 
 
 main = entry('visualizer', lambda: [VisualizerNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -120,12 +120,8 @@ _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 class _Run(NamedTuple):
     """Numbers of fixed size, and the string or sequence that follows them, if any.
 
-    Attributes
-    ----------
-    layouts
-        By position in the message modulo 8, on which the padding depends.
-    tail
-        Wire type of what follows; empty for the last run.
+    The layout depends on the position in the message modulo 8. `tail` is the wire type of what
+    follows; empty for the last run.
     """
 
     layouts: tuple[struct.Struct, ...]
@@ -136,10 +132,7 @@ class _Run(NamedTuple):
 class _Field(NamedTuple):
     """A field of a message, and the range of its items on the wire.
 
-    Attributes
-    ----------
-    encode, decode
-        As in `Type`, or None for a single item; `decode` alone converts an enumeration.
+    A single item has no `encode`; then `decode` converts an enumeration, if given.
     """
 
     name: str

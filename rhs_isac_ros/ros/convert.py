@@ -45,13 +45,7 @@ class CodebookMessage:
             average_crlb_m2=codebook.average_crlb_m2)
 
     def codebook(self) -> Codebook:
-        """Return the codebook.
-
-        Raises
-        ------
-        CodebookError
-            If the arrays are not a valid codebook.
-        """
+        """Return the codebook, or raise CodebookError."""
         return Codebook(self.analog, self.digital, self.average_crlb_m2)
 
 
@@ -70,20 +64,7 @@ def ros_type(kind: type[_MessageT]) -> Any:
 
 def to_ros(
         message: _MessageT, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
-    """Convert a message to ROS.
-
-    Parameters
-    ----------
-    stamp
-        Time for the header; None: zero.
-    identity
-        Sender and id of the scenario; by default those of the message.
-
-    Returns
-    -------
-    Any
-        A message of `ros_type`.
-    """
+    """Convert a message to ROS; see `to_bytes`."""
     stamp_ns = 10**9 * stamp.sec + stamp.nanosec if stamp is not None else 0
     return deserialize_message(to_bytes(message, stamp_ns, identity), ros_type(type(message)))
 
@@ -117,8 +98,7 @@ def from_ros(kind: type[_MessageT], message: Any) -> _MessageT:
     Raises
     ------
     MessageError
-        If an array does not fill its shape, or an enumeration field is not one of its
-        constants.
+        As in `from_bytes`.
     RuntimeError
         If rclpy does not serialize messages as `cdr` decodes them.
     """
@@ -139,7 +119,8 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     Raises
     ------
     MessageError
-        If the bytes are not a message of `ros_type`, or for the reasons given in `from_ros`.
+        If the bytes are not a message of `ros_type`, an array does not fill its shape, or an
+        enumeration field is not one of its constants.
     """
     if serialized.startswith(cdr.HEADER):
         return _CODECS[kind].decode(serialized)
@@ -155,15 +136,7 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
 
 
 def codebook_from_ros(message: ros.Codebook) -> Codebook:
-    """Convert a codebook from ROS.
-
-    Raises
-    ------
-    MessageError
-        If an array does not fill its shape.
-    CodebookError
-        If the arrays are not a valid codebook.
-    """
+    """Convert a codebook from ROS, or raise MessageError or CodebookError."""
     return from_ros(CodebookMessage, message).codebook()
 
 

@@ -16,14 +16,9 @@ _PERIOD_S = 1.0
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
-    """Convert the report of a node to one status, OK or WARN.
+    """Convert the report of a node, by its fully qualified name, to one status, OK or WARN.
 
     The hardware id consists of the name of this host and the name of the node.
-
-    Parameters
-    ----------
-    name
-        Fully qualified name of the node.
     """
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
@@ -75,14 +70,7 @@ class LogOnce:
         self._logged: dict[str, str] = {}
 
     def error(self, subject: str, text: str, *, repeat_if_changed: bool = False) -> None:
-        """Log an error unless one was logged for the subject already.
-
-        Parameters
-        ----------
-        repeat_if_changed
-            Whether to log an error again if its text differs from the last one logged for the
-            subject.
-        """
+        """Log the first error of a subject, and on request each that differs from the last."""
         last = self._logged.get(subject)
         if last is None or repeat_if_changed and text != last:
             self._logged[subject] = text

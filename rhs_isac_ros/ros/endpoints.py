@@ -70,10 +70,7 @@ _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
 def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSProfile:
-    """Return `LATCHED` for messages that represent a current value, otherwise `exchange`.
-
-    Acks need a deeper queue than `EXCHANGE`.
-    """
+    """Return `LATCHED` for messages of a current value, `exchange` for others, `ACKS` for acks."""
     if kind is m.Ack and exchange is EXCHANGE:
         return ACKS
     return LATCHED if kind in _LATCHED_MESSAGES else exchange
@@ -133,10 +130,7 @@ def create_publisher(
 ) -> Publisher:
     """Create a publisher of a ROS type on a topic; one that was refused publishes nothing.
 
-    Parameters
-    ----------
-    overridable
-        Whether parameters ``qos_overrides.*`` change its quality of service.
+    Parameters ``qos_overrides.*`` change the quality of service if it is `overridable`.
     """
     publisher = create_or_refuse(node, f'publisher of {name}', lambda: node.create_publisher(
         kind, name, profile, qos_overriding_options=_overriding(overridable),
@@ -147,18 +141,14 @@ def create_publisher(
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
         raw: bool = False, overridable: bool = False) -> None:
-    """Subscribe to a topic.
+    """Subscribe to a topic of a ROS type.
 
     Parameters
     ----------
-    kind
-        ROS type of the topic.
-    name
-        Name of the topic.
     callback
         Called with each message, or with its serialized bytes (CDR) if `raw`.
     overridable
-        Whether parameters ``qos_overrides.*`` change its quality of service.
+        Whether parameters ``qos_overrides.*`` change the quality of service.
     """
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
         kind, name, callback, profile, raw=raw,
@@ -261,11 +251,8 @@ class BackgroundWorker:
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
         """Queue a job.
 
-        Parameters
-        ----------
-        on_result
-            Called with the result in the thread that spins the node. An exception
-            raised by the job is re-raised there instead.
+        The thread that spins the node calls `on_result` with the result, or raises the exception
+        of the job.
         """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))

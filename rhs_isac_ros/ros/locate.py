@@ -76,10 +76,7 @@ class LocateServer:
     def destroy(self, delay_s: float = 0.0) -> None:
         """Abort all goals, and withdraw the action.
 
-        Parameters
-        ----------
-        delay_s
-            Time in which the node sends the results of the goals [s]; without it, it sends none.
+        The node sends the results of the goals within `delay_s`; without it, it sends none.
         """
         for goal in list(self._goals):
             self._end(goal, 'the base station ends or stands by')

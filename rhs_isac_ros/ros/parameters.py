@@ -38,15 +38,7 @@ class ParameterError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Parameter(Field):
-    """Declaration of a parameter.
-
-    Attributes
-    ----------
-    default
-        Value when none is given.
-    dynamic
-        Whether the parameter may change while the node runs; all others are read at the start.
-    """
+    """Declaration of a parameter; a dynamic one may change while the node runs."""
 
     name: str
     default: bool | int | float | str | list[float]
@@ -71,12 +63,9 @@ class Parameter(Field):
         return text.lower() if self.kind is bool else text
 
     def check(self, value: Any) -> None:
-        """Check a value, because ROS does not check lists and the ends of a range exactly.
+        """Raise ParameterError for an invalid value.
 
-        Raises
-        ------
-        ParameterError
-            If the value has the wrong type, is out of range or is not one of the choices.
+        ROS checks neither lists nor the ends of a range exactly.
         """
         if problem := self.problem(value):
             raise ParameterError(f'{self.name}: {problem}')
@@ -204,7 +193,7 @@ CODEBOOK: Mapping[str, str] = {
 
 
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
-    """Declare the parameters of an executable, a key of `NODES`, and return values by name.
+    """Declare the parameters of an executable, and return their values by name.
 
     Raises
     ------
@@ -218,8 +207,7 @@ def declare(node: Node, executable: str) -> types.SimpleNamespace:
 def check_overrides(node: Node) -> None:
     """Warn once of values given to a node at its start that belong to no known parameter.
 
-    Robots share one parameter file among all their nodes; `run.check_parameters` rejects
-    unknown names after ``-p``.
+    Robots share one parameter file among all their nodes.
     """
     known = known_names()
     # rclpy has no public access to all overrides. Publishers declare qos_overrides when created.
@@ -268,13 +256,7 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
 
 
 def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settings:
-    """Return the settings of a role, a dataclass, from the parameters named as its fields.
-
-    Raises
-    ------
-    ParameterError
-        If the class rejects the values.
-    """
+    """Return the settings of a role, from the parameters named as the fields of its class."""
     try:
         return kind(**{field.name: getattr(values, field.name)
                        for field in dataclasses.fields(kind)})
@@ -284,13 +266,7 @@ def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settin
 
 def calibrated_surface(
         values: types.SimpleNamespace, scenario: Scenario) -> SurfaceEstimate | None:
-    """Return the surface of the parameter ``calibration_file``; None if it is empty.
-
-    Raises
-    ------
-    ParameterError
-        If the file is invalid, or belongs to another scenario.
-    """
+    """Return the surface of the parameter ``calibration_file``; None if it is empty."""
     try:
         return load_surface(values.calibration_file, scenario)
     except CalibrationError as error:
@@ -298,13 +274,7 @@ def calibrated_surface(
 
 
 def scenario_of(values: types.SimpleNamespace) -> Scenario:
-    """Return the scenario of the parameter ``scenario_file``.
-
-    Raises
-    ------
-    ScenarioError
-        If the file is invalid.
-    """
+    """Return the scenario of the parameter ``scenario_file``."""
     file = values.scenario_file
     return Scenario.from_yaml(file) if file else Scenario()
 
@@ -352,17 +322,9 @@ class ParameterizedNode(Node):
         self.add_post_set_parameters_callback(self._on_set)
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
-        """Return the settings for parameter values; nodes with dynamic parameters override this.
+        """Return a dataclass of settings for parameter values, or raise ParameterError.
 
-        Returns
-        -------
-        Any
-            A dataclass whose fields have the names of parameters.
-
-        Raises
-        ------
-        ParameterError
-            If the values contradict each other, the scenario or a file.
+        Nodes with dynamic parameters override this.
         """
         return None
 
@@ -383,8 +345,8 @@ class ParameterizedNode(Node):
             self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set parameters together, as the parameter services do.
 
-        Unlike that of rclpy, the reason for a rejection states the value and the valid range, and
-        read-only parameters may be given if they keep their values, as in a dump of the node.
+        Unlike in rclpy, the reason for a rejection states the value and the valid range. Read-only
+        parameters may be given if they keep their values, as in a dump of the node.
         """
         parameter_list = [p for p in parameter_list if not self._is_kept(p)]
         if not parameter_list:
@@ -396,7 +358,6 @@ class ParameterizedNode(Node):
         return super().set_parameters_atomically(parameter_list)
 
     def _is_kept(self, parameter: RosParameter) -> bool:
-        """Return whether a parameter is read-only and keeps its value."""
         name = parameter.name
         return (self.has_parameter(name) and self.describe_parameter(name).read_only
                 and same_value(self.get_parameter(name), parameter))

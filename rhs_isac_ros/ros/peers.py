@@ -66,8 +66,7 @@ class Peers:
         Called with the roles that are missing, by name with a description: as soon as none is
         missing or after a grace period, and then on every change.
     on_rival
-        Called with whether the node stands by whenever nodes with the same role have appeared or
-        gone.
+        Called with whether the node stands by, when nodes with the same role appear or go.
     """
 
     def __init__(

@@ -101,12 +101,7 @@ class Recorder:
     """Writes the messages of a network to a file.
 
     The file is ``<name>.part`` until it is closed, so that an interrupted run does not lose its
-    messages.
-
-    Parameters
-    ----------
-    scenario
-        Scenario of the network, stored in the file.
+    messages. It contains the scenario of the network.
 
     Attributes
     ----------
@@ -142,10 +137,8 @@ class Recorder:
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
         """Record all topics in the namespace of a node.
 
-        Parameters
-        ----------
-        on_message
-            Called with the relative name of the topic and each serialized message, once written.
+        `on_message` is called with the relative name of the topic and the serialized message after
+        each was written.
         """
         for name, (kind, profile) in recorded_topics().items():
             channel = self._writer.register_channel(
@@ -238,9 +231,7 @@ def _fields(text: str) -> list[str]:
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Read the scenario of a recording.
-
-    Return None if the recording contains none, as when ``ros2 bag`` made it.
+    """Return the scenario of a recording; None if there is none, as when ``ros2 bag`` made it.
 
     Raises
     ------
@@ -298,12 +289,7 @@ class CycleObserver(Node):
     on_malformed
         Called with the error of each malformed message; by default it is logged.
     log
-        Collects the cycles; by default a new log.
-
-    Attributes
-    ----------
-    log
-        The cycles, with times of `time.monotonic`.
+        Collects the cycles, with times of `time.monotonic`; by default a new log.
     """
 
     def __init__(

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+import types
 from typing import Any, Generic, TypeVar
 
 from rclpy.node import Node
@@ -10,19 +11,8 @@ from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    Action,
-    CodebookOffered,
-    Event,
-    LogMessage,
-    Outcome,
-    PeersChanged,
-    RevertSettings,
-    Send,
-    SettingsOffered,
-    Timeout,
-)
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, topics
@@ -30,7 +20,7 @@ from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
 from rhs_isac_ros.ros.endpoints import create_publisher, profile_for, steady_timer, subscribe
 from rhs_isac_ros.ros.frames import surface_frame
-from rhs_isac_ros.ros.parameters import ParameterizedNode, scenario_of
+from rhs_isac_ros.ros.parameters import ParameterizedNode, scenario_of, settings_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.roster import ROSTER
 
@@ -66,13 +56,7 @@ class Clocks:
         return self._world_s
 
     def role_s(self, in_world: bool) -> float:
-        """Return the time of the roles [s].
-
-        Parameters
-        ----------
-        in_world
-            Whether the time since the last call belongs to the world.
-        """
+        """Return the time of the roles [s]; `in_world` if they waited for the world until now."""
         self._advance(in_world)
         return self._role_s
 
@@ -193,6 +177,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                           functools.partial(self._receive_bytes, kind), profile_for(kind),
                           raw=True)
 
+    def make_settings(self, values: types.SimpleNamespace) -> Any:
+        """Return the settings of the role for parameter values, or raise ParameterError."""
+        kind = ROSTER[self._executable].settings
+        return kind and settings_of(kind, values)
+
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
         state = self.role.state
@@ -245,7 +234,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         lacking = (self._lacking,) if self._lacking else ()
         self._statistics.missing = (*missing.values(), *lacking)
         if ROSTER[self._executable].requires:
-            self.dispatch(PeersChanged((*(
+            self.dispatch(events.PeersChanged((*(
                 text for role, text in missing.items() if role != topics.OPTIMIZER_NODE),
                 *lacking)))
 
@@ -268,11 +257,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def on_settings_changed(self, settings: Any) -> None:
         """Pass new settings to the role."""
-        self.dispatch(SettingsOffered(settings))
+        self.dispatch(events.SettingsOffered(settings))
 
     def _on_codebook(self, codebook: Codebook) -> None:
-        """Pass a codebook to the role, which may begin to serve with the first."""
-        self.dispatch(CodebookOffered(codebook))
+        self.dispatch(events.CodebookOffered(codebook))
         if self._needs_codebook:
             self.advertise()
             self.subscribe()
@@ -284,12 +272,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _in_world(self) -> bool:
         return self.role.state in self.role.WORLD_STATES
 
-    def dispatch(self, event: Event) -> None:
+    def dispatch(self, event: events.Event) -> None:
         """Pass an event to the role, then a `Timeout` for each deadline that has passed."""
         now_s = self.now_s()
         self._handle(event, now_s)
         while (deadline_s := self.role.next_deadline()) is not None and deadline_s <= now_s:
-            self._handle(Timeout(), now_s)
+            self._handle(events.Timeout(), now_s)
         if deadline_s is not None and (
                 self._timer_due_s is None or deadline_s < self._timer_due_s):
             self._set_timer(deadline_s - now_s, deadline_s)
@@ -312,14 +300,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._sending[type(message)].publish(content)
         return True
 
-    def execute(self, action: Action) -> None:
-        """Execute an action that is specific to the role; nodes with such actions override this.
-
-        Raises
-        ------
-        TypeError
-            If the node does not support the action.
-        """
+    def execute(self, action: events.Action) -> None:
+        """Execute an action of the role; nodes of roles with own actions override this."""
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
     def _receive_bytes(self, kind: type[m.Message], serialized: bytes) -> None:
@@ -339,29 +321,29 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _drop_foreign(self, message: m.Message) -> None:
         """Count a message of another scenario, and log the first of each sender."""
-        self.role.counters[Outcome.WRONG_SCENARIO.value] += 1
+        self.role.counters[events.Outcome.WRONG_SCENARIO.value] += 1
         if message.sender not in self._foreign and len(self._foreign) < _MAX_LOGGED:
             self._foreign.add(message.sender)
             self.get_logger().warning(  # type: ignore[no-untyped-call]
                 f'{type(message).__name__} dropped: sent with scenario {message.scenario_id}, '
                 f'expected {self.scenario.id}; sender {started(message.sender)}')
 
-    def _handle(self, event: Event, now_s: float) -> None:
+    def _handle(self, event: events.Event, now_s: float) -> None:
         start_s = time.perf_counter()
         actions = self.role.handle(event, now_s)
         self._statistics.record(event, actions, now_s, time.perf_counter() - start_s)
         for action in actions:
             self._perform(action)
 
-    def _perform(self, action: Action) -> None:
+    def _perform(self, action: events.Action) -> None:
         match action:
-            case Send(message):
+            case events.Send(message):
                 self.publish(message)
-            case LogMessage(text, True):
+            case events.LogMessage(text, True):
                 self.get_logger().warning(text)  # type: ignore[no-untyped-call]
-            case LogMessage(text):
+            case events.LogMessage(text):
                 self.get_logger().info(text)  # type: ignore[no-untyped-call]
-            case RevertSettings(settings):
+            case events.RevertSettings(settings):
                 self.revert_parameters(settings)
             case _:
                 self.execute(action)
@@ -387,6 +369,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if deadline_s is None:
             return
         if deadline_s <= now_s:
-            self.dispatch(Timeout())
+            self.dispatch(events.Timeout())
         else:
             self._set_timer(deadline_s - now_s, deadline_s)

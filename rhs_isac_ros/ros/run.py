@@ -41,14 +41,9 @@ _ROS_OPTIONS = {'-p', '--param', '-r', '--remap', '--params-file', '--log-level'
 
 
 def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse a command line that may contain ROS arguments, and check the environment.
+    """Parse a command line, without the name of the program, that may contain ROS arguments.
 
     Print an error as one line and exit with code 2 if an argument or the domain is invalid.
-
-    Parameters
-    ----------
-    arguments
-        Command line without the name of the program.
     """
     check_domain(parser)
     try:
@@ -78,10 +73,7 @@ def check_domain(parser: argparse.ArgumentParser) -> None:
 def node_parser(executable: str, description: str) -> ArgumentParser:
     """Return a parser for an executable whose arguments are all ROS arguments.
 
-    Parameters
-    ----------
-    description
-        A sentence, which may be preceded by the name of the executable and a colon.
+    The description is a sentence, which may be preceded by the name of the executable and a colon.
     """
     text = description.rpartition('``: ')[2]
     return ArgumentParser(
@@ -92,10 +84,10 @@ def node_parser(executable: str, description: str) -> ArgumentParser:
 
 def check_parameters(
         parser: argparse.ArgumentParser, executable: str, arguments: Sequence[str]) -> None:
-    """Exit with a usage error if ``-p`` sets a parameter that only other executables have.
+    """Exit with a usage error if ``-p`` sets a parameter that the executable does not have.
 
-    Likewise if no executable has it. A parameter file may set both, because several nodes may
-    share the file; `parameters.check_overrides` warns of the latter.
+    A parameter file may do so, because several nodes may share it; see
+    `parameters.check_overrides`.
     """
     accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
     for name in _assigned(arguments):
@@ -249,11 +241,6 @@ def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., 
         Name of the executable, a key of `parameters.NODES`.
     make
         Creates the nodes; the docstring of its module describes the executable.
-
-    Returns
-    -------
-    Callable
-        Takes a command line, by default that of the process, and returns the exit code of `run`.
     """
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)

@@ -40,11 +40,8 @@ _MIN_EXTENT_M = 1e-3
 def board(scenario: Scenario, configuration: np.ndarray | None, stamp: Time) -> Marker:
     """Return the surface as one cube for each element, from dark for 0 to bright for 1.
 
-    Parameters
-    ----------
-    configuration
-        Applied configuration, float64 [F, N_E] in [0, 1], of which the mean over the frames is
-        shown; None if unknown.
+    It shows the mean over the frames of a configuration, float64 [F, N_E] in [0, 1]; None if
+    unknown.
     """
     positions = element_positions(scenario)
     levels = (np.full(len(positions), 0.5) if configuration is None
@@ -76,10 +73,7 @@ def truth(message: m.GroundTruth, stamp: Time) -> Marker:
 
 
 def estimate(message: m.PositionEstimate, stamp: Time) -> Marker:
-    """Return a position estimate as its 95 % ellipsoid in the colour of the user.
-
-    The ellipsoid contains 95 % of a Gaussian with the mean and covariance of the estimate.
-    """
+    """Return the ellipsoid that contains 95 % of an estimate, in the colour of the user."""
     half_m, quaternion = ellipsoid_95(message.covariance_m2)
     x, y, z, w = quaternion.tolist()
     marker = _marker('estimate', message.user, Marker.SPHERE, stamp)
@@ -180,14 +174,9 @@ def _transform(
 
 
 class TransformPublisher:
-    """Publishes transforms, provided that ``tf2_msgs`` is installed, which has no wheel.
+    """Publishes transforms, provided that ``tf2_msgs`` is `available`, which has no wheel.
 
     The constructor publishes the transform of the surface, latched.
-
-    Attributes
-    ----------
-    available
-        Whether ``tf2_msgs`` is installed; if not, nothing is published.
     """
 
     def __init__(self, node: Node, frame: Frame) -> None:

@@ -87,13 +87,9 @@ def is_enabled() -> bool:
 def prepare(args: Sequence[str]) -> list[str]:
     """Return a command line that names an enclave, if DDS security is enabled.
 
-    By default, the enclave of a node has its full name, that of a tool is ``operator``. ROS
-    reports an error of the environment with a traceback or not at all, so that it is checked here.
-
-    Parameters
-    ----------
-    args
-        Command line with the name of the program.
+    The command line begins with the name of the program. By default, the enclave of a node has its
+    full name, that of a tool is ``operator``. ROS reports an error of the environment with a
+    traceback or not at all, so that it is checked here.
 
     Raises
     ------
@@ -153,13 +149,7 @@ def _check_enclave(enclave: str) -> None:
 
 @contextlib.contextmanager
 def one_line() -> Iterator[None]:
-    """Convert the error of a node or an endpoint that DDS security refuses.
-
-    Raises
-    ------
-    SecurityError
-        Instead of an error of ROS, if DDS security is enabled.
-    """
+    """Convert the error of a node or an endpoint that DDS security refuses to `SecurityError`."""
     try:
         with warnings.catch_warnings():
             # ROS destroys the incomplete node.

@@ -76,7 +76,8 @@ def crash_all(
 
 
 def crash(
-        observer: NetworkObserver, processes: TrialProcesses, node: str, phase: m.Phase) -> CrashTrial:
+        observer: NetworkObserver, processes: TrialProcesses, node: str, phase: m.Phase
+) -> CrashTrial:
     """Kill a node in a phase, and restart it.
 
     Raises
