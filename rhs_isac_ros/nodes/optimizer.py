@@ -65,14 +65,11 @@ class GroupParameterService(ParameterService):
             return SetParametersResult(successful=False, reason=str(error))
 
 
-TIMEOUT_S = 10.0
-
-
 class PushError(RuntimeError):
     """The optimizer did not accept a codebook."""
 
 
-def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
+def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
     """Set a codebook as the parameters of the optimizer in the namespace of the node.
 
     This function blocks and spins the node, so it must not be called from a callback.
@@ -86,20 +83,16 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
     parameters = [Parameter(name, value=value)
                   for name, value in codebook.to_parameters().items()]
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
     end_s, future = time.monotonic() + timeout_s, None
-    try:
-        while future is None or not future.done():
-            if time.monotonic() > end_s:
-                reason = 'no response' if future else 'not found'
-                raise PushError(f'{optimizer}: {reason} within {timeout_s:g} s')
-            if future is None and client.services_are_ready():
-                future = client.set_parameters_atomically(parameters)
-            executor.spin_once(timeout_sec=0.1)
-    finally:
-        executor.remove_node(node)
+    if client.wait_for_services(timeout_s):
+        future = client.set_parameters_atomically(parameters)
+        executor = SingleThreadedExecutor(context=node.context)
+        rclpy.spin_until_future_complete(
+            node, future, executor, max(end_s - time.monotonic(), 0.0))
         executor.shutdown()
+    if future is None or not future.done():
+        reason = 'no response' if future else 'not found'
+        raise PushError(f'{optimizer}: {reason} within {timeout_s:g} s')
     result = future.result().result
     if not result.successful:
         raise PushError(f'{optimizer}: codebook rejected: {result.reason}')

@@ -19,14 +19,9 @@ from rhs_isac_ros.protocol.messages import MessageError
 
 
 class Type(NamedTuple):
-    """How a type of ROS is encoded.
+    """How a type of ROS is encoded: as items on the wire, each of a type of `struct`.
 
-    Attributes
-    ----------
-    wire
-        Characters of `struct` for numbers, ``s`` for a string, ``*I`` and ``*d`` for sequences.
-    encode, decode
-        From a value to its items on the wire, and back.
+    ``s`` is a string, ``*I`` and ``*d`` are sequences.
     """
 
     wire: tuple[str, ...]

@@ -17,7 +17,7 @@ from rhs_isac_ros.positioning import TrackEstimate
 from rhs_isac_ros.protocol.events import PublishTrack
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
-from rhs_isac_ros.ros import cdr
+from rhs_isac_ros.ros import cdr, frames
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 
@@ -76,12 +76,10 @@ def to_bytes(
 
     Parameters
     ----------
-    stamp_ns
-        Time for the header [ns].
     identity
         Sender and id of the scenario; by default those of the message.
     frame
-        Frame of the surface.
+        Frame of the header.
 
     Raises
     ------
@@ -93,15 +91,7 @@ def to_bytes(
 
 
 def from_ros(kind: type[_MessageT], message: Any) -> _MessageT:
-    """Convert a message of `ros_type` from ROS.
-
-    Raises
-    ------
-    MessageError
-        As in `from_bytes`.
-    RuntimeError
-        If rclpy does not serialize messages as `cdr` decodes them.
-    """
+    """Convert a message of `ros_type` from ROS, or raise MessageError, as `from_bytes` does."""
     serialized = serialize_message(message)
     # The options that follow the identifier do not change the encoding.
     if serialized[:2] != cdr.HEADER[:2]:
@@ -156,7 +146,7 @@ def pose(
     """
     frame = frame or Frame()
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
-    result.pose.pose.position = _encode_vector(Point, frame.from_surface(estimate.position))
+    result.pose.pose.position = frames.to_ros(Point, frame.from_surface(estimate.position))
     result.pose.covariance = _with_rotation(
         frame.covariance(estimate.covariance_m2), math.pi**2 / 3)
     return result
@@ -183,8 +173,8 @@ def true_odometry(
     """Return a true position [3] [m] and velocity [3] [m/s] in a frame, without covariances."""
     result = Odometry(header=Header(stamp=stamp, frame_id=frame.name),
                       child_frame_id=frame.user(user))
-    result.pose.pose.position = _encode_vector(Point, frame.from_surface(position))
-    result.twist.twist.linear = _encode_vector(Vector3, frame.rotation @ velocity)
+    result.pose.pose.position = frames.to_ros(Point, frame.from_surface(position))
+    result.twist.twist.linear = frames.to_ros(Vector3, frame.rotation @ velocity)
     return result
 
 
@@ -193,8 +183,3 @@ def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
     both = variance * np.eye(6)
     both[:3, :3] = covariance
     return both.ravel()
-
-
-def _encode_vector(kind: Any, values: np.ndarray) -> Any:
-    x, y, z = values.tolist()
-    return kind(x=x, y=y, z=z)

@@ -34,38 +34,28 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
 from rhs_isac_ros.ros import convert, topics
 
+
+def _profile(
+        depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
+        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability,
+                      durability=durability)
+
+
 # For handshakes and signals, which must all arrive and are useless to late joiners. The depth
 # holds the acks of the users of a beacon, and messages that arrive during a computation.
-EXCHANGE = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE)
-
+EXCHANGE = _profile(128)
 # For acks: all users answer the beacon of a base station to which they are new.
-ACKS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=MAX_USERS, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE)
-
+ACKS = _profile(MAX_USERS)
 # For the same messages, received by an observer of the whole network: its queue must hold those
 # of several seconds in which a busy machine does not run the observer.
-OBSERVATION = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=4096, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE)
-
+OBSERVATION = _profile(4096)
 # For a current value, which late joiners receive as well.
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
+LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 # For `LATCHED` values of many publishers, of which a subscription keeps one each.
-PRESENCES = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=128, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
+PRESENCES = _profile(128, DurabilityPolicy.TRANSIENT_LOCAL)
 # For the positions of robots, whose drivers and simulators often publish best effort.
-SENSOR = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE)
-
+SENSOR = _profile(10, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LATCHED_MESSAGES = {m.CapacityStatistics}
 
 
@@ -159,8 +149,10 @@ def subscribe(
 def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         on_message: Callable[[m.Message], None],
-        on_error: Callable[[m.MessageError], None] | None = None,
-        scenario_id: str = '', exchange: QoSProfile = EXCHANGE) -> None:
+        on_error: Callable[[m.MessageError], None] | None = None, scenario_id: str = '', *,
+        on_foreign: Callable[[m.Message], None] = lambda message: None,
+        on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
+        exchange: QoSProfile = EXCHANGE) -> None:
     """Subscribe to messages of the protocol; malformed ones are dropped.
 
     Parameters
@@ -169,8 +161,10 @@ def subscribe_messages(
         Required array sizes by symbol, as in `Scenario.sizes`; None: any.
     on_error
         Called with the reason why a message was dropped; by default, the node logs it.
-    scenario_id
-        If given, messages of other scenarios are ignored.
+    scenario_id, on_foreign
+        If given, messages of other scenarios are passed to `on_foreign`.
+    on_arrival
+        Called with the class of each message before it is read.
     exchange
         Quality of service for messages that are not latched.
     """
@@ -178,16 +172,18 @@ def subscribe_messages(
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
     def receive(kind: type[m.Message], serialized: bytes) -> None:
+        on_arrival(kind)
         try:
-            plain = convert.from_bytes(kind, serialized)
-            if scenario_id and plain.scenario_id not in ('', scenario_id):
+            message = convert.from_bytes(kind, serialized)
+            if scenario_id and message.scenario_id not in ('', scenario_id):
+                on_foreign(message)
                 return
             if sizes is not None:
-                m.check(plain, sizes)
+                m.check(message, sizes)
         except m.MessageError as error:
             (on_error or log)(error)
             return
-        on_message(plain)
+        on_message(message)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
                   functools.partial(receive, kind), profile_for(kind, exchange), raw=True)

@@ -8,7 +8,7 @@ import dataclasses
 import difflib
 import types
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from rcl_interfaces.msg import (
@@ -77,16 +77,7 @@ def _parameter(
     return Parameter(kind=type(default), text=text, name=name, default=default, **declared)
 
 
-class _Dataclass(Protocol):
-    """Any dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-
-_Settings = TypeVar('_Settings', bound=_Dataclass)
-
-
-def _declared_by(settings: type[_Dataclass] | None) -> dict[str, Parameter]:
+def _declared_by(settings: type[Any] | None) -> dict[str, Parameter]:
     """Return the parameters, by name, that the fields of a settings class declare."""
     return {} if settings is None else {
         field.name: Parameter(
@@ -255,7 +246,7 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
     return value
 
 
-def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settings:
+def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
     """Return the settings of a role, from the parameters named as the fields of its class."""
     try:
         return kind(**{field.name: getattr(values, field.name)
@@ -311,6 +302,7 @@ class ParameterizedNode(Node):
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(name or executable, **node_options)
+        self._executable = executable
         self.values = declare(self, executable)
         self._dynamic = {parameter.name: parameter for parameter in NODES[executable]
                          if parameter.dynamic}
@@ -322,11 +314,9 @@ class ParameterizedNode(Node):
         self.add_post_set_parameters_callback(self._on_set)
 
     def make_settings(self, values: types.SimpleNamespace) -> Any:
-        """Return a dataclass of settings for parameter values, or raise ParameterError.
-
-        Nodes with dynamic parameters override this.
-        """
-        return None
+        """Return the settings of the role for parameter values, or raise ParameterError."""
+        settings = ROSTER[self._executable].settings
+        return settings and settings_of(settings, values)
 
     def on_settings_changed(self, settings: Any) -> None:
         """Handle new settings, made from parameters that were just set."""

@@ -44,13 +44,7 @@ def _discovery_range() -> str:
 
 
 def claim_domain() -> str:
-    """Return a ROS domain that no other process has claimed; the claim ends with this process.
-
-    Raises
-    ------
-    RuntimeError
-        If all domains are claimed.
-    """
+    """Return a ROS domain that no other process has claimed; the claim ends with this process."""
     for offset in range(_DOMAINS):
         domain = 1 + (os.getpid() + offset) % _DOMAINS
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -83,12 +77,7 @@ def max_processes() -> int:
 class Processes:
     """A context manager that runs executables of this package and ends them on exit.
 
-    Parameters
-    ----------
-    logs
-        Directory for the output of the processes, ``<name>.log`` each.
-    environment
-        Environment variables to set for all processes.
+    Their output goes to ``<name>.log`` in the directory `logs`.
     """
 
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
@@ -103,13 +92,8 @@ class Processes:
             self, executable: str, name: str = '', process: str = '', **parameters: Any) -> None:
         """Start an executable with ROS parameters.
 
-        Parameters
-        ----------
-        name
-            Name of its node; by default that of the executable.
-        process
-            Name of the process; by default that of its node. Processes of nodes with the same name
-            need different names.
+        By default, the node has the name of the executable, and the process that of the node.
+        Processes of nodes with the same name need different names.
         """
         program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
         command = [str(program), '--ros-args']

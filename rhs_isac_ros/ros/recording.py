@@ -98,10 +98,10 @@ def _parts(text: str, package: str) -> Iterator[str]:
 
 
 class Recorder:
-    """Writes the messages of a network to a file.
+    """Writes the messages of a network, and its scenario, to a file.
 
     The file is ``<name>.part`` until it is closed, so that an interrupted run does not lose its
-    messages. It contains the scenario of the network.
+    messages.
 
     Attributes
     ----------
@@ -200,8 +200,7 @@ def read(
     Raises
     ------
     RecordingError
-        If mcap is not installed, the file is not a recording, or the definition of a message has
-        changed since.
+        If the file cannot be read, or a message had other fields when it was recorded.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     checked: set[int] = set()
@@ -236,7 +235,7 @@ def read_scenario(path: str | Path) -> Scenario | None:
     Raises
     ------
     RecordingError
-        If mcap is not installed, or the file is not a recording.
+        If the file cannot be read.
     ScenarioError
         If the scenario is invalid.
     """
@@ -282,12 +281,8 @@ class CycleObserver(Node):
         Records all topics of the namespace; the caller closes it. If given, the observer
         receives exactly the recorded messages of the types `cycle_log.RECEIVES`, and ignores
         the following parameters.
-    receives
-        Types of the messages to receive.
-    sizes
-        Required sizes by symbol, as in `Scenario.sizes`; None: any.
-    on_malformed
-        Called with the error of each malformed message; by default it is logged.
+    receives, sizes, on_malformed
+        As in `subscribe_messages`.
     log
         Collects the cycles, with times of `time.monotonic`; by default a new log.
     """

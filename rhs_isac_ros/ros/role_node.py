@@ -1,9 +1,7 @@
 """The adapter between a role of the protocol and ROS 2."""
 
 import dataclasses
-import functools
 import time
-import types
 from typing import Any, Generic, TypeVar
 
 from rclpy.node import Node
@@ -18,9 +16,14 @@ from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
-from rhs_isac_ros.ros.endpoints import create_publisher, profile_for, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import (
+    create_publisher,
+    profile_for,
+    steady_timer,
+    subscribe_messages,
+)
 from rhs_isac_ros.ros.frames import surface_frame
-from rhs_isac_ros.ros.parameters import ParameterizedNode, scenario_of, settings_of
+from rhs_isac_ros.ros.parameters import ParameterizedNode, scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.roster import ROSTER
 
@@ -112,7 +115,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(executable, name, **node_options)
-        self._executable = executable
         self.scenario = scenario_of(self.values)
         self._sizes = self.scenario.sizes
         self.instance = new_instance()
@@ -170,17 +172,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
-        for kind in self.role.RECEIVES:
-            if kind not in self._receiving:
-                self._receiving.add(kind)
-                subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
-                          functools.partial(self._receive_bytes, kind), profile_for(kind),
-                          raw=True)
-
-    def make_settings(self, values: types.SimpleNamespace) -> Any:
-        """Return the settings of the role for parameter values, or raise ParameterError."""
-        kind = ROSTER[self._executable].settings
-        return kind and settings_of(kind, values)
+        kinds = [kind for kind in self.role.RECEIVES if kind not in self._receiving]
+        self._receiving.update(kinds)
+        subscribe_messages(
+            self, kinds, self._sizes, self._on_message, self._on_malformed, self.scenario.id,
+            on_foreign=self._on_foreign, on_arrival=self._statistics.count_received)
 
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
@@ -304,22 +300,15 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """Execute an action of the role; nodes of roles with own actions override this."""
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
-    def _receive_bytes(self, kind: type[m.Message], serialized: bytes) -> None:
-        self._statistics.count_received(kind)
-        try:
-            message = convert.from_bytes(kind, serialized)
-            if message.scenario_id not in ('', self.scenario.id):
-                self._drop_foreign(message)
-                return
-            m.check(message, self._sizes)
-        except m.MessageError as error:
-            self.role.counters['malformed'] += 1
-            self._log_error('dropped', error)
-            return
+    def _on_message(self, message: m.Message) -> None:
         if not self._stands_by:
             self.dispatch(message)
 
-    def _drop_foreign(self, message: m.Message) -> None:
+    def _on_malformed(self, error: m.MessageError) -> None:
+        self.role.counters['malformed'] += 1
+        self._log_error('dropped', error)
+
+    def _on_foreign(self, message: m.Message) -> None:
         """Count a message of another scenario, and log the first of each sender."""
         self.role.counters[events.Outcome.WRONG_SCENARIO.value] += 1
         if message.sender not in self._foreign and len(self._foreign) < _MAX_LOGGED:
