@@ -3,7 +3,7 @@
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,10 @@ class GroupParameterService(ParameterService):
             return SetParametersResult(successful=False, reason=str(error))
 
 
+def _ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
+    return [Parameter(name, value=value) for name, value in values.items()]
+
+
 class PushError(RuntimeError):
     """The optimizer did not accept a codebook."""
 
@@ -81,11 +85,10 @@ def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
     """
     optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
-    parameters = [Parameter(name, value=value)
-                  for name, value in codebook.to_parameters().items()]
     end_s, future = time.monotonic() + timeout_s, None
     if client.wait_for_services(timeout_s):
-        future = client.set_parameters_atomically(parameters)
+        future = client.set_parameters_atomically(
+            _ros_parameters(codebook.to_parameters()))
         executor = SingleThreadedExecutor(context=node.context)
         rclpy.spin_until_future_complete(
             node, future, executor, max(end_s - time.monotonic(), 0.0))
@@ -119,8 +122,7 @@ class OptimizerNode(ParameterizedNode):
         self._codebook_id, self._refused = '', 0
         # A file of an earlier version contains another provenance, and may lack the id.
         self.set_parameters_atomically(
-            [Parameter(name, value=value)
-             for name, value in self._first_codebook(file).to_parameters().items()])
+            _ros_parameters(self._first_codebook(file).to_parameters()))
         self._announce(False)
         self._peers = Peers(
             self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
@@ -244,9 +246,9 @@ def main(args: Sequence[str] | None = None) -> int:
         return _push(codebook, args)
     if reason == INTERRUPTED:
         return 0
-    files = {'codebook_file': options.output, 'scenario_file': options.scenario or ''}
-    return run(lambda: [OptimizerNode(parameter_overrides=[
-        Parameter(name, value=str(file)) for name, file in files.items()])], args)
+    overrides = _ros_parameters({'codebook_file': str(options.output),
+                                 'scenario_file': str(options.scenario or '')})
+    return run(lambda: [OptimizerNode(parameter_overrides=overrides)], args)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -257,11 +259,10 @@ def _parser() -> argparse.ArgumentParser:
                     'offline, write it to a file and hold it.')
     add_options(parser)
     parser.add_argument('--push', action='store_true',
-                        help='send the codebook to the optimizer of a running network '
-                              'and exit')
+                        help='send the codebook to the optimizer of a running network and exit')
     parser.add_argument('--push-file', type=input_file, metavar='FILE',
-                        help='send this codebook to a running network without '
-                              'optimising, and exit')
+                        help='send this codebook to a running network without optimising, '
+                             'and exit')
     return parser
 
 

@@ -11,19 +11,10 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 
+from rhs_isac_ros import positioning
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
-from rhs_isac_ros.positioning import (
-    ESTIMATORS,
-    REGION_ESTIMATORS,
-    Estimator,
-    ModelError,
-    Network,
-    NeuralEstimator,
-    file_options,
-    make_estimator,
-)
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -60,10 +51,10 @@ class PositionerNode(RoleNode[Positioner]):
         """
         settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
-        if settings.estimator not in ESTIMATORS:
+        if settings.estimator not in positioning.ESTIMATORS:
             self._check_plugin(settings.estimator)
             return settings
-        if settings.estimator != NeuralEstimator.name:
+        if settings.estimator != positioning.NeuralEstimator.name:
             # Other estimators do not use the file. Clear it, so that a change of the file does not
             # rebuild them.
             return dataclasses.replace(settings, model_file='')
@@ -75,8 +66,8 @@ class PositionerNode(RoleNode[Positioner]):
             raise ParameterError(
                 "model_file: '', expected a trained model for the estimator neural")
         try:
-            Network.load(settings.model_file)
-        except ModelError as error:
+            positioning.Network.load(settings.model_file)
+        except positioning.ModelError as error:
             raise ParameterError(f'model_file: {error}') from None
         return settings
 
@@ -88,16 +79,18 @@ class PositionerNode(RoleNode[Positioner]):
         except plugins.PluginError as error:
             raise ParameterError(f'estimator: {error}') from None
 
-    def _make_estimator(self, settings: PositionerSettings, codebook: Codebook) -> Estimator:
+    def _make_estimator(
+            self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:
         folder = self.values.table_folder
-        options = file_options(
+        options = positioning.file_options(
             settings.estimator, Path(folder) if folder else default_folder(),
             settings.model_file)
-        if settings.estimator in REGION_ESTIMATORS:
+        if settings.estimator in positioning.REGION_ESTIMATORS:
             options['reject_outside'] = settings.reject_outside
         if settings.calibration_file:
             options['surface'] = load_surface(settings.calibration_file, self.scenario)
-        estimator = make_estimator(settings.estimator, self.scenario, codebook, **options)
+        estimator = positioning.make_estimator(
+            settings.estimator, self.scenario, codebook, **options)
         # The first estimate takes longer than all others. A user does not wait for it.
         center = np.array([self.scenario.roi_center_m])
         estimator.estimate(simulate_received(
@@ -106,17 +99,16 @@ class PositionerNode(RoleNode[Positioner]):
 
     def execute(self, action: events.Action) -> None:
         """Build an estimator in the background, or publish the odometry of a track."""
-        if isinstance(action, events.PublishTrack):
-            self._publish_track(action)
-            return
-        if not isinstance(action, events.BuildEstimator):
-            super().execute(action)
-            return
-        self._worker.run(
-            functools.partial(
-                build_estimator, action.codebook,
-                functools.partial(self._make_estimator, action.settings), time.perf_counter),
-            self._on_estimator)
+        match action:
+            case events.PublishTrack():
+                self._publish_track(action)
+            case events.BuildEstimator(codebook, settings):
+                make = functools.partial(self._make_estimator, settings)
+                self._worker.run(
+                    functools.partial(build_estimator, codebook, make, time.perf_counter),
+                    self._on_estimator)
+            case _:
+                super().execute(action)
 
     def _publish_track(self, track: events.PublishTrack) -> None:
         if self.is_standing_by:

@@ -33,13 +33,6 @@ class CodebookClient:
     whose id proves its content, therefore replaces a response with another codebook or a missing
     response. The optimizers agree on which of them announces; see `Presences`.
 
-    Parameters
-    ----------
-    scenario
-        Scenario that the codebook must fit.
-    on_codebook
-        Called with each new codebook.
-
     Attributes
     ----------
     codebook_id

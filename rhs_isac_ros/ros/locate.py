@@ -31,14 +31,8 @@ class _Goal:
 class LocateServer:
     """Serves the action, from the messages that the base station sends and receives.
 
-    Parameters
-    ----------
-    request
-        Called with the user of each accepted goal.
-    pose
-        Converts an estimate to a pose.
-    max_users
-        Highest number of a user.
+    It calls `request` with the user of each accepted goal, and `pose` with the estimate of a
+    position.
     """
 
     def __init__(

@@ -282,12 +282,7 @@ def same_value(one: RosParameter, other: RosParameter) -> bool:
 class ParameterizedNode(Node):
     """A node that checks each change of its parameters as a whole and converts it to settings.
 
-    Parameters
-    ----------
-    executable
-        Name of the executable, which determines the parameters.
-    name
-        Name of the node; by default that of the executable.
+    The executable determines the parameters; its name is by default that of the node.
 
     Attributes
     ----------

@@ -83,32 +83,19 @@ class Clocks:
 class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """A node that passes messages to a role and performs the actions that it returns.
 
-    A subclass makes its role from the parameters and passes it to `start`.
-
-    Parameters
-    ----------
-    executable
-        Name of the executable, which determines the parameters.
-    name
-        Name of the node; by default that of the executable.
+    A subclass makes its `role` from the parameters and passes it to `start`.
 
     Attributes
     ----------
-    role
-        The role; set by `start`.
     scenario
         Scenario of the parameter ``scenario_file``.
     instance
         Instance of the node; see `Message.sender`.
-    clocks
-        Clocks of the node.
 
     Raises
     ------
-    ParameterError
-        If a parameter is invalid.
-    ScenarioError
-        If the scenario file is invalid.
+    ParameterError, ScenarioError
+        If a parameter or the scenario file is invalid.
     """
 
     role: _RoleT

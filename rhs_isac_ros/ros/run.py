@@ -21,14 +21,7 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.ros import parameters
-from rhs_isac_ros.ros.parameters import (
-    CODEBOOK,
-    NODES,
-    Parameter,
-    ParameterError,
-    hint,
-    known_names,
-)
+from rhs_isac_ros.ros.parameters import CODEBOOK, NODES, Parameter, ParameterError
 from rhs_isac_ros.ros.startup import SecurityError, leave, one_line, prepare, use_discovery_profile
 from rhs_isac_ros.support.arguments import ArgumentParser
 
@@ -91,8 +84,9 @@ def check_parameters(
     """
     accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
     for name in _assigned(arguments):
-        if name not in known_names() and not name.startswith(_OF_RCLPY):
-            parser.error(f'argument -p: {name}: unknown parameter{hint(name)}; see --help')
+        if name not in parameters.known_names() and not name.startswith(_OF_RCLPY):
+            parser.error(
+                f'argument -p: {name}: unknown parameter{parameters.hint(name)}; see --help')
         owners = [owner for owner in NODES if name in _names(owner)]
         if owners and name not in accepted:
             parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '
@@ -169,8 +163,6 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
 
     Parameters
     ----------
-    make
-        Creates the nodes.
     args
         Command line with the name of the program; by default that of the process.
     done
@@ -233,14 +225,9 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
 
 
 def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
-    """Return the main function of an executable whose arguments are all ROS arguments.
+    """Return the main function of an executable, a key of `NODES`, without own arguments.
 
-    Parameters
-    ----------
-    executable
-        Name of the executable, a key of `parameters.NODES`.
-    make
-        Creates the nodes; the docstring of its module describes the executable.
+    The docstring of the module of `make` describes the executable.
     """
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)
