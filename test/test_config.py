@@ -14,7 +14,7 @@ CONFIG = Path(__file__).parents[1] / 'config'
 SCENARIOS = ('table1', 'quick', 'wideband', 'bandplan', 'hall')
 FILES = ('multipath', 'channel')
 CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
-FIELDS = {field.name: field.metadata['unit'] for field in dataclasses.fields(Scenario)}
+FIELDS = {field.name: field.metadata['declared'].unit for field in dataclasses.fields(Scenario)}
 
 
 def test_every_file_is_a_scenario_or_a_codebook():

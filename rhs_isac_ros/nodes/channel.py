@@ -1,12 +1,8 @@
 """The executable ``channel``: the emulated radio channel and surface."""
 
-import sys
-import types
 from typing import Any
 
 from rhs_isac_ros.protocol.channel import Channel
-from rhs_isac_ros.protocol.settings import Impairments
-from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -21,13 +17,5 @@ class ChannelNode(RoleNode[Channel]):
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'serving: {self.scenario.n_bands} bands, {self.scenario.n_elements} elements')
 
-    def make_settings(self, values: types.SimpleNamespace) -> Impairments:
-        """Return the impairments for parameter values."""
-        return settings_of(Impairments, values)
-
 
 main = entry('channel', lambda: [ChannelNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,7 +1,6 @@
 """The executable ``user``: one or many users of the system."""
 
 import functools
-import sys
 from typing import Any
 
 import numpy as np
@@ -131,7 +130,3 @@ class UserNode(RoleNode[User]):
 
 
 main = entry('user', lambda: [UserNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

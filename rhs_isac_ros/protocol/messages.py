@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from rhs_isac_ros.support.fields import Field
+
 
 class MessageError(ValueError):
     """A field of a message has an invalid value."""
@@ -32,7 +34,7 @@ def array(
         Whether entries may be NaN, for unknown values.
     """
     return dataclasses.field(
-        metadata={'dims': tuple(dims.split()), 'kind': kind, 'low': low, 'high': high,
+        metadata={'dims': tuple(dims.split()), 'declared': Field(kind, low=low, high=high),
                   'nan_allowed': nan_allowed})
 
 
@@ -43,7 +45,8 @@ def index(symbol: str) -> Any:
 
 def number(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
     """Declare a number with an inclusive range."""
-    return dataclasses.field(default=default, metadata={'low': low, 'high': high})
+    return dataclasses.field(
+        default=default, metadata={'declared': Field(float, low=low, high=high)})
 
 
 def size(symbol: str) -> Any:
@@ -85,8 +88,10 @@ def check(message: 'Message', sizes: Mapping[str, int]) -> None:
             problem = f'{value}, expected a finite number'
         elif 'equals' in meta and value != sizes[meta['equals']]:
             problem = f'{value}, expected {meta["equals"]} = {sizes[meta["equals"]]}'
-        elif 'low' in meta and not meta['low'] <= value <= meta['high']:
-            problem = f'{value}, expected {meta["low"]:g} to {meta["high"]:g}'
+        elif 'declared' in meta:
+            declared = meta['declared']
+            if not declared.low <= value <= declared.high:
+                problem = f'{value}, expected {declared.range}'
         if problem:
             raise MessageError(f'{kind.__name__}.{name}: {problem}')
 
@@ -108,10 +113,10 @@ def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[st
     finite = np.isfinite(value)
     if not finite.all() and not (meta['nan_allowed'] and (finite | np.isnan(value)).all()):
         return 'not finite, expected finite numbers'
-    if meta['low'] > -math.inf and value.size and (
-            value.min() < meta['low'] or value.max() > meta['high']):
-        return (f'{value.min():g} to {value.max():g}, expected '
-                f'{meta["low"]:g} to {meta["high"]:g}')
+    declared = meta['declared']
+    if declared.range and value.size and (
+            value.min() < declared.low or value.max() > declared.high):
+        return f'{value.min():g} to {value.max():g}, expected {declared.range}'
     return ''
 
 

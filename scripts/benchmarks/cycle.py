@@ -25,14 +25,15 @@ from parts.bare_cycle import bare_cycles
 from parts.chain import ChainObserver, Cycle
 from parts.hops import CHAIN, ping_pong
 from rclpy.experimental import EventsExecutor
+from system.trial_processes import TrialProcesses
 
 from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
-from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.processes import private_domain
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import use_discovery_profile
 from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.process_network import check_users, start_network
@@ -115,7 +116,7 @@ def run_cycles(
     observer, executor = ChainObserver(), EventsExecutor()
     executor.add_node(observer)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
+        with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             if composed:
                 processes.start('network', users=users, rest_s=REST_S, mobility='random_walk',
                                 speed_mps=scenario.max_user_speed_mps)

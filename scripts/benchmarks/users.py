@@ -17,13 +17,14 @@ import numpy as np
 import rclpy
 from parts.hops import CHAIN, ping_pong
 from system.observer import NetworkObserver
+from system.trial_processes import TrialProcesses
 
 from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
-from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.processes import private_domain
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import use_discovery_profile
 from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.tools.process_network import max_user_processes, start_network
@@ -89,7 +90,7 @@ def run_network(scenario: Scenario, users: int, rounds: int, together: bool) -> 
     cycles = max(rounds * users, MIN_CYCLES)
     observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
+        with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             start_network(processes, users, 0, None, default_codebook_file(), scenario,
                           rest_s=0.0, together=together)
             ended = observer.log.ended

@@ -66,7 +66,8 @@ def advice(points: Sequence[Point], plans: Sequence[str]) -> list[str]:
         for field, values in CURVES.items():
             errors = [point.interval for point in points_of(points, plan, field, 'mse')]
             at = doubling(values, [error.value for error in errors])
-            label, unit = (FIELDS[field].metadata[key] for key in ('label', 'unit'))
+            metadata = FIELDS[field].metadata
+            label, unit = metadata['label'], metadata['declared'].unit
             quantity = label.partition(',')[0]
             limits.append(f'a {quantity} of {at:.3g} {unit}' if np.isfinite(at) else
                           f'no {quantity} up to {values[-1]:.4g} {unit}')

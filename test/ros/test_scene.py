@@ -1,6 +1,7 @@
-"""Markers, compared with their geometry."""
+"""Markers of the scene, and transforms of the surface and of the users."""
 
 import dataclasses
+import importlib.util
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from visualization_msgs.msg import Marker
 from rhs_isac_ros.link import beam_pattern, steer
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import markers
+from rhs_isac_ros.ros import convert, scene, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED
 from rhs_isac_ros.ros.frames import Frame
 
 STAMP = Time(sec=3)
@@ -40,7 +43,7 @@ def an_estimate(covariance_m2, user=1):
 @pytest.mark.parametrize('seed', range(4))
 def test_the_ellipsoid_is_that_of_the_covariance(seed):
     root = np.random.default_rng(seed).normal(size=(3, 3))
-    marker = markers.estimate(an_estimate(root @ root.T), STAMP)
+    marker = scene.estimate(an_estimate(root @ root.T), STAMP)
     assert marker.type == Marker.SPHERE
     assert of(marker.pose.position) == pytest.approx([9.0, -1.0, 0.5])
     turn = rotation(marker.pose.orientation)
@@ -51,7 +54,7 @@ def test_the_ellipsoid_is_that_of_the_covariance(seed):
 
 
 def test_a_position_without_variance_is_visible():
-    marker = markers.estimate(an_estimate(np.zeros((3, 3))), STAMP)
+    marker = scene.estimate(an_estimate(np.zeros((3, 3))), STAMP)
     assert of(marker.scale).min() > 0
 
 
@@ -59,9 +62,9 @@ def test_each_user_has_one_hue_for_truth_and_estimate():
     hues = {}
     for user in (1, 2, 2**32 - 1):
         position = np.array([user % 7, 0.0, 0.0], float)
-        one = markers.truth(m.GroundTruth(
+        one = scene.truth(m.GroundTruth(
             cycle_id=0, user=user, position=position, velocity=np.zeros(3)), STAMP)
-        other = markers.estimate(an_estimate(np.eye(3), user), STAMP)
+        other = scene.estimate(an_estimate(np.eye(3), user), STAMP)
         assert of(one.pose.position) == pytest.approx(position)
         assert (one.ns, one.id) != (other.ns, other.id)
         assert (one.color.r, one.color.g, one.color.b) == (
@@ -73,25 +76,25 @@ def test_each_user_has_one_hue_for_truth_and_estimate():
 
 def test_the_board_shows_its_configuration(small):
     configuration = np.linspace(0, 1, 2 * small.scenario.n_elements).reshape(2, -1)
-    marker = markers.board(small.scenario, configuration, STAMP)
+    marker = scene.board(small.scenario, configuration, STAMP)
     assert np.array([of(point) for point in marker.points]) == pytest.approx(
         element_positions(small.scenario))
     assert [color.r for color in marker.colors] == pytest.approx(configuration.mean(axis=0))
     places = np.unique(element_positions(small.scenario)[:, 1])
     assert 0 < marker.scale.y == marker.scale.z < np.diff(places).min()
-    unknown = markers.board(small.scenario, None, STAMP)
+    unknown = scene.board(small.scenario, None, STAMP)
     assert len({color.r for color in unknown.colors}) == 1
 
 
 def test_a_flat_region_is_visible(small):
     flat = dataclasses.replace(small.scenario, roi_size_m=(4.0, 3.0, 0.0))
-    scale = of(markers.region(flat, STAMP).scale)
+    scale = of(scene.region(flat, STAMP).scale)
     assert scale[:2].tolist() == [4.0, 3.0]
     assert 0 < scale[2] < 0.01
 
 
 def test_the_region_has_the_bounds_of_the_scenario(small):
-    marker = markers.region(small.scenario, STAMP)
+    marker = scene.region(small.scenario, STAMP)
     low, high = small.scenario.roi_bounds_m
     assert of(marker.pose.position) - of(marker.scale) / 2 == pytest.approx(low)
     assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
@@ -102,7 +105,7 @@ def test_the_region_has_the_bounds_of_the_scenario(small):
 def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     scenario, place = Scenario(), np.array([9.0, 3.0, 0.3])
     found = beam_pattern(scenario, steer(scenario, place), 10.0)
-    marker = markers.beam(found, 3, STAMP)
+    marker = scene.beam(found, 3, STAMP)
     corners = np.array([of(point) for point in marker.points]).reshape(-1, 3, 3)
     assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'rhs_link')
     lengths = np.linalg.norm(corners, axis=-1)
@@ -113,12 +116,12 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum('nu,nu->n', normals, corners.mean(axis=1)) >= -1e-9).all()
     assert 0 < marker.color.a < 1
-    assert marker.color.r == markers.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
+    assert marker.color.r == scene.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
 
 
 def test_a_path_contains_its_positions_in_order():
     places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
-    path = markers.path(places, STAMP, Frame())
+    path = scene.path(places, STAMP, Frame())
     assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
     assert np.array([of(pose.pose.position) for pose in path.poses]) == pytest.approx(places)
     assert all(pose.header == path.header and pose.pose.orientation.w == 1
@@ -126,5 +129,52 @@ def test_a_path_contains_its_positions_in_order():
 
 
 def test_a_deletion_names_its_marker():
-    marker = markers.deletion('truth', 4, STAMP)
+    marker = scene.deletion('truth', 4, STAMP)
     assert (marker.ns, marker.id, marker.action) == ('truth', 4, Marker.DELETE)
+
+
+HAS_TF2 = importlib.util.find_spec('tf2_msgs') is not None
+
+
+def test_the_surface_is_at_the_origin_of_the_map():
+    transform = scene.surface_transform(Frame(), Time(sec=3))
+    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'rhs_link')
+    assert transform.header.stamp.sec == 3
+    assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [0.0] * 3
+    assert transform.transform.rotation.w == 1.0
+
+
+def test_a_user_is_at_its_estimate():
+    transform = scene.user_transform(Frame(), 7, np.array([9.0, -1.5, 0.25]), Time(sec=4))
+    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'user_7')
+    assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [9.0, -1.5, 0.25]
+    assert [getattr(transform.transform.rotation, axis) for axis in 'xyzw'] == [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.skipif(HAS_TF2, reason='tf2_msgs is installed')
+def test_without_tf2_msgs_the_visualizer_logs_one_line(bench, probe, capfd):
+    bench.add(VisualizerNode)
+    assert capfd.readouterr().err.count(
+        'no transforms, because tf2_msgs is not installed') == 1
+    assert probe.count_publishers(topics.TF) == probe.count_publishers(topics.TF_STATIC) == 0
+
+
+@pytest.mark.skipif(not HAS_TF2, reason='tf2_msgs is not installed')
+def test_the_visualizer_publishes_transforms(bench, probe):
+    from tf2_msgs.msg import TFMessage
+    bench.add(VisualizerNode)
+    found = {}
+
+    def store(message):
+        found.update({one.child_frame_id: one.transform.translation for one in message.transforms})
+    probe.create_subscription(TFMessage, topics.TF_STATIC, store, LATCHED)
+    probe.create_subscription(TFMessage, topics.TF, store, EXCHANGE)
+    bench.until(lambda: topics.RHS_FRAME in found, 'the surface')
+    bench.until(lambda: probe.count_publishers(topics.TF), 'the publisher')
+    estimates = bench.publisher(probe, m.PositionEstimate)
+    estimate = convert.to_ros(m.PositionEstimate(
+        cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
+        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
+    probe.create_timer(0.05, lambda: estimates.publish(estimate))
+    bench.until(lambda: 'user_2' in found, 'the user')
+    assert found['user_2'].y == 2.5

@@ -10,8 +10,8 @@ import pytest
 from ament_index_python.packages import get_package_prefix
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-from rhs_isac_ros.ros import security
-from rhs_isac_ros.ros.security import SecurityError, prepare
+from rhs_isac_ros.ros import startup
+from rhs_isac_ros.ros.startup import SecurityError, prepare
 from rhs_isac_ros.tools import param, topic
 
 EVERY = ('bs', 'lab/user_1', 'operator', 'lab/operator', 'replay', 'other')
@@ -23,7 +23,7 @@ def keystore(tmp_path, monkeypatch):
     for name in EVERY:
         folder = tmp_path / 'enclaves' / name
         folder.mkdir(parents=True)
-        for file in security._FILES:
+        for file in startup._FILES:
             (folder / file).touch()
         (folder / 'permissions.p7s').write_text('<domains><id>7</id></domains>', encoding='utf-8')
     for name, value in {
