@@ -10,7 +10,6 @@ import numpy as np
 from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
-    RunningQuartiles,
     applied_beam,
     capacity,
     capacity_report,
@@ -34,6 +33,8 @@ from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
 # Fields of a report for which statistics are computed, named as in `CapacityStatistics`.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
+# Reports over which statistics are computed: they follow a changing network in bounded memory.
+_WINDOW = 1000
 # Number of cycles whose reports may still arrive.
 _MAX_REMEMBERED = 8
 # Time without messages of a cycle after which the role computes a report [s]. In a process with
@@ -94,7 +95,8 @@ class Transmission(PlainRole):
         self._counted: NewestDict[int, None] = NewestDict(_MAX_REMEMBERED)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
-        self._quartiles = RunningQuartiles(len(_FIGURES))
+        # Figures of the newest reports, in a ring.
+        self._reported, self._n_reported = np.empty((_WINDOW, len(_FIGURES))), 0
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
         """Process an event and return the beam, or the capacity and its statistics."""
@@ -214,7 +216,11 @@ class Transmission(PlainRole):
         if not math.isfinite(report.loss_percent) or report.cycle_id in self._counted:
             return []
         self._counted.put(report.cycle_id, None)
-        self._quartiles.add(np.array([getattr(report, name) for name in _FIGURES]))
-        figures = dict(zip(_FIGURES, self._quartiles.quartiles(), strict=True))
+        self._reported[self._n_reported % len(self._reported)] = [
+            getattr(report, name) for name in _FIGURES]
+        self._n_reported += 1
+        newest = self._reported[:self._n_reported]
+        quartiles = np.quantile(newest, (0.25, 0.5, 0.75), axis=0).T
         return [Send(m.CapacityStatistics(
-            cycle_id=report.cycle_id, n_reports=len(self._quartiles), **figures))]
+            cycle_id=report.cycle_id, n_reports=len(newest),
+            **dict(zip(_FIGURES, quartiles, strict=True))))]
