@@ -26,10 +26,9 @@ from scipy.optimize import minimize
 
 from rhs_isac_ros.bounds import AverageCrlb, crlb
 from rhs_isac_ros.codebook import METHODS, random_codebook
-from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, monte_carlo, sobol
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
-from rhs_isac_ros.codebook.sampling import monte_carlo, sobol
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams

@@ -20,7 +20,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
-from rhs_isac_ros.codebook.sampling import sobol
+from rhs_isac_ros.codebook.objective import sobol
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
