@@ -21,7 +21,7 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, CodebookError, directional_codebook, random_codebook
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.experiments.resampling import replicate
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support import streams
@@ -77,8 +77,9 @@ def main() -> None:
               '{median_m2:.3f} | {average_crlb_m2:.4f} |'.format(name, **figures[name]))
     print()
     for rival in ('crlb', 'directional', 'random'):
-        percent, low, high = reduction(
-            errors['ambiguity'], errors[rival], lambda values: values.mean(axis=-1))
+        ambiguity, other = (
+            replicate(errors[name][None], 0)[0] for name in ('ambiguity', rival))
+        percent, low, high = ambiguity.reduction_from(other)
         figures[f'reduction_{rival}_percent'] = percent
         print(f'ambiguity is {percent:.1f} % below {rival} '
               f'(95 % interval {low:.1f} to {high:.1f})')

@@ -43,12 +43,12 @@ from parts.warning_windows import warnings
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
-from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.positioning import Estimate, Estimator, make_estimator
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import positive_int
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
 # Squared Mahalanobis radius of the 95 % region.

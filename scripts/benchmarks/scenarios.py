@@ -31,10 +31,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, optimize
-from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.support.arguments import positive_int
 
 FOLDER = Path(__file__).parents[2] / 'config' / 'scenarios'
 # Scenarios whose codebook is directional, and those with fewer positions.
