@@ -96,19 +96,7 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Progress of an optimisation after a step.
-
-    Attributes
-    ----------
-    step
-        Update steps so far.
-    evaluations
-        Evaluations of the objective so far, with or without its gradient.
-    value_m2
-        Lowest objective so far [m^2].
-    elapsed_s
-        Time since the start [s].
-    """
+    """Steps and evaluations so far, the lowest objective, and the time since the start."""
 
     step: int
     evaluations: int
