@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, optimize
@@ -82,23 +83,18 @@ def run(options: argparse.Namespace) -> None:
             command, check=True, stdout=subprocess.PIPE, text=True).stdout)
         report(name, row)
         results |= {f'{name}.{key}': value for key, value in row.items()}
-        if options.json:
-            options.json.write_text(json.dumps(results, indent=1) + '\n', encoding='utf-8')
+        write_results(options.json, results)
 
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        prog='scripts/benchmark scenarios', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('scenarios', __doc__)
     add = parser.add_argument
     add('--positions', type=positive_int, default=1000, help='number of positions of each row')
-    add('--seed', type=int, default=1, help='seed of all random numbers')
     add('--only', nargs='*', metavar='NAME', help='only these scenarios')
     add('--inside', action='store_true',
         help='estimate without reject_outside, as if no user were outside of the region')
     add('--codebooks', type=Path, help='folder in which codebooks are kept between runs')
-    add('--json', type=Path, help='JSON file for the results')
     add('--one', help=argparse.SUPPRESS)
     return parser.parse_args()
 
