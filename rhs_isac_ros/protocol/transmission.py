@@ -10,7 +10,6 @@ import numpy as np
 from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
-    RunningQuartiles,
     applied_beam,
     capacity,
     capacity_report,
@@ -26,6 +25,8 @@ from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
 # Fields of a report for which statistics are computed, named as in `CapacityStatistics`.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
+# Reports over which statistics are computed: they follow a changing network in bounded memory.
+_WINDOW = 1000
 # Time without messages of a cycle after which the role computes a report [s]. In a process with
 # other roles, the rest of the cycle then comes first.
 _IDLE_S = 5e-3
@@ -84,7 +85,8 @@ class Transmission(Role):
         self._counted: NewestDict[int, None] = NewestDict(REMEMBERED_CYCLES)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
-        self._quartiles = RunningQuartiles(len(_FIGURES))
+        # Figures of the newest reports, in a ring.
+        self._reported, self._n_reported = np.empty((_WINDOW, len(_FIGURES))), 0
 
     def react(self, event: Event) -> None:
         """Process an event: send the beam, or the capacity and its statistics."""
@@ -192,9 +194,13 @@ class Transmission(Role):
 
     def _summarize(self, report: m.Capacity) -> None:
         """Add a report to the statistics, once for each cycle, and publish them."""
-        if math.isfinite(report.loss_percent) and report.cycle_id not in self._counted:
-            self._counted.put(report.cycle_id, None)
-            self._quartiles.add(np.array([getattr(report, name) for name in _FIGURES]))
-            figures = dict(zip(_FIGURES, self._quartiles.quartiles(), strict=True))
-            self.send(m.derive(
-                m.CapacityStatistics, report, n_reports=len(self._quartiles), **figures))
+        if not math.isfinite(report.loss_percent) or report.cycle_id in self._counted:
+            return
+        self._counted.put(report.cycle_id, None)
+        self._reported[self._n_reported % len(self._reported)] = [
+            getattr(report, name) for name in _FIGURES]
+        self._n_reported += 1
+        newest = self._reported[:self._n_reported]
+        quartiles = np.quantile(newest, (0.25, 0.5, 0.75), axis=0).T
+        self.send(m.derive(m.CapacityStatistics, report, n_reports=len(newest),
+                           **dict(zip(_FIGURES, quartiles, strict=True))))

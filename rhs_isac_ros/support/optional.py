@@ -10,21 +10,10 @@ class MissingLibraryError(ImportError):
 
 @contextlib.contextmanager
 def optional_import(purpose: str, extra: str = '', script: str = '') -> Iterator[None]:
-    """Replace an ImportError inside the block by one that names the library and the extra.
+    """Replace an ImportError inside the block by a MissingLibraryError with instructions.
 
-    Parameters
-    ----------
-    purpose
-        Task that needs the library; the first words of the message.
-    extra
-        Extra of this package that installs the library, if there is one.
-    script
-        Script that installs the library in a clone, if `extra` is not installed there.
-
-    Raises
-    ------
-    MissingLibraryError
-        If an import inside the block fails.
+    `purpose`, the task that needs the library, is the beginning of the message. `extra` is the
+    extra of this package that installs the library, and `script` installs it in a clone.
     """
     try:
         yield
