@@ -32,7 +32,7 @@ setup(
     ],
     python_requires='>=3.10',
     # The library requires nothing else. The nodes also require ROS 2, which pip cannot install:
-    # rosdep reads package.xml, and scripts/setup reads requirements.txt.
+    # rosdep reads package.xml, and scripts/setup reads requirements*.txt.
     install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6', 'threadpoolctl>=3.1'],
     # Tests and the documentation read this table as a literal.
     extras_require={

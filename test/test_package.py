@@ -14,7 +14,8 @@ TREE = ElementTree.parse(ROOT / 'package.xml').getroot()
 # threadpoolctl has no key: the system's scikit-learn depends on it.
 KEYS = {
     'docutils': 'python3-sphinx', 'hypothesis': 'python3-hypothesis', 'joblib': 'python3-joblib',
-    'matplotlib': 'python3-matplotlib', 'numpy': 'python3-numpy', 'psutil': 'python3-psutil',
+    'matplotlib': 'python3-matplotlib', 'numpy': 'python3-numpy',
+    'packaging': 'python3-packaging', 'psutil': 'python3-psutil',
     'pytest': 'python3-pytest', 'rich': 'python3-rich', 'scipy': 'python3-scipy',
     'sklearn': 'python3-sklearn', 'sphinx': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn',
     'tqdm': 'python3-tqdm', 'yaml': 'python3-yaml',
