@@ -12,7 +12,7 @@ TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='1.0.0',
     description='Multi-band integrated sensing and communication with a holographic surface',
     author='rhs_isac_ros authors',
     author_email='maintainers@rhs-isac-ros.org',
