@@ -60,7 +60,7 @@ def main() -> None:
     restrict_to(options.threads)
     if not HAVE_JAX:
         print('JAX is not installed, so its figures are omitted; to install it: '
-              'python3 -m pip install --no-deps -r requirements-peers.txt\n', file=sys.stderr)
+              'scripts/setup peers\n', file=sys.stderr)
     figures: dict = {'threads': options.threads}
     for part, measure in (
             ('a', gradient), ('b', lambda: target(options.limit)), ('c', growth),
