@@ -117,7 +117,7 @@ def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
     A template is a whitened mean times range and carrier, which depends on the direction and, via
     the curvature of the wavefront and the delays of the sub-bands, slowly on the range. For T
     template ranges, R ranges and V directions, the arrays are ``outer_filters``, the conjugate
-    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy``, theirs [m^2], float32 [T, V];
+    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy`` of these [m^2], float32 [T, V];
     ``outer_index``, the template of each range, int64 [R]; and ``outer_weights``, the prior
     probability of ranges and directions, 0 inside the region, float64 [R, V].
     """

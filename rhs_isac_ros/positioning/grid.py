@@ -314,8 +314,12 @@ class TemplateTable:
                     part = np.s_[:, first:last]
                     likelihood[part], gain[part] = query.over_gain(likelihood[part] / 2, of_phase)
         likelihood -= energy
-        step, column = np.nonzero(np.ones_like(likelihood, bool) if prior.is_coarse
-                                  else _are_maxima(likelihood))
+        is_peak = np.full(likelihood.shape, prior.is_coarse)
+        if not prior.is_coarse:
+            # Local maxima along the range, but not at its ends.
+            np.greater_equal(likelihood[1:-1], likelihood[:-2], out=is_peak[1:-1])
+            is_peak[1:-1] &= likelihood[1:-1] > likelihood[2:]
+        step, column = np.nonzero(is_peak)
         value, range_m = likelihood[step, column], self._window_ranges_m[window[column]]
         if not prior.is_coarse:
             # The vertex of a parabola through a maximum and the steps beside it.
@@ -444,14 +448,6 @@ def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) 
     # No point after one is heavier.
     n_left = np.repeat(firsts + counts, counts) - np.arange(len(phases))
     return relative + np.log(n_left) > np.repeat(np.log(total), counts) - margin
-
-
-def _are_maxima(values: np.ndarray) -> np.ndarray:
-    """Return which values [D, W] are local maxima along the first axis, but not at its ends."""
-    result = np.zeros(values.shape, bool)
-    np.greater_equal(values[1:-1], values[:-2], out=result[1:-1])
-    result[1:-1] &= values[1:-1] > values[2:]
-    return result
 
 
 def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,

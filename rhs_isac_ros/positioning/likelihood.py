@@ -229,12 +229,6 @@ class NuisancePrior:
         values += np.outer(gain, self.gain) / max(self.gain_std, _MIN_GAIN_STD)**2
         return values
 
-    def with_phases(self, values: np.ndarray, outputs: np.ndarray) -> np.ndarray:
-        """Turn every band by the angle of its filter's output [M, N_B], if phases are uniform."""
-        change = np.zeros_like(values)
-        change[:, -outputs.shape[1]:] = np.angle(outputs) / _UNIFORM_EQUIVALENT
-        return values + change
-
 
 class Likelihood:
     """The likelihood with one covariance everywhere: the average over region and surfaces."""
@@ -282,7 +276,9 @@ class Likelihood:
         # Steps of the range turn the phases many times.
         if not self.nuisance.is_coarse:
             return values
-        return self.nuisance.with_phases(values, self.outputs(points, values, signals))
+        outputs, change = self.outputs(points, values, signals), np.zeros_like(values)
+        change[:, -outputs.shape[1]:] = np.angle(outputs) / _UNIFORM_EQUIVALENT
+        return values + change
 
     def outputs(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Compute the outputs of the bands' matched filters, complex128 [M, N_B]."""

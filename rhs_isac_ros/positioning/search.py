@@ -24,8 +24,6 @@ from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, 
 # accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 10.0
 EXACT_MARGIN = 8.0
-# Squared Mahalanobis distance below which two modes have converged to the same maximum.
-_SAME_MODE = 2.0
 # A mode has converged when its last step gained less log-likelihood than this.
 _MIN_GAIN = 0.05
 # Maximum number of exact steps. Few modes need more than two, unless signals are strong.
