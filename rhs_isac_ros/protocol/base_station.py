@@ -171,14 +171,11 @@ class BaseStation(StateMachine):
 
     # Guards
 
-    def _ready(self, event: Event) -> bool:
-        """Whether nothing is missing, once the event is taken into account."""
+    def _not_ready(self, event: Event) -> bool:
+        """Whether a role or the codebook is missing, once the event is taken into account."""
         missing = event.missing if isinstance(event, events.PeersChanged) else self._missing
         has_codebook = self._offered or isinstance(event, events.CodebookOffered)
-        return missing == () and bool(has_codebook)
-
-    def _not_ready(self, event: Event) -> bool:
-        return not self._ready(event)
+        return missing != () or not has_codebook
 
     def _pausing(self, event: Event) -> bool:
         return self._pause_requested
@@ -472,12 +469,12 @@ class BaseStation(StateMachine):
     TABLE = (
         *on(events.CodebookOffered, 'codebook')(
             # A new codebook takes effect with the next cycle, as do new settings.
-            Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING, guard=_ready),
-            Row((State.WAITING,), (_store_codebook, _log_not_ready)),
+            Row((State.WAITING,), (_store_codebook, _log_not_ready), guard=_not_ready),
+            Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING),
             Row(ANY, (_store_codebook,))),
         *on(events.PeersChanged, 'peers')(
-            Row((State.WAITING,), (_store_peers, _begin_cycle), State.BEACONING, guard=_ready),
-            Row((State.WAITING,), (_store_peers, _log_not_ready)),
+            Row((State.WAITING,), (_store_peers, _log_not_ready), guard=_not_ready),
+            Row((State.WAITING,), (_store_peers, _begin_cycle), State.BEACONING),
             Row(ANY, (_store_peers,))),
         *on(events.SettingsOffered, 'settings')(
             Row((State.WAITING, State.PAUSED), (_store_settings, _apply_settings)),
