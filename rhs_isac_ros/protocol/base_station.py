@@ -140,10 +140,11 @@ class BaseStation(StateMachine):
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
         self._cycle = Cycle(first_cycle_id - 1)
-        # What was logged: outages by reason and user, 0 for the whole network, since the last
-        # service; what is missing, since the last beacon; that service began, since then.
+        # Outages that were logged and last, by reason and user; user 0 for the whole network.
         self._outages: NewestDict[tuple[str, int], None] = NewestDict(MAX_USERS)
+        # What the last warning listed as missing; empty once a cycle has begun.
         self._logged_lacking: tuple[str, ...] = ()
+        # Whether a cycle was served since something was missing.
         self._serving = False
 
     def _use(self, settings: BaseStationSettings) -> None:
@@ -152,7 +153,7 @@ class BaseStation(StateMachine):
         self._acks.clear()
 
     def timeout_s(self, state: enum.Enum) -> float | None:
-        """Return the timeout of a state [s]; its attempts divide that of a step equally.
+        """Return the timeout of a state [s]; the attempts of a step share its timeout equally.
 
         There is no rest before a pause.
         """
@@ -170,14 +171,11 @@ class BaseStation(StateMachine):
 
     # Guards
 
-    def _ready(self, event: Event) -> bool:
-        """Whether no role and no codebook is missing, in view of the event."""
+    def _not_ready(self, event: Event) -> bool:
+        """Whether a role or the codebook is missing, once the event is taken into account."""
         missing = event.missing if isinstance(event, events.PeersChanged) else self._missing
         has_codebook = self._offered or isinstance(event, events.CodebookOffered)
-        return missing == () and bool(has_codebook)
-
-    def _not_ready(self, event: Event) -> bool:
-        return not self._ready(event)
+        return missing != () or not has_codebook
 
     def _pausing(self, event: Event) -> bool:
         return self._pause_requested
@@ -271,7 +269,7 @@ class BaseStation(StateMachine):
                 self.log(f'user {user} removed: not in allowed_users {settings.allowed_users!r}')
 
     def _log_not_ready(self, event: Event) -> None:
-        """Log what is missing, once the presence of the other roles is known, if it is new."""
+        """Log what is missing, unless it was logged or the other roles are not known yet."""
         lacking = self._lacking()
         if self._missing is not None:
             self._serving = False
@@ -436,7 +434,7 @@ class BaseStation(StateMachine):
         self._apply_settings(event)
 
     def _finish(self, event: m.Data) -> None:
-        """End the cycle: the user was served. Log that service begins, and which outages end."""
+        """End the cycle with service; log that service begins, or which outages have ended."""
         cycle, n_users = self._cycle, len(self._users)
         self._report(m.Phase.BEACONING, 'served')
         if not self._serving:
@@ -471,12 +469,12 @@ class BaseStation(StateMachine):
     TABLE = (
         *on(events.CodebookOffered, 'codebook')(
             # A new codebook takes effect with the next cycle, as do new settings.
-            Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING, guard=_ready),
-            Row((State.WAITING,), (_store_codebook, _log_not_ready)),
+            Row((State.WAITING,), (_store_codebook, _log_not_ready), guard=_not_ready),
+            Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING),
             Row(ANY, (_store_codebook,))),
         *on(events.PeersChanged, 'peers')(
-            Row((State.WAITING,), (_store_peers, _begin_cycle), State.BEACONING, guard=_ready),
-            Row((State.WAITING,), (_store_peers, _log_not_ready)),
+            Row((State.WAITING,), (_store_peers, _log_not_ready), guard=_not_ready),
+            Row((State.WAITING,), (_store_peers, _begin_cycle), State.BEACONING),
             Row(ANY, (_store_peers,))),
         *on(events.SettingsOffered, 'settings')(
             Row((State.WAITING, State.PAUSED), (_store_settings, _apply_settings)),

@@ -175,7 +175,7 @@ class Channel(Role):
         return self._settings.describe()
 
     def react(self, event: Event) -> None:
-        """Process a message and send feed signals and delivered data that arrive."""
+        """Process a message, then send the signals and data whose delay has passed."""
         match event:
             case SettingsOffered(settings):
                 self._settings.latest = settings

@@ -183,13 +183,7 @@ class Message:
         return 1e-9 * self.stamp_ns if self.stamp_ns else now_s
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return sizes that depend on the content, by symbol.
-
-        Parameters
-        ----------
-        sizes
-            Sizes by symbol, as in `Scenario.sizes`.
-        """
+        """Return sizes that depend on the content, by symbol as in `Scenario.sizes`."""
         return {}
 
 
@@ -211,9 +205,9 @@ MessageT = TypeVar('MessageT', bound=Message)
 
 
 def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
-    """Return a message with other fields, and the cycle, user, band and codebook of a source.
+    """Return a message with the fields given, and the cycle, user, band and codebook of a source.
 
-    The source is a message, or another object with attributes of the same names.
+    The source is a message, or another object with attributes of these names.
     """
     shared = {name: getattr(source, name) for name in _SHARED
               if name in kind.__dataclass_fields__ and hasattr(source, name)}

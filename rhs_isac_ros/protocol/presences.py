@@ -61,8 +61,8 @@ class Presences:
         self.own = own
         # Nodes in conflict with this one, by instance.
         self._others: NewestDict[int, Presence] = NewestDict(_MAX_OTHERS)
-        # The newest other node of the role, and the older one that was logged last: one that was
-        # suspended may return.
+        # The newest other node of the role, and the older one that was logged last, which is not
+        # logged again if it returns after a suspension.
         self._rival: Presence | None = None
         self._logged_older = 0
         # By id: the differences of other scenarios.

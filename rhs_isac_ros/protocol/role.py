@@ -14,7 +14,7 @@ from rhs_isac_ros.protocol.messages import Message
 class Role:
     """A role of the protocol. It maps events to actions and does not read a clock.
 
-    A subclass handles an event in `react`, which appends actions by `send`, `log` and `act`.
+    A subclass defines `react`, which appends actions with `send`, `log` and `act`.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class Transition(Generic[RoleT, EventT]):
     # Condition on role and event, without side effects.
     guard: Callable[[RoleT, EventT], bool] = always
     outcome: Outcome | None = None  # what to count, if anything
-    restart_timeout: bool = False  # whether that of the current state starts again
+    restart_timeout: bool = False  # whether to restart the timeout of the current state
     # The class of its event, and the name of the event in the counters; set by `on`.
     event: type = object
     event_name: str = ''
@@ -264,7 +264,7 @@ class StateMachine(Role):
         if row.target or row.restart_timeout:
             self.repeats = 0 if row.target else self.repeats + 1
             self.state = state = row.target or self.state
-            # Asked for after the actions, which may have changed it.
+            # Read after the actions, which may have changed it.
             timeout_s = self.timeout_s(state)
             self._deadline_s = None if timeout_s is None else self.now_s + timeout_s
 

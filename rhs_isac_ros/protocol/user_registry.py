@@ -1,4 +1,4 @@
-"""The users that a base station knows: their turns, the nodes that have their numbers, limits."""
+"""The users that a base station knows: their turns, and the nodes that own their numbers."""
 
 import bisect
 import dataclasses
@@ -83,8 +83,8 @@ class UserRegistry:
         """Choose the users to wait for, and return their first and last number.
 
         The range contains the user whose turn it is. The ranges of all turns cover every number,
-        so that new users are invited within a round. Each of the beacons of the cycle that nobody
-        answered, `attempt` of them, extends the range.
+        so that new users are invited within a round. `attempt` is the number of beacons of the
+        cycle that nobody answered; each extends the range.
         """
         self.answered = {}
         numbers, size = self._numbers, INVITED * _EXTENSION**min(attempt, 8)

@@ -53,6 +53,15 @@ def test_messages_are_the_same_if_all_fields_are_equal(example):
     assert not m.same(m.Ack(cycle_id=1, user=2), m.Grant(cycle_id=1, user=2))
 
 
+def test_a_message_takes_the_fields_of_its_cycle_from_another():
+    request = m.PilotRequest(cycle_id=3, user=2, user_instance=5, band=1, last_band=1, n_frames=2,
+                             sender=9, scenario_id='sc', stamp_ns=7)
+    pilot = m.derive(m.Pilot, request, symbols=np.ones(2, complex))
+    assert (pilot.cycle_id, pilot.user, pilot.band) == (3, 2, 1)
+    assert (pilot.sender, pilot.scenario_id, pilot.stamp_ns) == (0, '', 0)
+    assert m.derive(m.Pilot, request, band=0, symbols=pilot.symbols).band == 0
+
+
 def test_events_without_arrays_compare_by_value():
     assert Timeout() == Timeout()
     assert PeersChanged(('a',)) == PeersChanged(('a',)) != PeersChanged(('b',))
