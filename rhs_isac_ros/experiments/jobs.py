@@ -159,11 +159,10 @@ def _return_as(version: str) -> str:
 
 @contextlib.contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore SIGINT inside the block, so that processes started there ignore it, too.
+    """Ignore SIGINT inside the block, so that processes started there inherit this.
 
     A terminal sends SIGINT to the whole process group, but only this process may end the
-    workers. Ignored signals are inherited. A blocked signal would be delivered after the block
-    instead of being lost, but joblib unblocks it.
+    workers. Blocking it would not lose a signal in the meantime, but joblib unblocks it.
     """
     # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
     if threading.current_thread() is not threading.main_thread():
@@ -182,7 +181,7 @@ def run_jobs(
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
     Each result is stored as soon as it is available. After an interruption or an error, the same
-    call resumes the experiment. A terminal shows a progress bar.
+    call resumes the experiment. A terminal shows a progress bar with a label.
 
     Parameters
     ----------
@@ -194,13 +193,9 @@ def run_jobs(
         Number of parallel jobs on this machine; -1 for one per core.
     dask
         Address of the scheduler of a Dask cluster to use instead.
-    label
-        Label of the progress bar.
 
     Raises
     ------
-    ValueError
-        If two jobs have the same name.
     JobError
         If a job fails, or its worker has another version of this package.
     ConnectionError
@@ -235,7 +230,7 @@ def run_jobs(
 
 
 def _decoded(job_result: JobResult) -> dict[str, Any]:
-    """Decode the result of a job, or raise JobError if it failed or ran in another version."""
+    """Return the result of a job, or raise JobError if it failed or ran in another version."""
     name = job_result.job.name
     if job_result.error:
         raise JobError(f'job {name} failed: {job_result.error.strip()}')

@@ -23,8 +23,6 @@ class Replicates(NamedTuple):
         [1 + replicates]; NaN where a replicate has no result.
     by_member
         The same with all cases once: replicates that resample the members only.
-    n_members
-        Number of members.
     """
 
     values: np.ndarray
@@ -70,11 +68,6 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
         Seed of the resampled members; different for results with other members.
     quantiles
         Quantiles to compute instead of the mean, from 0 to 1.
-
-    Raises
-    ------
-    ValueError
-        If `results` has another shape or no finite value, or a quantile is out of range.
     """
     if results.ndim != 2 or not np.isfinite(results).any():
         raise ValueError(f'results: shape {results.shape}, expected [members, cases] with a '

@@ -148,17 +148,14 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
 
 @functools.lru_cache(maxsize=1)
 def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
-    """Return an estimator for a scenario and a codebook as JSON, the same for successive jobs."""
+    """Return an estimator for JSON of scenario and codebook, the same for successive jobs."""
     _initialise_sobol()
     return make_estimator(name, Scenario(**json.loads(scenario)),
                           Codebook.from_parameters(json.loads(codebook)))
 
 
 def _initialise_sobol() -> None:
-    """Create a Sobol sequence, of which only one thread of a cluster's worker may be the first.
-
-    SciPy reads its table of direction numbers for the first sequence of a process, without a lock.
-    """
+    """Create a Sobol sequence: for the first of a process, SciPy reads a table without a lock."""
     with _FIRST_SOBOL:
         qmc.Sobol(1)
 
@@ -169,15 +166,7 @@ _STRUCTURE = ('center_frequencies_hz', 'n_subbands', 'n_frames', 'elements_per_s
 
 
 class Results(NamedTuple):
-    """Quantities of a setting at all positions.
-
-    Attributes
-    ----------
-    setting, codebooks
-        The setting and its codebooks.
-    quantities
-        The quantities by name, float64 [codebooks, positions].
-    """
+    """Quantities of a setting at all positions, by name, float64 [codebooks, positions]."""
 
     setting: Setting
     codebooks: tuple[Codebook, ...]
@@ -309,12 +298,7 @@ def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = 
                ) -> list[Results]:
     """Run the jobs of a sweep that have no stored result, and return the results in order.
 
-    Parameters
-    ----------
-    folder
-        Folder of the stored results, which several sweeps may share.
-    n_jobs, dask
-        See `run_jobs`; errors are the same.
+    Several sweeps may share a folder. `run_jobs` describes the other arguments and the errors.
     """
     designs = [job for setting in sweep.settings for job in sweep.designs(setting)]
     made = _results(design, designs, folder, n_jobs, dask, 'codebooks')

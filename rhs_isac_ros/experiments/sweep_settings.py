@@ -25,12 +25,8 @@ class Measure(NamedTuple):
 
     Attributes
     ----------
-    quantity
-        Name of the quantity, of which a position has one value.
     label
         Label of an axis without the unit.
-    unit
-        Unit of the measure.
     quantile
         The quantile, from 0 to 1; None for the mean.
     root
@@ -138,14 +134,9 @@ NAMES = (*FIELDS, CODEBOOK, ESTIMATOR)
 
 
 class Axis(NamedTuple):
-    """Values of a field, or of several fields that vary together.
+    """Values of a field, or of several fields that vary together: a tuple for each step.
 
-    Attributes
-    ----------
-    fields
-        Names of the fields; pictures show the first one.
-    values
-        Values of these fields, a tuple for each step.
+    Pictures show the first field.
     """
 
     fields: tuple[str, ...]
@@ -177,18 +168,9 @@ class Axis(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """One combination of values.
+    """One combination of values, `varied` by name, and the scenario with these values.
 
-    Attributes
-    ----------
-    varied
-        Values of the varied fields by name.
-    scenario
-        Scenario with these values.
-    codebook
-        Kind or file of the codebook.
-    estimator
-        Name of the estimator.
+    `codebook` is a kind or a file.
     """
 
     varied: Mapping[str, Any]

@@ -29,9 +29,8 @@ _N_DIRECT = 64
 _N_STEPS = 4
 _N_STRONGEST = 4
 _N_KEPT = 12
-# Number of configurations for the multipath alone, of their random starts and of steps.
+# Number of configurations for the multipath alone, and of steps from as many random starts.
 _N_SCATTERED = 8
-_N_SCATTERED_STARTS = 256
 _N_SCATTERED_STEPS = 8
 # Configurations of nearly equal capacity count as one.
 _MIN_DIFFERENCE = 1e-6
@@ -171,7 +170,7 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
 def _scattered_configurations(
         paths: np.ndarray, fixed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Search for configurations without a line of sight, from random waves in the air."""
-    shape = (len(paths), _N_SCATTERED_STARTS, *paths.shape[2:])
+    shape = (len(paths), _N_STARTS, *paths.shape[2:])
     on_board = _complex_normal((*shape[:-1], 1), rng)
     in_air = _complex_normal((*shape[:-2], 1, shape[-1]), rng)
     waves = _Waves.at(paths, _enabled(on_board * in_air, paths, fixed), on_board)
@@ -209,12 +208,10 @@ def _matched(tables: Tables, direct: np.ndarray) -> np.ndarray:
 
 
 class _Waves(NamedTuple):
-    """Configurations with a pair of waves for each.
+    """Configurations, float32 [N_B, n, N_E], with their capacities and a pair of waves for each.
 
     Attributes
     ----------
-    analog
-        Float32 [N_B, n, N_E].
     rate
         Capacities [nat/symbol], float32 [N_B, n].
     on_board

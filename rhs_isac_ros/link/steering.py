@@ -64,12 +64,10 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Point(NamedTuple):
-    """Configurations, and the local behaviour of the capacity with their best digital parts.
+    """Configurations, float64 [N_B, n, N_E], and the capacity with their best digital parts.
 
     Attributes
     ----------
-    analog
-        Float64 [N_B, n, N_E].
     rate
         Capacities [nat/symbol], float64 [N_B, n].
     vertex

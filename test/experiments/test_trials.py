@@ -203,30 +203,24 @@ def test_jobs_run_on_a_dask_cluster(tmp_path, cluster):
 
 @pytest.fixture
 def two_workers(tmp_path):
-    """Address of a scheduler with two workers, three processes that belong together only by it."""
+    """Address of a scheduler with two workers, processes that it does not restart."""
     distributed = pytest.importorskip('distributed')
-    file, processes = tmp_path / 'scheduler.json', []
-
-    def start(module, *arguments):
-        processes.append(subprocess.Popen(
-            [sys.executable, '-m', f'distributed.cli.{module}', '--scheduler-file', str(file),
-             '--no-dashboard', *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            env=os.environ | {'OPENBLAS_NUM_THREADS': '1'}))
-
-    start('dask_scheduler', '--host', '127.0.0.1', '--port', '0')
-    for _ in range(2):
-        start('dask_worker', '--no-nanny', '--nthreads', '1', '--local-directory', str(tmp_path))
-    try:
-        with distributed.Client(scheduler_file=str(file), timeout=30, set_as_default=False) as (
-                client):
-            client.wait_for_workers(2, timeout=30)
-            address = client.scheduler.address
-        yield address
-    finally:
-        for process in processes:
-            process.kill()
-        for process in processes:
-            process.wait()
+    with distributed.LocalCluster(
+            n_workers=0, protocol='tcp', host='127.0.0.1', dashboard_address=':0') as empty:
+        workers = [subprocess.Popen(
+            [sys.executable, '-m', 'distributed.cli.dask_worker', empty.scheduler_address,
+             '--no-nanny', '--nthreads', '1', '--no-dashboard', '--local-directory',
+             str(tmp_path)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            env=os.environ | {'OPENBLAS_NUM_THREADS': '1'}) for _ in range(2)]
+        try:
+            with distributed.Client(empty, set_as_default=False) as client:
+                client.wait_for_workers(2, timeout=30)
+            yield empty.scheduler_address
+        finally:
+            for worker in workers:
+                worker.kill()
+            for worker in workers:
+                worker.wait()
 
 
 def test_a_cluster_that_loses_a_worker_gives_every_result(tmp_path, two_workers):
