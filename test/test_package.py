@@ -1,12 +1,15 @@
-"""package.xml lists every imported package, so that rosdep can install them."""
+"""package.xml lists every imported package, and all files state one version."""
 
 import ast
 import functools
+import re
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+
+import rhs_isac_ros
 
 ROOT = Path(__file__).parents[1]
 TREE = ElementTree.parse(ROOT / 'package.xml').getroot()
@@ -90,3 +93,13 @@ def test_libraries_have_keys_that_rosdep_knows():
     libraries = {key for key in keys(*RUN, 'test_depend', 'doc_depend')
                  if key.startswith('python3-')}
     assert libraries <= set(KEYS.values())
+
+
+@pytest.mark.parametrize(('path', 'pattern'), [
+    ('package.xml', '<version>(.*)</version>'),
+    ('msg_defs/package.xml', '<version>(.*)</version>'), ('setup.py', "version='(.*)'"),
+    ('CITATION.cff', '^version: (.*)$'),
+    ('CHANGELOG.rst', r'^(\d[^ ]*) \(.*\)$'), ('msg_defs/CHANGELOG.rst', r'^(\d[^ ]*) \(.*\)$')])
+def test_all_files_state_one_version(path, pattern):
+    text = (ROOT / path).read_text(encoding='utf-8')
+    assert re.findall(pattern, text, re.MULTILINE)[0] == rhs_isac_ros.__version__
