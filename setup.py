@@ -1,5 +1,7 @@
 """The ament_python package rhs_isac_ros; without ROS, pip installs the library alone."""
 
+import os
+import sys
 from glob import glob
 from pathlib import Path
 
@@ -9,6 +11,13 @@ NAME = 'rhs_isac_ros'
 NODES = sorted(path.stem for path in Path(__file__).parent.glob(f'{NAME}/nodes/[a-z]*.py'))
 # The demonstration, and the terminal tools that have no counterpart in `ros2`.
 TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
+
+# colcon does not search for packages inside a package, and installs this one without its messages.
+if 'COLCON' in os.environ and not any(
+        (Path(prefix) / 'share' / 'rhs_isac_msgs').is_dir()
+        for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)):
+    print(f'{NAME}: the package rhs_isac_msgs is missing: in the src folder of the workspace, run '
+          '`ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`, then repeat colcon build', file=sys.stderr)
 
 setup(
     name=NAME,

@@ -2,7 +2,9 @@
 
 import ast
 import functools
+import os
 import re
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -103,3 +105,15 @@ def test_libraries_have_keys_that_rosdep_knows():
 def test_all_files_state_one_version(path, pattern):
     text = (ROOT / path).read_text(encoding='utf-8')
     assert re.findall(pattern, text, re.MULTILINE)[0] == rhs_isac_ros.__version__
+
+
+@pytest.mark.parametrize(('variables', 'is_reported'), [
+    ({'COLCON': '1', 'AMENT_PREFIX_PATH': ''}, True),
+    ({'COLCON': '1', 'AMENT_PREFIX_PATH': '{}'}, False), ({}, False)])
+def test_a_build_without_the_messages_prints_the_missing_link(variables, is_reported, tmp_path):
+    (tmp_path / 'share' / 'rhs_isac_msgs').mkdir(parents=True)
+    environment = {name: value for name, value in os.environ.items() if name != 'COLCON'} | {
+        name: value.format(tmp_path) for name, value in variables.items()}
+    done = subprocess.run([sys.executable, 'setup.py', '--version'], cwd=ROOT, env=environment,
+                          capture_output=True, text=True, check=True)
+    assert ('ln -s rhs_isac_ros/msg_defs rhs_isac_msgs' in done.stderr) == is_reported
