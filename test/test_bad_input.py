@@ -78,6 +78,8 @@ CALLS = [
     ('tools.param', ['get', 'bs'], 'required: parameter_name'),
     ('tools.param', ['list', '--filter', '('], 'expected a regular expression'),
     ('tools.permissions', ['--users', '-1'], 'expected 0 to 1000'),
+    ('tools.permissions', ['--robot', '2'], "'2', expected USER=TOPIC or USER=tf"),
+    ('tools.permissions', ['--robot', '3=odom'], 'user 3, expected one of 2 users'),
     ('codebook.__main__', ['--output', '.'], '.: a directory, expected a file'),
     ('codebook.__main__', ['--plot', 'p.xyz'], 'ends in .png, .pdf, .svg'),
     ('codebook.__main__', ['--output', 'a.pdf', '--plot', 'a.pdf'], 'another file than --output'),

@@ -156,8 +156,7 @@ def test_publishers_are_those_of_the_documentation():
         assert allowed_to == expected
 
 
-@pytest.mark.parametrize('arguments', [
-    ['--namespace', 'lab'], ['--users', '-1'], ['--robot', '2'], ['--robot', '3=odom']])
+@pytest.mark.parametrize('arguments', [['--namespace', 'lab'], ['--users', '-1']])
 def test_invalid_arguments_are_rejected(arguments, capsys):
     with pytest.raises(SystemExit):
         permissions.main(arguments)
