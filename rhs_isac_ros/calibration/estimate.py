@@ -59,7 +59,7 @@ class Pilots:
 
 
 def prior_of(scenario: Scenario) -> SurfacePrior:
-    """Return the prior that a scenario declares, with defaults for what it leaves at zero."""
+    """Return the prior that a scenario declares, with defaults for fields that are zero."""
     return SurfacePrior(scenario.element_error_rms or DEFAULT_ERROR_RMS,
                         scenario.failed_element_share or DEFAULT_FAILED_SHARE)
 
@@ -75,7 +75,7 @@ def estimate_surface(
     pilots
         Pilots of one or several codebooks; without any, the result is the prior.
     prior
-        By default that of `prior_of`.
+        By default the result of `prior_of`.
     progress
         Called after each round with its number and the largest change of a parameter, in
         standard deviations.
@@ -125,7 +125,7 @@ class Alignment:
         """Return the derivatives of aligned signals by the values, [N, Q, N_B, N_SB F].
 
         Offsets of carrier and timing move the multipath out of the nulls of its covariance, and
-        are visible there. Their derivatives are therefore those of the signals, not of the mean.
+        are visible there. Their derivatives therefore contain the signals, not the mean.
         """
         return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
 
@@ -159,8 +159,8 @@ class Alignment:
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
     """RMS of real and imaginary parts of the bands' relative errors in a round [2, N_B].
 
-    A gain or phase that users or cycles draw at random cannot be distinguished from that of
-    the bands, which is then fixed: pilots of one user reveal the sum only.
+    Pilots of one user reveal only the sum of its random gain or phase and the one of the bands,
+    which is then fixed.
     """
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
@@ -259,10 +259,9 @@ class PilotStatistics:
 
     def _linearised(self, part: '_Block', signals: np.ndarray, values: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Improve the values; return the signals, linear in the values, and their slopes.
+        """Improve the values; return the signals as in a model linear in them, and their slopes.
 
-        The signals are those of a linear model with the values themselves as parameters, so that
-        the prior applies to these.
+        The parameters are the values themselves, not their changes, so that the prior applies.
         """
         self._alignment.step(part.whiten, signals, part.mean, values)
         aligned = self._alignment.aligned(signals, values)

@@ -20,16 +20,10 @@ _MIN_PROBABILITY = 1e-7
 
 @dataclasses.dataclass(frozen=True)
 class SurfacePrior:
-    """What is known of a surface before the calibration.
+    """Knowledge of a surface before the calibration.
 
-    Attributes
-    ----------
-    element_error_rms
-        RMS of the relative errors of the coefficients.
-    failed_element_share
-        Probability that an element has failed; from 0 to below 1.
-    band_gain_rms
-        RMS of the relative errors of the bands' gains.
+    RMS of the relative errors of the coefficients, probability that an element has failed, and RMS
+    of the relative errors of the bands' gains.
     """
 
     element_error_rms: float

@@ -4,8 +4,8 @@ A survey measures the covariance. Gains g of the elements in all measurements of
 Gaussian with the covariance C_0 that three fields of the scenario declare. A survey with the
 radiation matrix T replaces the covariance L_0 of its signals T g + noise by a measured one, L, and
 leaves the distribution of g given these signals as it is. Of all covariances whose signals have
-the covariance L, that of g is then the closest to C_0 in the sense of Kullback and Leibler, apart
-from the noise:
+the covariance L, the following one of g is then the closest to C_0 in the sense of Kullback and
+Leibler, apart from the noise:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 
@@ -204,20 +204,9 @@ class PathChannel(ArrayFile):
         """Convert paths of Sionna RT, as its `PathSolver` returns them.
 
         Users are the transmitters, and the only receiver is at the surface's centre, with axes
-        like those of the scenario. Both have one isotropic antenna. Paths from behind the surface
-        are removed.
-
-        Parameters
-        ----------
-        paths
-            Paths with specular reflections only.
-        f0
-            Frequency of the scene [Hz].
-
-        Raises
-        ------
-        ArchiveError
-            If there are several receivers or antennas, or the result is not possible.
+        like the scenario's. Both have one isotropic antenna. All reflections are specular, and
+        the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed. Raises
+        ArchiveError if there are several receivers or antennas, or the result is not possible.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
         if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):

@@ -92,8 +92,8 @@ class _Drawn:
             None if DeclaredElements(scenario).is_exact
             else draw_surface(scenario, streams.generator(seed, streams.SURFACE)))
 
-    def blocked(self, truth: m.GroundTruth) -> np.ndarray | None:
-        """Return whether the user has no direct path, bool [1]; None if no user is blocked."""
+    def blocked(self, truth: m.GroundTruth) -> np.ndarray:
+        """Return whether the user has no direct path, bool [1]."""
         return draw_blocked(self._scenario, 1, streams.generator(
             self._seed, streams.BLOCKAGE, truth.user))
 
@@ -118,7 +118,7 @@ class _Cycle:
     multipath
         Multipath gains of each band, complex128 [N_SB, F, N_E].
     blocked
-        Whether the user has no direct path, bool [1]; None if no user is blocked.
+        Whether the user has no direct path, bool [1].
     surface
         Errors of the elements; None if there are none.
     factors
