@@ -73,17 +73,13 @@ def estimate_surface(
     Parameters
     ----------
     pilots
-        Pilots of one or several codebooks; without any, the result is the prior.
+        Pilots of one or several codebooks of the scenario's sizes; without any, the result is the
+        prior.
     prior
         By default the result of `prior_of`.
     progress
         Called after each round with its number and the largest change of a parameter, in
         standard deviations.
-
-    Raises
-    ------
-    ValueError
-        If the beamforming of pilots does not have the sizes of the scenario.
     """
     prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)
@@ -211,12 +207,8 @@ class PilotStatistics:
                  ) -> tuple[np.ndarray, np.ndarray]:
         """Compute information [2 P, 2 P] and shift [2 P] for real and then imaginary parts.
 
-        Parameters
-        ----------
-        gains
-            Gains of the bands about which the model is linear, complex128 [N_B].
-        mean, covariance
-            Of gains and offsets of the elements, complex128 [2 N_E] and [2 N_E, 2 N_E].
+        Takes the gains of the bands about which the model is linear, complex128 [N_B], and mean
+        and covariance of gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
         """
         size = self._size
         normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
@@ -243,7 +235,8 @@ class PilotStatistics:
                     flat = columns.reshape(-1, size)
                     normal += np.conj(flat.T) @ flat
                     product += np.conj(flat.T) @ white.reshape(-1)
-        return _real_matrix(normal) - lost, _real_vector(product) - moved
+        information = 2 * np.block([[normal.real, -normal.imag], [normal.imag, normal.real]])
+        return information - lost, 2 * np.concatenate([product.real, product.imag]) - moved
 
     def _whiteners(self, radiation: np.ndarray, gains: np.ndarray, mean: np.ndarray,
                    covariance: np.ndarray) -> np.ndarray:
@@ -304,11 +297,3 @@ class _Block:
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Whiten signals [..., N_B, N_SB F]."""
         return np.einsum('irs,...is->...ir', self._whiteners, signals)
-
-
-def _real_matrix(matrix: np.ndarray) -> np.ndarray:
-    return 2 * np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
-
-
-def _real_vector(vector: np.ndarray) -> np.ndarray:
-    return 2 * np.concatenate([vector.real, vector.imag])

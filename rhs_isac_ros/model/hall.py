@@ -107,10 +107,10 @@ class MultipathEstimate(ArrayFile):
 
     def misfit(self, scenario: Any) -> str:
         """Return why the covariance does not fit a scenario; empty if it does."""
+        fields = scenario.fields()
         for name in CONDITIONS:
-            own, other = _plain(self.conditions.get(name)), _plain(getattr(scenario, name))
-            if own != other:
-                return f'a survey with {name} {own}, expected {other} as in the scenario'
+            if (own := self.conditions.get(name)) != fields[name]:
+                return f'a survey with {name} {own}, expected {fields[name]} as in the scenario'
         return ''
 
     def save(self, path: str | Path) -> None:
@@ -305,7 +305,3 @@ class PathChannel(ArrayFile):
             return cls(**content | {'f0': float(arrays['f0'])}, path=str(path))
         except (TypeError, ValueError) as error:
             raise ArchiveError(f'{path}: {error}') from None
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value

@@ -97,8 +97,7 @@ def simulate_received(
     Raises
     ------
     ValueError
-        If `positions` is not a finite [N, 3] array, or the codebook or the surface does not have
-        the sizes of the scenario.
+        If `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
     """
     positions = checked_positions(positions)
     drawn, factors = draw_impairments(scenario, len(positions), rng)
