@@ -22,8 +22,8 @@ _MIN_PROBABILITY = 1e-7
 class SurfacePrior:
     """Knowledge of a surface before the calibration.
 
-    RMS of the relative errors of the coefficients, probability that an element has failed, and RMS
-    of the relative errors of the bands' gains.
+    This is the RMS of the relative errors of the coefficients, the probability that an element has
+    failed, and the RMS of the relative errors of the bands' gains.
     """
 
     element_error_rms: float
@@ -80,8 +80,8 @@ def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: Surface
     """Compute the posterior of a surface, with a search that starts from some `failed` [N_E].
 
     The P parameters are gains and offsets of the elements, then errors of the bands' gains, whose
-    real and imaginary parts have the RMS `band_rms`, float64 [2, N_B], before. The log-likelihood
-    is ``-x^T information x / 2 + shift^T x``, for real and then imaginary parts x.
+    real and imaginary parts have the prior RMS `band_rms`, float64 [2, N_B]. The log-likelihood is
+    ``-x^T information x / 2 + shift^T x``, for real and then imaginary parts x.
     """
     search = _Search(information, shift, prior, band_rms)
     state, log_odds = search.climb(failed.copy())
