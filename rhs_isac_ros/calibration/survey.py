@@ -39,6 +39,8 @@ _FALSE_ALARM = 1e-9
 # Inflation that a survey without positions would have, and its weight in positions: a margin for
 # small surveys, in which the quantiles above are uncertain.
 _INFLATION, _INFLATION_WEIGHT = 1.8, 40
+# The same of the level of users in sight [dB].
+_LEVEL_STD_DB = 1.2
 # Smaller surveys, and those that span less of a side of the region, cause a warning.
 MIN_POSITIONS = 20
 _MIN_SPAN = 0.5
@@ -111,7 +113,8 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     inside = int(np.sum(left_out.distances <= inflation * _radius()))
     about: dict[str, Any] = {
         'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': fit.weight,
-        'inflation': inflation, 'coverage': [inside / n_sight, *_interval(inside, n_sight)],
+        'inflation': inflation, 'level_std_db': _level_std_db(left_out, int(np.prod(model.shape))),
+        'coverage': [inside / n_sight, *_interval(inside, n_sight)],
         'warnings': texts, 'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
     plain = scenario.fields()
     return MultipathEstimate(
@@ -296,6 +299,16 @@ def _inflation(left_out: _LeftOut, n_measurements: int) -> float:
                      / gammainccinv(n_measurements, _FALSE_ALARM)))
     weights = np.array([n, _INFLATION_WEIGHT])
     return float(np.exp(weights @ np.log([most, _INFLATION]) / weights.sum()))
+
+
+def _level_std_db(left_out: _LeftOut, n_measurements: int) -> float:
+    """Return the standard deviation of the power of the residuals among users [dB]."""
+    n = len(left_out.energies)
+    # The energies of Gaussian residuals of equal power scatter as well.
+    excess = max(float(np.var(np.log(left_out.energies))) - 1 / n_measurements, 0.0)
+    usual = (np.log(10) / 10 * _LEVEL_STD_DB)**2
+    variance = (n * excess + _INFLATION_WEIGHT * usual) / (n + _INFLATION_WEIGHT)
+    return float(10 / np.log(10) * np.sqrt(variance))
 
 
 def _radius() -> float:

@@ -23,19 +23,22 @@ class Marginal(NamedTuple):
     log_volume: np.ndarray
 
 
-def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float) -> np.ndarray:
-    """Average the likelihood of n complex Gaussian numbers over their log-normal power.
+def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: float = 0.0
+                          ) -> np.ndarray:
+    """Average the likelihood of Gaussian numbers over their level, a log-normal power.
 
-    Takes their energies relative to the variance at 0 dB, float64 [N]. Returns the logarithm of
-    the average relative to the density of zeros at 0 dB, float64 [N].
+    Takes the energies of n complex numbers, relative to their variance at 0 dB, float64 [N], and
+    the standard deviation and the median of the level. Returns the logarithm of the average,
+    relative to the density of zeros at 0 dB, float64 [N].
     """
     std = np.log(10) / 10 * std_db
     # The likelihood of n numbers determines the level up to n**-0.5.
-    level = std * np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
-    exponents = -energy[:, None] * np.exp(-level) - n * level - level**2 / (2 * std**2)
+    normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
+    level, prior = np.log(10) / 10 * median_db + std * normal, -normal**2 / 2
+    exponents = -energy[:, None] * np.exp(-level) - n * level + prior
     highest = exponents.max(axis=1)
     total = np.exp(exponents - highest[:, None]).sum(axis=1)
-    return highest + np.log(total) - np.log(np.exp(-level**2 / (2 * std**2)).sum())
+    return highest + np.log(total) - np.log(np.exp(prior).sum())
 
 
 def eliminate(

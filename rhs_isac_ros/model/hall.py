@@ -20,6 +20,7 @@ line of sight to its source.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,8 @@ class MultipathEstimate(ArrayFile):
     conditions
         Fields of the scenario of the survey on which it depends.
     about
-        How it was made: ``positions``, their number; ``prior_weight`` nu and ``inflation`` t;
+        How it was made: ``positions``, their number; ``prior_weight`` nu, ``inflation`` t and
+        ``level_std_db``, the standard deviation of the power among users [dB];
         ``coverage``, the expected share of positions in the 95 % region, with its interval;
         ``warnings``; ``codebook``, its id; ``version``.
     path
@@ -99,6 +101,16 @@ class MultipathEstimate(ArrayFile):
             'excess': (n_bands, n_rows, n_rows)}, ArchiveError)
         for array in self.content():
             read_only(array)
+
+    @property
+    def level_db(self) -> tuple[float, float]:
+        """Median and standard deviation of the level of a user's multipath [dB].
+
+        The median is below 0 dB, because the covariance is larger than the multipath by the
+        inflation of the survey.
+        """
+        return (-10 * math.log10(self.about.get('inflation', 1.0)),
+                self.about.get('level_std_db', 0.0))
 
     def content(self) -> tuple[np.ndarray, ...]:
         """Return the arrays that the digest covers."""

@@ -16,10 +16,9 @@ import numpy as np
 from rhs_isac_ros.bounds import PairwiseErrorCost
 from rhs_isac_ros.bounds.rows import Evaluation
 from rhs_isac_ros.codebook import Codebook, optimize, random_codebook
-from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, ambiguity
+from rhs_isac_ros.codebook.codebook import Provenance
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, ambiguity, draw_confusable, sobol
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
-from rhs_isac_ros.codebook.provenance import Provenance
-from rhs_isac_ros.codebook.sampling import draw_confusable, sobol
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 

@@ -18,9 +18,8 @@ from rhs_isac_ros.model.multipath import (
     multipath_covariance,
 )
 from rhs_isac_ros.model.surface import AppliedBeams
-from rhs_isac_ros.positioning.expansion import Means
 from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
-from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.positioning.lattice import Means, Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
 from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
 from rhs_isac_ros.positioning.search import find_modes
