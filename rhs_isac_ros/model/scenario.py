@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
-from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
-from rhs_isac_ros.model.path_channel import PathChannel
+from rhs_isac_ros.model.hall import SPEED_OF_LIGHT_MPS as SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import ArchiveError, ArrayFile, read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
-SPEED_OF_LIGHT_MPS = 299_792_458.0
 # Relative rounding of differences between frequencies.
 _ROUNDING = 1e-9
 
@@ -260,12 +260,7 @@ class Scenario(Extensions, Table1):
         """Read a scenario from a YAML file that maps field names to values.
 
         Fields that are not in the file have their defaults. Paths in the file are relative to its
-        folder.
-
-        Raises
-        ------
-        ScenarioError
-            If the file cannot be read, is not a mapping, or has an unknown field or invalid value.
+        folder. Raises ScenarioError if the file is invalid.
         """
         try:
             content = read_yaml(path)
@@ -349,9 +344,7 @@ class Scenario(Extensions, Table1):
     def roi_bounds_m(self) -> np.ndarray:
         """Lower and upper corner of the region of interest, float64 [2, 3] [m], read-only."""
         center, size = np.array(self.roi_center_m), np.array(self.roi_size_m)
-        bounds = np.stack([center - size / 2, center + size / 2])
-        bounds.flags.writeable = False
-        return bounds
+        return read_only(np.stack([center - size / 2, center + size / 2]))
 
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw positions from the region of interest, float64 [n, 3] [m].
@@ -365,13 +358,7 @@ class Scenario(Extensions, Table1):
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Check the shape of an array against `symbols`: keys of `Scenario.sizes`, blanks between.
-
-    Raises
-    ------
-    ValueError
-        If the shape differs. The message gives the actual and the expected shape.
-    """
+    """Raise ValueError unless the shape is that of `symbols`, keys of `Scenario.sizes`."""
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:
         listed = ', '.join(symbols.split())
@@ -385,13 +372,7 @@ def _plain(value: Any) -> Any:
 
 
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
-    """Convert a field's value to its declared type.
-
-    Raises
-    ------
-    ScenarioError
-        If the type is wrong or the value is out of range.
-    """
+    """Convert a field's value to its declared type; raise ScenarioError if it is invalid."""
     name = field.name
     if name == 'feed_positions_m':
         return None if value is None else tuple(

@@ -8,7 +8,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation

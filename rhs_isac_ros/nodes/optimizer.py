@@ -21,8 +21,9 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options, check
-from rhs_isac_ros.codebook.command import run as run_command
+from rhs_isac_ros.codebook.__main__ import ERRORS, add_options, check
+from rhs_isac_ros.codebook.__main__ import run as run_command
+from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import convert, parameters, topics

@@ -118,9 +118,9 @@ class PositionerNode(RoleNode[Positioner]):
         for publisher in self._user_odometry.publishers(track.user):
             publisher.publish(odometry)
 
-    def _on_estimator(self, event: events.EstimatorReady | events.EstimatorFailed) -> None:
+    def _on_estimator(self, event: events.EstimatorBuilt) -> None:
         self.dispatch(event)
-        if isinstance(event, events.EstimatorReady):
+        if event.estimator is not None:
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:

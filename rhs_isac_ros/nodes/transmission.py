@@ -4,7 +4,7 @@ import types
 from typing import Any
 
 from rhs_isac_ros.link import prepare_steering
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.transmission import Transmission
 from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode

@@ -6,7 +6,7 @@ import enum
 import functools
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -59,17 +59,7 @@ def optional_float() -> Any:
     return dataclasses.field(metadata={'nan_allowed': True})
 
 
-class Checkable(Protocol):
-    """A dataclass with the fields declared here."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-    def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return sizes that depend on the content, by symbol."""
-        ...
-
-
-def check(message: Checkable, sizes: Mapping[str, int]) -> None:
+def check(message: 'Message', sizes: Mapping[str, int]) -> None:
     """Check the arrays, indices and numbers of a message.
 
     Parameters
@@ -85,7 +75,8 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
-    for name, meta in _fields(type(message)):
+    kind: type = type(message)
+    for name, meta in _fields(kind):
         value = getattr(message, name)
         problem = ''
         if 'dims' in meta:
@@ -102,11 +93,11 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
             if not declared.low <= value <= declared.high:
                 problem = f'{value}, expected {declared.range}'
         if problem:
-            raise MessageError(f'{type(message).__name__}.{name}: {problem}')
+            raise MessageError(f'{kind.__name__}.{name}: {problem}')
 
 
 @functools.cache
-def _fields(kind: type[Checkable]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+def _fields(kind: type) -> tuple[tuple[str, Mapping[str, Any]], ...]:
     """Return name and declaration of every field whose values are restricted."""
     return tuple((field.name, field.metadata) for field in dataclasses.fields(kind)
                  if field.metadata or field.type is float)
@@ -212,6 +203,21 @@ def same(one: Message, other: Message) -> bool:
     return type(one) is type(other) and all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name))
         for field in dataclasses.fields(one) if field.name != 'stamp_ns')
+
+
+# The fields that connect the messages of a cycle.
+_SHARED = ('cycle_id', 'user', 'user_instance', 'band', 'codebook_id')
+MessageT = TypeVar('MessageT', bound=Message)
+
+
+def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
+    """Return a message with other fields, and the cycle, user, band and codebook of a source.
+
+    The source is a message, or another object with attributes of the same names.
+    """
+    shared = {name: getattr(source, name) for name in _SHARED
+              if name in kind.__dataclass_fields__ and hasattr(source, name)}
+    return kind(**shared | fields)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -420,3 +426,9 @@ def started(instance: int) -> str:
     """Return the start of an instance [ns since 1970] for a log message."""
     time = datetime.datetime.fromtimestamp(instance // 10**9, datetime.timezone.utc)
     return f'started {time:%Y-%m-%d %H:%M:%S} UTC'
+
+
+def describe_conflict(user: int, instance: int) -> str:
+    """Return a log message about several nodes with one user number, of which one is served."""
+    return (f'user {user}: two nodes have this number; the first one, {started(instance)}, '
+            'is served')

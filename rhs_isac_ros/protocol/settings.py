@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import Field
 

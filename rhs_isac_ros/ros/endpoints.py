@@ -26,7 +26,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, topics
 
 

@@ -23,9 +23,9 @@ from rclpy.parameter import Parameter as RosParameter
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.model import Scenario, mobility
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.settings import BaseStationSettings
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support import plugins

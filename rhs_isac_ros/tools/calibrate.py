@@ -32,7 +32,7 @@ from rhs_isac_ros.calibration import (
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics

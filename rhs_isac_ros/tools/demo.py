@@ -19,9 +19,9 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import STARTED_S, exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
 from rhs_isac_ros.protocol.messages import Phase
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros.processes import (
     MAX_USER_NODES,
     Processes,

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES
 from rhs_isac_ros.monitoring.network_state import Fix, NodeStatus, Overview
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.run import run

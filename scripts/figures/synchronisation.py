@@ -22,9 +22,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from parts.options import parse_options
 from parts.plans import SEED, Plan, add_plan_options, read_plans
 
-from rhs_isac_ros.experiments import markdown_table, parse_options, run_command
+from rhs_isac_ros.experiments import markdown_table, run_command
 from rhs_isac_ros.experiments.sweep import BLOCK, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import add_legend, draw_panel
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, Setting

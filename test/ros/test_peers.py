@@ -19,7 +19,7 @@ from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, peers, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES
@@ -252,7 +252,7 @@ def test_compatible_observers_are_no_conflict(bench):
 
 # Several nodes of a role
 
-class Radio(PlainRole):
+class Radio(Role):
     """A role that collects its events."""
 
     SENDS, RECEIVES = (m.FeedSignals,), (m.Pilot,)

@@ -9,13 +9,13 @@ from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
-from rhs_isac_ros.protocol.role import PlainRole
+from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import LATCHED, steady_timer
 from rhs_isac_ros.ros.role_node import RoleNode
 
 
-class Scripted(PlainRole):
+class Scripted(Role):
     """A role that records its events and follows the script of the test."""
 
     def __init__(self, script=lambda role, event, now_s: [], sends=(), receives=()):

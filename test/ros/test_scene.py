@@ -1,11 +1,15 @@
 """Markers of the scene, and transforms of the surface and of the users."""
 
 import dataclasses
+import functools
 import importlib.util
+import math
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from rclpy.parameter import Parameter
+from rclpy.time import Time as RosTime
 from visualization_msgs.msg import Marker
 
 from rhs_isac_ros.link import beam_pattern, steer
@@ -151,6 +155,13 @@ def test_a_user_is_at_its_estimate():
     assert [getattr(transform.transform.rotation, axis) for axis in 'xyzw'] == [0.0, 0.0, 0.0, 1.0]
 
 
+def test_two_networks_have_frames_of_their_own():
+    frames = [Frame('odom', prefix=f'{space}/') for space in ('left', 'right')]
+    children = [transform.child_frame_id for frame in frames for transform in (
+        scene.surface_transform(frame, Time()), scene.user_transform(frame, 1, np.zeros(3), Time()))]
+    assert children == ['left/rhs_link', 'left/user_1', 'right/rhs_link', 'right/user_1']
+
+
 @pytest.mark.skipif(HAS_TF2, reason='tf2_msgs is installed')
 def test_without_tf2_msgs_the_visualizer_logs_one_line(bench, probe, capfd):
     bench.add(VisualizerNode)
@@ -178,3 +189,30 @@ def test_the_visualizer_publishes_transforms(bench, probe):
     probe.create_timer(0.05, lambda: estimates.publish(estimate))
     bench.until(lambda: 'user_2' in found, 'the user')
     assert found['user_2'].y == 2.5
+
+
+@pytest.mark.skipif(not HAS_TF2, reason='tf2_msgs is not installed')
+def test_two_networks_share_one_tree(bench, probe):
+    tf2_ros = pytest.importorskip('tf2_ros')
+    buffer = tf2_ros.Buffer(node=probe)
+    # It subscribes as long as it exists.
+    listener = tf2_ros.TransformListener(buffer, probe)
+    poses = {'left': [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+             'right': [0.0, 4.0, 0.0, 0.0, 0.0, -math.pi / 2]}
+    for space, pose in poses.items():
+        bench.add(VisualizerNode, namespace=f'/{space}', parameter_overrides=[
+            Parameter('frame_id', value='odom'), Parameter('surface_pose', value=pose)])
+        estimates = probe.create_publisher(
+            convert.ros_type(m.PositionEstimate), f'/{space}/position_estimate', EXCHANGE)
+        estimate = convert.to_ros(m.PositionEstimate(
+            cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
+            covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
+        probe.create_timer(0.05, functools.partial(estimates.publish, estimate))
+    for space, place in (('left', [9.0, 2.5, 0.1]), ('right', [2.5, -4.0, 0.1])):
+        bench.until(lambda space=space: buffer.can_transform(
+            'odom', f'{space}/user_2', RosTime()), f'the user of {space}')
+        found = buffer.lookup_transform('odom', f'{space}/user_2', RosTime())
+        moved = found.transform.translation
+        np.testing.assert_allclose([moved.x, moved.y, moved.z], place, atol=1e-9)
+        assert buffer.can_transform('odom', f'{space}/rhs_link', RosTime())
+    assert listener

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.validate_topic_name import validate_topic_name
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, OBSERVATION, profile_for
 from rhs_isac_ros.ros.recording import recorded_topics, type_name
