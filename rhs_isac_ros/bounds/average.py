@@ -67,7 +67,7 @@ class Combination(NamedTuple):
     scale: np.ndarray
 
     def forward(self, band: int, whitened: np.ndarray) -> np.ndarray:
-        """Return the rows, complex128 [n, G, R], from those of the source, [n, S, R]."""
+        """Return the rows, complex128 [n, G, R], from the source's rows, [n, S, R]."""
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
@@ -93,14 +93,14 @@ class Average:
     patterns
         Factors of the rows' means.
     combination
-        The form's rows, if they are not those of the source.
+        The form's rows, if they differ from the source's.
     tick
         Called repeatedly while the rows are computed; an exception ends the computation.
 
     Attributes
     ----------
     surface
-        An estimate of the surface that is taken as exact; None for that of the scenario.
+        An estimate of the surface that is taken as exact; None for the scenario's elements.
     """
 
     @one_blas_thread
@@ -177,8 +177,8 @@ def average_crlb(
 class AverageCrlb(Average):
     """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
-    Nuisance parameters, errors of the elements and `region_prior` are taken into account as
-    `crlb` does; `tolerance` and errors are those of `Average` and `average_crlb`.
+    Nuisance parameters, errors of the elements and `region_prior` enter as in `crlb`, and
+    `tolerance` and `tick` as in `Average`.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
@@ -216,7 +216,7 @@ class AverageCrlb(Average):
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
-    """Rows of position and nuisance parameters from those of the derivative and of the gain.
+    """Rows of position and nuisance parameters from rows of the derivative and of the gain.
 
     A parameter whose pattern is constant in each band multiplies the row of the gain; any other
     one has a row of its own. Without parameters, the derivative is sufficient.
@@ -256,7 +256,7 @@ def quadratic_gradients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
-    The sums are those of `GradientSums` for all bands, complex128 [N_B, N_SB F, N_E] and
+    The sums are `GradientSums` of all bands, complex128 [N_B, N_SB F, N_E] and
     [N_B, N_SB F, N_SB F]. An estimate of the surface is taken as exact.
     """
     scenario = model.scenario

@@ -52,8 +52,6 @@ class GlobalBound(NamedTuple):
     ----------
     value, standard_error
         The bound and the standard error of its Monte-Carlo average [m^2].
-    range_part
-        Part of the value that is an error of the range [m^2].
     positions
         Positions of the phases that were drawn, float64 [n, 3] [m].
     squared_errors
@@ -65,7 +63,6 @@ class GlobalBound(NamedTuple):
 
     value: float
     standard_error: float
-    range_part: float
     positions: np.ndarray
     squared_errors: np.ndarray
     coarseness: float
@@ -77,13 +74,8 @@ def global_bound(
         n_phases: int = 2048) -> GlobalBound:
     """Compute the bound from the posterior of `n_phases` random positioning phases.
 
-    Nuisance parameters of the scenario are not included: the bound is that of a user who is
-    synchronised.
-
-    Raises
-    ------
-    ValueError
-        If `n_phases` is less than 2.
+    Nuisance parameters of the scenario are not included: the bound holds for a user who is
+    synchronised. Raises ValueError if `n_phases` is less than 2.
     """
     if n_phases < 2:
         raise ValueError(f'n_phases: {n_phases}, expected at least 2')
@@ -99,7 +91,7 @@ def global_bound(
     variances = moments[:, 3]
     return GlobalBound(
         float(variances.mean()), float(variances.std(ddof=1) / np.sqrt(n_phases)),
-        float(moments[:, 4].mean()), moments[:, :3], moments[:, 5], coarseness)
+        moments[:, :3], moments[:, 4], coarseness)
 
 
 class _Lattice:
@@ -134,7 +126,7 @@ class _Lattice:
         sight, inside = sight[used], inside[used]
         self._sight, self._ranges = sight, ranges
         with np.errstate(divide='ignore'):
-            # The density of (r, u, v) is that of the position times r^2 / w.
+            # The density of (r, u, v) is the density of the position times r^2 / w.
             self._prior = np.log(np.where(inside, ranges**2 / thickness / sight[:, :1], 0.0))
         self._interpolate(sight, ranges, box[:, 0])
 
@@ -169,8 +161,7 @@ class _Lattice:
     def phases(self, n: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
         """Draw true points and signals.
 
-        Yields for each the position [3], the variance of the posterior, that of the range, and the
-        squared error.
+        Yields for each the position [3], the variance of the posterior and the squared error.
         """
         model = self._model
         # Systematic sampling spreads the points evenly over the region.
@@ -207,12 +198,12 @@ class _Lattice:
         values = values[chosen, at].astype(float)
         weights = np.exp(values - values.max())
         weights /= weights.sum()
-        truth, ranges = self._sight[ray] * self._ranges[index], self._ranges[at]
-        offsets = (self._sight[rays[chosen]] * ranges[:, None] - truth) * self._extends
+        truth = self._sight[ray] * self._ranges[index]
+        places = self._sight[rays[chosen]] * self._ranges[at, None]
+        offsets = (places - truth) * self._extends
         mean = weights @ offsets
         return np.array([
-            *truth, weights @ np.sum((offsets - mean)**2, axis=1),
-            weights @ (ranges - weights @ ranges)**2, mean @ mean])
+            *truth, weights @ np.sum((offsets - mean)**2, axis=1), mean @ mean])
 
 
 def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -69,13 +69,8 @@ def misspecified(assumed: Scenario, true: Scenario, codebook: Beamforming,
                  positions: np.ndarray) -> Misspecified:
     """Compute the errors of an estimator that assumes one scenario while another one is true.
 
-    Takes positions of the user, float64 [N, 3] [m].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, the sizes of the scenarios differ, or one of
-        them declares nuisance parameters, such as phases, which are not included.
+    Takes positions of the user, float64 [N, 3] [m], and scenarios of equal sizes without nuisance
+    parameters, such as phases; raises ValueError for others.
     """
     return misspecified_of(
         MeasurementModel(assumed, codebook), MeasurementModel(true, codebook), positions)

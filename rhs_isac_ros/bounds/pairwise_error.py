@@ -2,8 +2,8 @@
 
 The phases of the bands may be unknown: theta = A z, with standard normal z. The distance of two
 signals is then the smallest over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For small
-deviations it is what the marginalisation of the Fisher information leaves; for large ones it
-vanishes if the signals differ in the phases of their bands alone.
+deviations it agrees with the marginal Fisher information; for large ones it vanishes if the
+signals differ in the phases of their bands alone.
 """
 
 import copy
@@ -30,9 +30,9 @@ class PairwiseErrorCost(Average):
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
     cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. The quadratic
-    form is that of Eq. (12), with the difference h(p) - h(p') instead of the derivative. If the
-    scenario declares phases as unknown, the form is the smallest over the phases; other nuisance
-    parameters are not included.
+    form has the difference h(p) - h(p') in place of the derivative in Eq. (12). If the scenario
+    declares phases as unknown, the form is the smallest over the phases; other nuisance parameters
+    are not included.
 
     Parameters
     ----------

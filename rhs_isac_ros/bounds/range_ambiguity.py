@@ -70,13 +70,11 @@ def range_confusion_error_of(
         model: MeasurementModel, positions: np.ndarray, rng: np.random.Generator) -> float:
     """Estimate the squared error by confusion of ranges with a codebook [m^2].
 
-    The error is that of the posterior mean if the user is at a position, or at one that can be
-    confused with it: the lags are the minima of the mismatch along the line of sight. The
-    differences of the signals are what remains after a small displacement of the confused
-    position, to first order, and with the best values of phases that the scenario declares as
-    unknown. Noise is drawn several times for each position.
-
-    The result is the average over positions of the user, float64 [N, 3] [m].
+    This is the error of the posterior mean if the user is at one of N positions, float64 [N, 3]
+    [m], or at one that can be confused with it: the lags are the minima of the mismatch along the
+    line of sight. A small displacement of the confused position, to first order, and phases that
+    the scenario declares as unknown make the signals as similar as possible. Noise is drawn
+    several times for each position.
     """
     positions = checked_positions(positions)
     scenario = model.scenario

@@ -2,8 +2,7 @@
 
 A row is a linear function of one band's line-of-sight gains, such as their derivative with respect
 to one coordinate, or their difference between two positions. Its mean is the same function of the
-mean signals, as in Eq. (13). The objectives are functions of whitened means, whose computation
-takes most of their time.
+mean signals, as in Eq. (13). Whitened means take most of the time of an objective.
 """
 
 import copy

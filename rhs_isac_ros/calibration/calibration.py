@@ -114,10 +114,7 @@ class Calibration:
 
 def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
               prior: SurfacePrior | None = None) -> Calibration:
-    """Estimate a surface from pilots; see `estimate_surface`.
-
-    The ids of the codebooks are those of beamforming that has one.
-    """
+    """Estimate a surface from pilots; see `estimate_surface`."""
     prior = prior or prior_of(scenario)
     changes: list[float] = []
     surface = estimate_surface(scenario, pilots, prior, lambda _, change: changes.append(change))

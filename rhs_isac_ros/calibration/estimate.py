@@ -59,7 +59,7 @@ class Pilots:
 
 
 def prior_of(scenario: Scenario) -> SurfacePrior:
-    """Return the prior that a scenario declares, with defaults for what it leaves at zero."""
+    """Return the prior that a scenario declares, with defaults for fields that are zero."""
     return SurfacePrior(scenario.element_error_rms or DEFAULT_ERROR_RMS,
                         scenario.failed_element_share or DEFAULT_FAILED_SHARE)
 
@@ -73,17 +73,13 @@ def estimate_surface(
     Parameters
     ----------
     pilots
-        Pilots of one or several codebooks; without any, the result is the prior.
+        Pilots of one or several codebooks of the scenario's sizes; without any, the result is the
+        prior.
     prior
-        By default that of `prior_of`.
+        By default the result of `prior_of`.
     progress
         Called after each round with its number and the largest change of a parameter, in
         standard deviations.
-
-    Raises
-    ------
-    ValueError
-        If the beamforming of pilots does not have the sizes of the scenario.
     """
     prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)
@@ -125,7 +121,7 @@ class Alignment:
         """Return the derivatives of aligned signals by the values, [N, Q, N_B, N_SB F].
 
         Offsets of carrier and timing move the multipath out of the nulls of its covariance, and
-        are visible there. Their derivatives are therefore those of the signals, not of the mean.
+        are visible there. Their derivatives therefore contain the signals, not the mean.
         """
         return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
 
@@ -159,8 +155,8 @@ class Alignment:
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
     """RMS of real and imaginary parts of the bands' relative errors in a round [2, N_B].
 
-    A gain or phase that users or cycles draw at random cannot be distinguished from that of
-    the bands, which is then fixed: pilots of one user reveal the sum only.
+    Pilots of one user reveal only the sum of its random gain or phase and the one of the bands,
+    which is then fixed.
     """
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
@@ -211,12 +207,8 @@ class PilotStatistics:
                  ) -> tuple[np.ndarray, np.ndarray]:
         """Compute information [2 P, 2 P] and shift [2 P] for real and then imaginary parts.
 
-        Parameters
-        ----------
-        gains
-            Gains of the bands about which the model is linear, complex128 [N_B].
-        mean, covariance
-            Of gains and offsets of the elements, complex128 [2 N_E] and [2 N_E, 2 N_E].
+        Takes the gains of the bands about which the model is linear, complex128 [N_B], and mean
+        and covariance of gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
         """
         size = self._size
         normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
@@ -243,7 +235,8 @@ class PilotStatistics:
                     flat = columns.reshape(-1, size)
                     normal += np.conj(flat.T) @ flat
                     product += np.conj(flat.T) @ white.reshape(-1)
-        return _real_matrix(normal) - lost, _real_vector(product) - moved
+        information = 2 * np.block([[normal.real, -normal.imag], [normal.imag, normal.real]])
+        return information - lost, 2 * np.concatenate([product.real, product.imag]) - moved
 
     def _whiteners(self, radiation: np.ndarray, gains: np.ndarray, mean: np.ndarray,
                    covariance: np.ndarray) -> np.ndarray:
@@ -259,10 +252,9 @@ class PilotStatistics:
 
     def _linearised(self, part: '_Block', signals: np.ndarray, values: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Improve the values; return the signals, linear in the values, and their slopes.
+        """Improve the values; return the signals as in a model linear in them, and their slopes.
 
-        The signals are those of a linear model with the values themselves as parameters, so that
-        the prior applies to these.
+        The parameters are the values themselves, not their changes, so that the prior applies.
         """
         self._alignment.step(part.whiten, signals, part.mean, values)
         aligned = self._alignment.aligned(signals, values)
@@ -305,11 +297,3 @@ class _Block:
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Whiten signals [..., N_B, N_SB F]."""
         return np.einsum('irs,...is->...ir', self._whiteners, signals)
-
-
-def _real_matrix(matrix: np.ndarray) -> np.ndarray:
-    return 2 * np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
-
-
-def _real_vector(vector: np.ndarray) -> np.ndarray:
-    return 2 * np.concatenate([vector.real, vector.imag])

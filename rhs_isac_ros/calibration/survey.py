@@ -141,7 +141,7 @@ def survey_report(estimate: MultipathEstimate) -> str:
 
 
 class _Fit(NamedTuple):
-    """The most likely fields of a scenario, and what follows from them."""
+    """The most likely fields of a scenario, and residuals with these."""
 
     # Scenario with the fields, and weight of the prior in positions.
     fields: Scenario
@@ -232,11 +232,7 @@ def _log_evidence(declared: np.ndarray, sample: np.ndarray, n: int, weight: floa
 
 
 class _LeftOut(NamedTuple):
-    """What each position yields under the covariance of all others.
-
-    Squared Mahalanobis distances of the local position errors, and energies of the whitened
-    residuals, float64 [N].
-    """
+    """Squared Mahalanobis distances of local position errors, and energies of residuals [N]."""
 
     distances: np.ndarray
     energies: np.ndarray
@@ -246,8 +242,8 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
               total: np.ndarray, n_others: float) -> _LeftOut:
     """Evaluate every position under the covariance ``(total - e e^H) / n_others`` of the others.
 
-    `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. The errors are
-    those of a scoring step from the true position, with unknown nuisance parameters.
+    `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. An error is a
+    scoring step from the true position, with unknown nuisance parameters.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     nuisance = nuisance_of(model.scenario).scaled_patterns

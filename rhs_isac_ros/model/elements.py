@@ -258,20 +258,11 @@ def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
         gains, np.where(fate < scenario.failed_element_share, levels, np.nan))
 
 
-def error_factors(scenario: Scenario, analog: np.ndarray) -> np.ndarray:
-    """Compute the factors of the coefficients' covariance, float64 [T, N_B, F, N_E].
-
-    The covariance of an element's coefficient between two frames is the sum over the T terms of
-    the product of their factors. `analog` is C, float64 [N_B, F, N_E].
-    """
-    factors = [constant + slope * analog for constant, slope in error_terms(scenario)]
-    return np.array(factors).reshape(-1, *analog.shape)
-
-
 def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
-    """Return the T factors of `error_factors` as a constant and a slope over the amplitude c.
+    """Return the factors of the coefficients' covariance: constants, and slopes over C.
 
-    There is one term for errors alone, and there are two more if elements can fail.
+    The covariance of an element's coefficient between two frames is a sum over T terms: one for
+    errors, and two more if elements can fail. Each is the product of the factors of both frames.
     """
     rms, share = scenario.element_error_rms, scenario.failed_element_share
     spread = np.sqrt((1 + rms**2) * share)
@@ -282,18 +273,20 @@ def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
 
 
 def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
-    """Compute the factors times the weights S B, complex128 [T, N_B, N_SB F, N_E]."""
-    factors = error_factors(scenario, beams.analog)
-    return (factors[:, :, None] * feed_weights(scenario, beams)).reshape(
-        len(factors), scenario.n_bands, -1, scenario.n_elements)
+    """Compute the factors of `error_terms` times S B, complex128 [T, N_B, N_SB F, N_E]."""
+    factors = np.array([constant + slope * beams.analog
+                        for constant, slope in error_terms(scenario)])
+    return (factors.reshape(-1, *beams.analog.shape)[:, :, None]
+            * feed_weights(scenario, beams)).reshape(
+                len(factors), scenario.n_bands, -1, scenario.n_elements)
 
 
 @functools.lru_cache(maxsize=16)
 def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
     """Compute the correlation of an element's gain over the measurements of a band.
 
-    The gain is that of the direct path, averaged over the region of interest, and of the
-    multipath. Returns complex128 [N_SB F, N_SB F, N_E], read-only.
+    It includes the direct path, averaged over the region of interest, and the multipath. Returns
+    complex128 [N_SB F, N_SB F, N_E], read-only.
     """
     nodes, weights = gauss_legendre(_ROI_NODES)
     low, high = scenario.roi_bounds_m

@@ -4,8 +4,8 @@ A survey measures the covariance. Gains g of the elements in all measurements of
 Gaussian with the covariance C_0 that three fields of the scenario declare. A survey with the
 radiation matrix T replaces the covariance L_0 of its signals T g + noise by a measured one, L, and
 leaves the distribution of g given these signals as it is. Of all covariances whose signals have
-the covariance L, that of g is then the closest to C_0 in the sense of Kullback and Leibler, apart
-from the noise:
+the covariance L, the following one of g is then the closest to C_0 in the sense of Kullback and
+Leibler, apart from the noise:
 
     C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
 
@@ -119,10 +119,10 @@ class MultipathEstimate(ArrayFile):
 
     def misfit(self, scenario: Any) -> str:
         """Return why the covariance does not fit a scenario; empty if it does."""
+        fields = scenario.fields()
         for name in CONDITIONS:
-            own, other = _plain(self.conditions.get(name)), _plain(getattr(scenario, name))
-            if own != other:
-                return f'a survey with {name} {own}, expected {other} as in the scenario'
+            if (own := self.conditions.get(name)) != fields[name]:
+                return f'a survey with {name} {own}, expected {fields[name]} as in the scenario'
         return ''
 
     def save(self, path: str | Path) -> None:
@@ -216,20 +216,9 @@ class PathChannel(ArrayFile):
         """Convert paths of Sionna RT, as its `PathSolver` returns them.
 
         Users are the transmitters, and the only receiver is at the surface's centre, with axes
-        like those of the scenario. Both have one isotropic antenna. Paths from behind the surface
-        are removed.
-
-        Parameters
-        ----------
-        paths
-            Paths with specular reflections only.
-        f0
-            Frequency of the scene [Hz].
-
-        Raises
-        ------
-        ArchiveError
-            If there are several receivers or antennas, or the result is not possible.
+        like the scenario's. Both have one isotropic antenna. All reflections are specular, and
+        the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed. Raises
+        ArchiveError if there are several receivers or antennas, or the result is not possible.
         """
         a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
         if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):
@@ -328,7 +317,3 @@ class PathChannel(ArrayFile):
             return cls(**content | {'f0': float(arrays['f0'])}, path=str(path))
         except (TypeError, ValueError) as error:
             raise ArchiveError(f'{path}: {error}') from None
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value

@@ -7,7 +7,7 @@ nepers, an imaginary one a phase. The factor applies to the direct path and to t
 not to the thermal noise. The exponential wraps phases, so that a phase whose standard deviation is
 a turn is uniform.
 
-Simulation, estimators, bounds and calibration use only what an `Impairment` returns, so that
+Simulation, estimators, bounds and calibration use the results of an `Impairment` only, so that
 another one requires no change elsewhere: a `Factor` in `BUILT_IN`, or a plug-in of the group
 ``rhs_isac_ros.impairments``.
 """
@@ -82,7 +82,7 @@ class Impairment:
 
 
 class Nuisance:
-    """The nuisance parameters of a scenario: those of all impairments together.
+    """The nuisance parameters of all impairments of a scenario.
 
     The parameters are x = L z with standard normal z. Bounds and estimators use z, which needs no
     units.
@@ -160,20 +160,12 @@ def _shape(scenario: Scenario) -> tuple[int, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Factor(Impairment):
-    """Independent values whose standard deviation is a field of the scenario.
-
-    Attributes
-    ----------
-    field
-        The field.
-    patterns
-        Function that returns the exponents per unit of the values.
-    unit
-        Unit of the field, in the unit of the values.
-    """
+    """Independent values whose standard deviation is a field of the scenario."""
 
     field: str
+    # Function that returns the exponents per unit of the values.
     patterns: Callable[[Scenario], np.ndarray]
+    # Unit of the field, in the unit of the values.
     unit: float = 1.0
     needs_search: bool = False
     scope: Scope = Scope.CYCLE
@@ -222,7 +214,7 @@ def draw_factors(
     """Draw the factors of the signals of n users and cycles, complex128 [n, N_B, N_SB F].
 
     Impairments of users and of cycles have a generator each. The values of a built-in impairment
-    do not depend on what else the scenario declares. The result is None if nothing is declared.
+    do not depend on others. The result is None if the scenario declares no impairment.
     """
     declared = impairments_of(scenario)
     if not declared:

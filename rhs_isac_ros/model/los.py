@@ -24,10 +24,10 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
     return _gain(scenario, distances, band, _amplitude(scenario, offsets))
 
 
-def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray | None:
-    """Draw whether n users lack the direct path, bool [n]; None if the scenario has none."""
+def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw whether n users lack the direct path, bool [n]."""
     if not scenario.blocked_probability:
-        return None
+        return np.zeros(n, bool)
     return rng.spawn(1)[0].random(n) < scenario.blocked_probability
 
 

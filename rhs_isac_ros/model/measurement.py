@@ -92,13 +92,12 @@ def simulate_received(
     Takes the user's position in each phase, float64 [N, 3] [m], and returns complex128
     [N, N_B, N_SB F], sub-band-major. Impairments that the scenario declares are drawn too: a new
     user and a new cycle for each position, and one surface for all of them, unless `surface` is
-    given. With a channel file, the signals are those of its users nearest to the positions.
+    given. With a channel file, the users are the file's nearest to the positions.
 
     Raises
     ------
     ValueError
-        If `positions` is not a finite [N, 3] array, or the codebook or the surface does not have
-        the sizes of the scenario.
+        If `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
     """
     positions = checked_positions(positions)
     drawn, factors = draw_impairments(scenario, len(positions), rng)
@@ -110,8 +109,7 @@ def simulate_received(
     received = np.empty((len(positions), n_bands, n_measurements), complex)
     for block in blocks(len(positions), _BLOCK):
         for band in range(n_bands):
-            los = direct_gain(
-                scenario, positions[block], band, None if blocked is None else blocked[block])
+            los = direct_gain(scenario, positions[block], band, blocked[block])
             gains = 0.0 if scenario.channel else draw_multipath(scenario, band, len(los), rng)
             noise = _thermal_noise(scenario, (len(los), n_measurements), rng)
             symbol = 1.0 if factors is None else factors[block, band]
@@ -149,15 +147,8 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
 def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
     """Implements Eq. (13). Derivative of one band's mean signal with respect to the position.
 
-    Returns complex128 [N, G, N_SB F] [1/m], sub-band-major.
-
-    Parameters
-    ----------
-    slopes
-        Derivative of the line-of-sight gains, complex128 [N, G, N_SB, N_E] [1/m]; G is 3. Any
-        other linear functions of the gains may take its place.
-    radiation
-        T_i of the band, complex128 [N_SB F, N_E].
+    Takes the derivative of the line-of-sight gains, complex128 [N, 3, N_SB, N_E] [1/m], and T_i of
+    the band, complex128 [N_SB F, N_E]. Returns complex128 [N, 3, N_SB F] [1/m], sub-band-major.
     """
     n, n_rows, n_subbands, n_elements = slopes.shape
     frames = radiation.reshape(n_subbands, -1, n_elements)
@@ -179,8 +170,8 @@ class MeasurementModel:
     Immutable. Construction computes the radiation matrices only; the factors of the covariance
     and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
 
-    Positions are those of the user, float64 [N, 3] [m]. Methods that take them raise ValueError
-    if the shape is wrong or a value is not finite. Measurements are sub-band-major.
+    Methods take positions of the user, float64 [N, 3] [m], and raise ValueError if the shape is
+    wrong or a value is not finite. Measurements are sub-band-major.
 
     Parameters
     ----------
@@ -305,13 +296,8 @@ class MeasurementModel:
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute `mean` and `jacobian` together, much faster, but with different rounding.
 
-        Parameters
-        ----------
-        by_coordinate
-            Derivatives of the positions with respect to other coordinates, float64 [N, 3, Q],
-            for the derivatives of the mean with respect to these, [N, Q, N_B, N_SB F].
-        whitened
-            Whether to `whiten` both.
+        Both may be `whitened`. With derivatives of the positions with respect to Q other
+        coordinates, float64 [N, 3, Q], the derivatives of the mean are with respect to these.
         """
         positions, weights = checked_positions(positions), self._weights
         n, (n_bands, n_rows) = len(positions), self.shape
@@ -351,8 +337,7 @@ class MeasurementModel:
             model = MeasurementModel(scenario, self.beams, surface)
 
         def of_band(positions: np.ndarray, block: slice, band: int) -> np.ndarray:
-            los = direct_gain(
-                scenario, positions, band, None if blocked is None else blocked[block])
+            los = direct_gain(scenario, positions, band, blocked[block])
             return received_signal(los, 0.0, model.radiation[band], 0.0)
 
         signals = model._of_bands(positions, (), of_band)
@@ -392,7 +377,7 @@ class ElementSums:
         # gain.
         self._frames = np.ascontiguousarray(np.swapaxes(radiation.reshape(shape), 2, 3))
         if gain is not None:
-            # Not in place: with one frame, the array is that of the caller.
+            # Not in place: with one frame, the array belongs to the caller.
             self._frames = self._frames * (gain / 2 / self._wavenumbers)[..., None, None]
         self._elements = element_positions(scenario)
         # Coordinates in which the elements differ from the origin; a plane has two.
@@ -463,8 +448,8 @@ def _phasors(phases: np.ndarray) -> np.ndarray:
     """Compute exp(i phase), complex128, for phases [rad] of moderate size.
 
     The nearest phasor of a table is rotated by the rest of the phase with the Taylor series, which
-    takes a third of the time of an exponential. The error is below 1e-15, and below that of the
-    phase for large phases.
+    takes a third of the time of an exponential. The error is below 1e-15, or below the rounding
+    of a large phase.
     """
     turns = phases * (_N_PHASORS / (2 * np.pi))
     nearest = np.rint(turns)

@@ -50,7 +50,7 @@ class StraightMobility(Mobility, Protocol):
 
 
 class Crowd:
-    """The paths of many users; those of straight legs are evaluated with one array operation."""
+    """The paths of many users; one array operation evaluates all straight legs."""
 
     def __init__(self, mobilities: Sequence[Mobility]) -> None:
         self._mobilities = mobilities
@@ -156,9 +156,9 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """User on traced positions: the one nearest to the position of another mobility.
+    """User of a channel file who is nearest to the position of another mobility.
 
-    Positions are those of a channel file; the velocity is that of the other mobility.
+    The velocity is the one of the other mobility.
     """
 
     def __init__(self, mobility: Mobility, channel: PathChannel) -> None:

@@ -5,6 +5,7 @@ declare the covariance of the gains; a measured one adds a term of the rank of i
 it, see `hall`.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Iterator, Sequence
@@ -34,15 +35,16 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     """Implements Eq. (2). Covariance of the multipath gains of the elements that fields declare.
 
     The power-angle profile is a product of two Laplacians of `angular_spread_deg` about
-    `multipath_direction_deg`, normalised over the half space in front of the surface and scaled by
-    the mean line-of-sight power in the region of interest times ``multipath_to_los_db``. The paper
-    leaves the scale open; that both powers are equal by default is the reading of this package. A
-    gain pattern of the elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E].
+    `multipath_direction_deg`, normalised over the half space in front of the surface, weighted by
+    a gain pattern of the elements, and scaled by the mean line-of-sight power in the region of
+    interest times ``multipath_to_los_db``. The paper leaves the scale open; equal powers by
+    default are the reading of this package. Returns V_i, complex128 [N_B, N_E, N_E];
     `declared_covariance` needs less memory for many elements.
     """
     return _matrix(_lattice(scenario), scenario)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class SpatialCovariance:
     """V_i of Eq. (2) for products with it, in one band or in several with a leading axis.
 
@@ -52,42 +54,47 @@ class SpatialCovariance:
 
     Attributes
     ----------
-    power
-        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
+    shape
+        Numbers of rows and columns of the elements.
     is_real
         Whether V_i is real, as for an even profile that is not measured.
+    power
+        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
     matrix
         V_i [..., N_E, N_E]; None for many elements.
     """
 
-    def __init__(self, shape: tuple[int, int], is_real: bool, power: np.ndarray,
-                 matrix: np.ndarray | None, spectrum: np.ndarray | None,
-                 excess: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-        self._shape, self.is_real, self.power = shape, is_real, power
-        self.matrix, self._spectrum, self._excess = matrix, spectrum, excess
+    shape: tuple[int, int]
+    is_real: bool
+    power: np.ndarray
+    matrix: np.ndarray | None = None
+    # Fourier transform over the offsets of the elements; None for few elements.
+    spectrum: np.ndarray | None = None
+    # W F and F of the term of low rank, without a matrix.
+    excess: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def n_elements(self) -> int:
         """Number of elements N_E."""
-        return math.prod(self._shape)
+        return math.prod(self.shape)
 
     def __getitem__(self, bands: int | slice | list[int]) -> 'SpatialCovariance':
         """Return V_i of some bands."""
         return SpatialCovariance(
-            self._shape, self.is_real, self.power[bands],
+            self.shape, self.is_real, self.power[bands],
             None if self.matrix is None else self.matrix[bands],
-            None if self._spectrum is None else self._spectrum[bands],
-            self._excess and (self._excess[0][bands], self._excess[1][bands]))
+            None if self.spectrum is None else self.spectrum[bands],
+            self.excess and (self.excess[0][bands], self.excess[1][bands]))
 
     def plus(self, weights: np.ndarray, factor: np.ndarray) -> 'SpatialCovariance':
         """Return the sum with F^H W F, of W [N_B, R, R] and F [N_B, R, N_E]; W is Hermitian."""
         through = np.matmul(weights, factor)
         power = self.power + np.sum(np.conj(factor) * through, axis=-2).real
+        total = dataclasses.replace(self, is_real=False, power=power)
         if self.matrix is None:
-            return SpatialCovariance(
-                self._shape, False, power, None, self._spectrum, (through, factor))
-        matrix = read_only(self.matrix + np.matmul(adjoint(factor), through))
-        return SpatialCovariance(self._shape, False, power, matrix, None)
+            return dataclasses.replace(total, excess=(through, factor))
+        return dataclasses.replace(
+            total, matrix=read_only(self.matrix + np.matmul(adjoint(factor), through)))
 
     def scatter(self, weights: np.ndarray) -> np.ndarray:
         """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
@@ -106,16 +113,16 @@ class SpatialCovariance:
     def _convolve(self, rows: np.ndarray, result: np.ndarray) -> None:
         from scipy import fft
 
-        assert self._spectrum is not None
-        lattice = rows.reshape(*rows.shape[:-1], *self._shape)
-        (n_rows, n_columns), sizes = self._shape, self._spectrum.shape[-2:]
+        assert self.spectrum is not None
+        lattice = rows.reshape(*rows.shape[:-1], *self.shape)
+        (n_rows, n_columns), sizes = self.shape, self.spectrum.shape[-2:]
         for part in blocks(rows.shape[-2], max(_BLOCK_NUMBERS // math.prod(sizes), 1)):
             waves = fft.fft2(lattice[..., part, :, :], sizes)
-            waves *= self._spectrum[..., None, :, :]
+            waves *= self.spectrum[..., None, :, :]
             found = fft.ifft2(waves, overwrite_x=True)[..., :n_rows, :n_columns]
             result[..., part, :] = found.reshape(result[..., part, :].shape)
-        if self._excess:
-            through, factor = self._excess
+        if self.excess:
+            through, factor = self.excess
             result += np.matmul(rows @ adjoint(factor), through)
 
 
@@ -139,14 +146,14 @@ def declared_covariance(scenario: Scenario) -> SpatialCovariance:
     power = np.repeat(lattice[:, shape[0] - 1, shape[1] - 1, None].real, scenario.n_elements, 1)
     if scenario.n_elements <= _MAX_MATRIX:
         matrix = _matrix(lattice.real if is_real else lattice, scenario)
-        return SpatialCovariance(shape, is_real, power, matrix, None)
+        return SpatialCovariance(shape, is_real, power, matrix)
     from scipy import fft
 
     # A circle long enough that nothing wraps around; the offset 0 comes first.
     kernel = np.zeros((len(lattice), *(fft.next_fast_len(2 * n - 1) for n in shape)), complex)
     kernel[:, :2 * shape[0] - 1, :2 * shape[1] - 1] = np.conj(lattice)
     kernel = np.roll(kernel, (1 - shape[0], 1 - shape[1]), axis=(1, 2))
-    return SpatialCovariance(shape, is_real, power, None, fft.fft2(kernel).real)
+    return SpatialCovariance(shape, is_real, power, spectrum=fft.fft2(kernel).real)
 
 
 def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:

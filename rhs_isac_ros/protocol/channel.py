@@ -113,8 +113,8 @@ class _Cycle:
 
     truth: m.GroundTruth
     multipath: list[np.ndarray]  # of each band, complex128 [N_SB, F, N_E]
-    # Whether the user has no direct path, bool [1]; None if no user is blocked.
-    blocked: np.ndarray | None
+    # Whether the user has no direct path, bool [1].
+    blocked: np.ndarray
     # Gains of the other paths of each band, complex128 [N_SB, N_E]: direct, or of a channel file.
     los: list[np.ndarray]
     # Factors of all signals, complex128 [N_B, N_SB, F]; None if all are 1.

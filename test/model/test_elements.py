@@ -16,7 +16,7 @@ from rhs_isac_ros.model import (
 from rhs_isac_ros.model.elements import (
     DeclaredElements,
     element_correlation,
-    error_factors,
+    error_terms,
 )
 
 N_SURFACES = 1500
@@ -73,7 +73,8 @@ def test_factors_are_the_covariance_of_the_coefficients():
     mean = 0.7 * configurations + 0.15
     np.testing.assert_allclose(applied.mean(axis=1), mean, atol=0.02)
     deviation = applied - mean[:, None]
-    factors = error_factors(scenario, configurations[None, :, None])[:, 0, :, 0]
+    factors = np.array([constant + slope * configurations
+                        for constant, slope in error_terms(scenario)])
     np.testing.assert_allclose(
         deviation @ deviation.conj().T / scenario.n_elements,
         np.einsum('tq,tp->qp', factors, factors), atol=0.01)

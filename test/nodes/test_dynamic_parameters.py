@@ -113,7 +113,7 @@ def test_changes_of_policy_and_noise_are_reported(running):
     ('positioner', {'estimator': 'neural'}, "model_file: '', expected a trained model"),
     ('positioner', {'estimator': 'ml', 'prior': 'track'}, "prior: 'track', expected 'region'"),
     ('transmission', {'band': 7}, 'band: 7, expected 0 to 1 of the scenario'),
-    ('channel', {'loss_probability': 1.5}, 'loss_probability: 1.5, expected a number'),
+    ('channel', {'loss_probability': 1.5}, 'loss_probability: 1.5, expected 0 to 1'),
     ('user_1', {'speed_mps': 2.0}, 'Trying to set a read-only parameter: speed_mps'),
 ])
 def test_an_invalid_value_is_rejected_with_the_reason(running, node, values, reason):

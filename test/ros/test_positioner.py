@@ -111,7 +111,7 @@ def test_signals_are_answered_while_another_estimator_is_built(
             begun.set()
             released.wait()
         return make_estimator(name, scenario, codebook, **options)
-    monkeypatch.setattr(positioner, 'make_estimator', slowly)
+    monkeypatch.setattr(positioner.positioning, 'make_estimator', slowly)
     estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
     send(1)
@@ -134,7 +134,7 @@ def test_a_node_can_be_destroyed_while_an_estimator_is_built(bench, node, codebo
         begun.set()
         made.append(make_estimator(name, scenario, codebook, **options))
         return made[0]
-    monkeypatch.setattr(positioner, 'make_estimator', slowly)
+    monkeypatch.setattr(positioner.positioning, 'make_estimator', slowly)
     node.dispatch(CodebookOffered(codebooks[0]))
     assert begun.wait(10)
     bench.remove(node)

@@ -158,7 +158,8 @@ def test_a_user_is_at_its_estimate():
 def test_two_networks_have_frames_of_their_own():
     frames = [Frame('odom', prefix=f'{space}/') for space in ('left', 'right')]
     children = [transform.child_frame_id for frame in frames for transform in (
-        scene.surface_transform(frame, Time()), scene.user_transform(frame, 1, np.zeros(3), Time()))]
+        scene.surface_transform(frame, Time()),
+        scene.user_transform(frame, 1, np.zeros(3), Time()))]
     assert children == ['left/rhs_link', 'left/user_1', 'right/rhs_link', 'right/user_1']
 
 
