@@ -150,6 +150,9 @@ def _example(parameters: Sequence[Parameter]) -> str:
     return f'{chosen.name}:={value}'
 
 
+# Time for the destruction of the nodes [s]. Fast DDS 2.14 can wait for itself for ever when a
+# publisher is destroyed while another participant times out.
+_DESTRUCTION_S = 10
 # Maximum time between two checks for a signal.
 _POLL_S = 0.1
 
@@ -211,12 +214,17 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         print_error(error, program)
         return 2
     finally:
+        # Without a handler, the signal also ends a process whose threads wait for each other in
+        # the middleware, where no handler in Python would run.
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(_DESTRUCTION_S)
         leave()
         for node in nodes:
             node.destroy_node()
         if executor is not None:
             executor.shutdown()
         try_shutdown()
+        signal.alarm(0)
         # Python restores the default handlers when it exits. A further signal, as from Ctrl-C on
         # a launch, would then kill a process that is about to exit normally.
         for number in (signal.SIGINT, signal.SIGTERM):
