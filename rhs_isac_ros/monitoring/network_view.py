@@ -311,7 +311,8 @@ class NetworkView:
     def _entities(self, message: m.Message) -> Iterator[tuple[str, Entity]]:
         match message:
             case m.RhsConfiguration():
-                yield f'{WORLD}/board', scene.board(self._scenario, message.analog)
+                yield f'{WORLD}/board', scene.board(
+                    self._scenario, message.analog, enlarged=True)
                 if message.mode is m.Mode.TRANSMISSION:
                     yield TRANSMISSION, scene.configurations(
                         self._scenario, [message.analog])
@@ -321,7 +322,8 @@ class NetworkView:
                     yield POSITIONING, scene.configurations(
                         self._scenario, [self._configurations[band] for band in bands])
             case m.Beam():
-                yield f'{WORLD}/beam', scene.lobe(self._scenario, message)
+                yield f'{WORLD}/beam', scene.lobe(
+                    scene.pattern(self._scenario, message), message.user)
             case m.GroundTruth():
                 path = self._path(message.user)
                 ball, name = scene.truth(message)

@@ -1,7 +1,6 @@
 """The executable ``visualizer``: shows a network in RViz and Foxglove."""
 
 import copy
-import math
 import sys
 import time
 from typing import Any
@@ -12,7 +11,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from rhs_isac_ros.link import Beam, beam_pattern
+from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, markers, parameters, qos, topics, transforms
@@ -79,13 +78,16 @@ class VisualizerNode(Node):
 
     def _show_markers(self, stamp: Time) -> None:
         scene = self._scene
-        array = [markers.region(self._scenario, stamp), markers.board(
-            self._scenario, scene.configuration.analog if scene.configuration else None, stamp)]
-        for user in scene.users.values():
+        bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes] = {
+            ('region', 0): shapes.region(self._scenario),
+            ('board', 0): shapes.board(
+                self._scenario, scene.configuration.analog if scene.configuration else None)}
+        for number, user in scene.users.items():
             if user.truth:
-                array.append(markers.truth(user.truth, stamp))
+                bodies['truth', number], _ = shapes.truth(user.truth)
             if user.estimate:
-                array.append(markers.estimate(user.estimate, stamp))
+                _, bodies['estimate', number] = shapes.estimate(user.estimate)
+        array = [markers.marker(*key, body, stamp) for key, body in bodies.items()]
         if scene.beam:
             array.append(self._beam_marker(scene.beam, stamp))
         array = [markers.place(marker, self._frame) for marker in array]
@@ -95,12 +97,9 @@ class VisualizerNode(Node):
         self._publisher.publish(MarkerArray(markers=array))
 
     def _beam_marker(self, message: m.Beam, stamp: Time) -> Marker:
-        """Return the pattern of a beam at the distance of the centre of the region."""
         if self._drawn is None or self._drawn[0] is not message:
-            pattern = beam_pattern(
-                self._scenario, Beam(message.analog, message.digital, message.band),
-                math.hypot(*self._scenario.roi_center_m))
-            self._drawn = message, markers.beam(pattern, message.user, stamp)
+            lobe = shapes.lobe(shapes.pattern(self._scenario, message), message.user)
+            self._drawn = message, markers.marker('beam', 0, lobe, stamp)
         drawn = copy.copy(self._drawn[1])
         drawn.header = Header(stamp=stamp, frame_id=drawn.header.frame_id)
         return drawn

@@ -1,4 +1,4 @@
-"""The scene of a network as markers for RViz, in metres in the frame of the surface.
+"""Shapes as markers for RViz, in metres in the frame of the surface, and paths.
 
 `place` moves a marker to the frame of standard messages.
 """
@@ -12,100 +12,61 @@ from nav_msgs.msg import Path
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
-from rhs_isac_ros.link import BeamPattern
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_interval_m, element_positions
-from rhs_isac_ros.monitoring.shapes import ellipsoid_95, lobe_m, user_colour
-from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.monitoring.shapes import Boxes, Ellipsoids, Mesh, Points
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.topics import RHS_FRAME
 
-_USER_SIZE_M = 0.25
-# RViz rejects bodies without extent [m].
-_MIN_EXTENT_M = 1e-3
+# Opacity of bodies through which others remain visible.
+_ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
 
 
-def board(scenario: Scenario, configuration: np.ndarray | None, stamp: Time) -> Marker:
-    """Return the surface as one cube for each element, from dark for 0 to bright for 1.
+def marker(
+        namespace: str, number: int, shape: Points | Ellipsoids | Boxes | Mesh, stamp: Time
+) -> Marker:
+    """Return a ball, an ellipsoid, cuboids or a mesh as a marker.
 
-    Parameters
-    ----------
-    configuration
-        Applied configuration, float64 [F, N_E] in [0, 1], of which the mean over the frames is
-        shown; None if unknown.
+    Rerun draws an ellipsoid and a box that is not solid as outlines; here they are translucent.
     """
-    positions = element_positions(scenario)
-    levels = (np.full(len(positions), 0.5) if configuration is None
-              else np.mean(configuration, axis=0))
-    side_m = 0.9 * element_interval_m(scenario)
-    marker = _marker('board', 0, Marker.CUBE_LIST, stamp)
-    marker.scale = Vector3(x=_MIN_EXTENT_M, y=side_m, z=side_m)
-    marker.points = [_point(position) for position in positions]
-    marker.colors = [ColorRGBA(r=c, g=c, b=0.3 + 0.2 * c, a=1.0) for c in levels.tolist()]
-    return marker
-
-
-def region(scenario: Scenario, stamp: Time) -> Marker:
-    """Return the region of interest as a translucent cuboid."""
-    marker = _marker('region', 0, Marker.CUBE, stamp)
-    marker.pose.position = _point(np.array(scenario.roi_center_m))
-    marker.scale = _vector(np.maximum(scenario.roi_size_m, _MIN_EXTENT_M))
-    marker.color = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.15)
-    return marker
-
-
-def truth(message: m.GroundTruth, stamp: Time) -> Marker:
-    """Return the true position of a user as a small ball in the colour of the user."""
-    marker = _marker('truth', message.user, Marker.SPHERE, stamp)
-    marker.pose.position = _point(message.position)
-    marker.scale = _vector(np.full(3, _USER_SIZE_M))
-    marker.color = _colour(message.user, 1.0)
-    return marker
-
-
-def estimate(message: m.PositionEstimate, stamp: Time) -> Marker:
-    """Return a position estimate as its 95 % ellipsoid in the colour of the user.
-
-    The ellipsoid contains 95 % of a Gaussian with the mean and covariance of the estimate.
-    """
-    half_m, quaternion = ellipsoid_95(message.covariance_m2)
-    x, y, z, w = quaternion.tolist()
-    marker = _marker('estimate', message.user, Marker.SPHERE, stamp)
-    marker.pose.position = _point(message.position)
-    marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
-    marker.scale = _vector(np.maximum(2 * half_m, _MIN_EXTENT_M))
-    marker.color = _colour(message.user, 0.35)
-    return marker
-
-
-def beam(pattern: BeamPattern, user: int, stamp: Time) -> Marker:
-    """Return the surface of `lobe_m` as triangles in the colour of the user."""
-    points = lobe_m(pattern)
-    # Two triangles for each cell of the mesh, with their front sides outward.
-    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
-    corners = np.stack([a, b, c, a, c, d], axis=2).reshape(-1, 3, 3)
-    # Triangles without area are invisible and need not be sent.
-    corners = corners[np.linalg.norm(np.cross(
-        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0]
-    marker = _marker('beam', 0, Marker.TRIANGLE_LIST, stamp)
-    marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
-    marker.points = [_point(corner) for corner in corners.reshape(-1, 3)]
-    marker.color = _colour(user, 0.25)
-    return marker
+    match shape:
+        case Points():
+            found = _marker(namespace, number, Marker.SPHERE, stamp)
+            found.pose.position = _point(shape.positions[0])
+            found.scale = _vector(np.full(3, 2 * shape.radii_m[0]))
+            found.color = _colour(shape.colours[0], 1.0)
+        case Ellipsoids():
+            x, y, z, w = shape.quaternions[0].tolist()
+            found = _marker(namespace, number, Marker.SPHERE, stamp)
+            found.pose = Pose(position=_point(shape.centres[0]),
+                              orientation=Quaternion(x=x, y=y, z=z, w=w))
+            found.scale = _vector(2 * shape.half_sizes_m[0])
+            found.color = _colour(shape.colours[0], _ELLIPSOID)
+        case Boxes():
+            # All cuboids have the size of the first.
+            found = _marker(namespace, number, Marker.CUBE_LIST, stamp)
+            found.scale = _vector(2 * shape.half_sizes_m[0])
+            found.points = [_point(centre) for centre in shape.centres]
+            found.colors = [_colour(colour, 1.0 if shape.solid else _OUTLINE)
+                            for colour in shape.colours]
+        case Mesh():
+            found = _marker(namespace, number, Marker.TRIANGLE_LIST, stamp)
+            found.scale = Vector3(x=1.0, y=1.0, z=1.0)
+            found.points = [_point(corner) for corner in _triangles(shape.points)]
+            found.color = _colour(shape.colour, _MESH)
+    return found
 
 
 def deletion(namespace: str, number: int, stamp: Time) -> Marker:
     """Return a marker that deletes the marker with a namespace and an id."""
-    marker = _marker(namespace, number, Marker.SPHERE, stamp)
-    marker.action = Marker.DELETE
-    return marker
+    found = _marker(namespace, number, Marker.SPHERE, stamp)
+    found.action = Marker.DELETE
+    return found
 
 
-def place(marker: Marker, frame: Frame) -> Marker:
+def place(found: Marker, frame: Frame) -> Marker:
     """Return a marker in the frame of standard messages; its points are relative to its pose."""
-    marker.header.frame_id = frame.name
-    marker.pose = frame.pose(marker.pose)
-    return marker
+    found.header.frame_id = frame.name
+    found.pose = frame.pose(found.pose)
+    return found
 
 
 def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
@@ -116,24 +77,34 @@ def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
         for position in positions])
 
 
+def _triangles(points: np.ndarray) -> np.ndarray:
+    """Return the corners of the triangles of a mesh, float64 [N, 3], front sides outward."""
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    corners = np.stack([a, b, c, a, c, d], axis=2).reshape(-1, 3, 3)
+    # Triangles without area are invisible and need not be sent.
+    areas = np.linalg.norm(np.cross(
+        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return corners[areas > 0].reshape(-1, 3)
+
+
 def _marker(namespace: str, number: int, kind: int, stamp: Time) -> Marker:
-    marker = Marker(header=Header(stamp=stamp, frame_id=RHS_FRAME), ns=namespace, type=kind,
-                    # Marker ids are signed, user numbers are unsigned.
-                    id=number & 0x7fffffff, action=Marker.ADD)
-    marker.pose.orientation.w = 1.0
-    return marker
+    found = Marker(header=Header(stamp=stamp, frame_id=RHS_FRAME), ns=namespace, type=kind,
+                   # Marker ids are signed, user numbers are unsigned.
+                   id=number & 0x7fffffff, action=Marker.ADD)
+    found.pose.orientation.w = 1.0
+    return found
 
 
-def _colour(user: int, opacity: float) -> ColorRGBA:
-    red, green, blue = user_colour(user)
+def _colour(values: Iterable[float], opacity: float) -> ColorRGBA:
+    red, green, blue = (float(value) for value in values)
     return ColorRGBA(r=red, g=green, b=blue, a=opacity)
 
 
 def _point(values: np.ndarray) -> Point:
-    x, y, z = np.asarray(values).tolist()
+    x, y, z = values.tolist()
     return Point(x=x, y=y, z=z)
 
 
 def _vector(values: np.ndarray) -> Vector3:
-    x, y, z = np.asarray(values).tolist()
+    x, y, z = values.tolist()
     return Vector3(x=x, y=y, z=z)

@@ -40,7 +40,8 @@ from rhs_isac_ros.support.arguments import (
     picture_file,
     positive_int,
 )
-from rhs_isac_ros.tools.pictures import draw_cycles, prepare_drawing
+from rhs_isac_ros.support.pictures import write_picture
+from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 from rhs_isac_ros.tools.process_network import (
     add_network_options,
     load_files,
@@ -271,7 +272,7 @@ def _report(
     if complete:
         print(table(complete))
         print(summary(complete, given_up))
-        draw_cycles(complete, scenario, options.picture)
+        write_picture(options.picture, compose_cycles(complete, scenario))
         print(f'picture: {options.picture}')
     if options.record:
         print(f'recording: {options.record}')

@@ -17,6 +17,7 @@ from rhs_isac_ros.monitoring.shapes import (
     Entity,
     Entry,
     Lines,
+    Mesh,
     Number,
     Picture,
     Points,
@@ -39,6 +40,9 @@ _DOT_SIZE = 4.0
 _LINE_WIDTH = 2.0
 # Width of outlines in points of the screen.
 _OUTLINE_WIDTH = 1.2
+# A mesh is a grid of thin dim lines, of which only every second is drawn, so that entities behind
+# it remain visible.
+_MESH_WIDTH, _MESH_STEP, _MESH_DIM = 0.6, 2, 0.45
 _BACKGROUND = (16, 18, 22)
 
 
@@ -232,6 +236,13 @@ def _archetype(entity: Entity) -> Any:
             strips = rr.LineStrips2D if is_plane else rr.LineStrips3D
             return strips(entity.strips, colors=_colours(np.array([entity.colour])),
                           radii=_radius(entity.width))
+        case Mesh():
+            grid = [*entity.points[::_MESH_STEP],
+                    *np.swapaxes(entity.points, 0, 1)[::_MESH_STEP]]
+            # Most lines of a lobe have no extent.
+            return rr.LineStrips3D(
+                [line for line in grid if line.any()], radii=_radius(_MESH_WIDTH),
+                colors=_colours(_MESH_DIM * np.array([entity.colour])))
         case Picture():
             return rr.Image(entity.pixels, color_model='L')
         case Series(name, colour, dots):

@@ -22,8 +22,9 @@ from rhs_isac_ros.support.arguments import (
     nonnegative_float,
     picture_file,
 )
+from rhs_isac_ros.support import pictures
 from rhs_isac_ros.tools.command import run_command
-from rhs_isac_ros.tools.pictures import draw_scene
+from rhs_isac_ros.tools.pictures import compose_scene
 
 _PROGRAM = 'snapshot'
 # Within this time [s], every user publishes its true position; within twice this time, the
@@ -133,7 +134,7 @@ def write_picture(
     if missing:
         print(f'{_PROGRAM}: not in the picture: {"; ".join(missing)}', file=sys.stderr)
     try:
-        draw_scene(scene, scenario, options.output)
+        pictures.write_picture(options.output, compose_scene(scene, scenario))
     except OSError as error:
         print_error(f'{options.output}: cannot be written: {error.strerror}', _PROGRAM)
         return 1
