@@ -76,7 +76,7 @@ CALLS = [
     ('tools.topic', ['hz', 'beam', '--window', '0'], 'expected at least 1'),
     ('tools.topic', ['list', '--spin-time', 'nan'], 'expected a number of at least 0'),
     ('tools.param', ['get', 'bs'], 'required: parameter_name'),
-    ('tools.param', ['list', '--filter', '('], 'expected a regular expression'),
+    ('tools.param', ['list', '--timeout', 'x'], 'expected a number of at least 0'),
     ('tools.permissions', ['--users', '-1'], 'expected at least 0'),
     ('codebook.__main__', ['--output', '.'], '.: a directory, expected a file'),
     ('codebook.__main__', ['--plot', 'p.xyz'], 'ends in .png, .pdf, .svg'),

@@ -1,13 +1,14 @@
-"""What the commands share: their entry and exit codes, and the node of `topic` and `param`."""
+"""What the commands share: their entry, nodes that observe a network, recordings, and tables."""
 
 import argparse
+import itertools
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
@@ -18,13 +19,17 @@ from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from rhs_isac_ros.calibration import CalibrationError
-from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import discard_stdout, print_error
-from rhs_isac_ros.model import ScenarioError
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError
-from rhs_isac_ros.ros.command_line import check_domain, parse
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, diagnostics, topics
+from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
-from rhs_isac_ros.ros.recording import RecordingError
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
+from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.security import SecurityError, is_enabled, one_line, prepare
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct
@@ -35,11 +40,10 @@ _POLL_PERIOD_S = 0.02
 # Discovery is complete when the graph has not changed for this time [s]. It pauses while DDS
 # security exchanges keys.
 _SETTLE_S = 1.0 if is_enabled() else 0.4
-
-
 # Errors of arguments and files.
 INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
            plugins.PluginError, OSError)
+_NodeT = TypeVar('_NodeT', bound=Node)
 
 
 class ToolError(RuntimeError):
@@ -80,8 +84,7 @@ def run_command(
     check_distinct(parser, named(inputs), named(outputs))
     try:
         return work(options, [parser.prog, *arguments])
-    except KeyboardInterrupt:
-        # The handlers of signals are not installed yet while libraries are imported.
+    except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except BrokenPipeError:
         discard_stdout()
@@ -94,12 +97,122 @@ def run_command(
         return 2
 
 
-class Session:
-    """A context manager with one node, which the command itself spins."""
+def print_now(*values: object, end: str = '\n') -> None:
+    """Print and flush, so that a pipe receives the text at once."""
+    print(*values, end=end, flush=True)
 
-    def __init__(self) -> None:
+
+def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
+    """Return a table of cells.
+
+    Parameters
+    ----------
+    heads
+        Headings, which may have several lines.
+    align
+        ``<`` or ``>`` for each column.
+    """
+    lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return '\n'.join('  '.join(
+        f'{cell:{side}{width}}' for cell, side, width in zip(line, align, widths, strict=True)
+    ).rstrip() for line in lines)
+
+
+def none_within(what: str, timeout_s: float) -> ToolError:
+    """Return the error that a network did not provide something within a time [s]."""
+    return ToolError(f'{what} within {timeout_s:g} s, in the domain '
+                     f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
+
+
+def observe(
+        make: Callable[[], _NodeT], arguments: Sequence[str],
+        done: Callable[[_NodeT], bool] = lambda node: False) -> tuple[int, _NodeT | None]:
+    """Spin a node until a signal arrives or it is done.
+
+    Returns
+    -------
+    tuple
+        Exit code of `rhs_isac_ros.ros.run.run`, and the node; None if it could not be created.
+    """
+    nodes: list[_NodeT] = []
+
+    def create() -> list[_NodeT]:
+        nodes.append(make())
+        return nodes
+    code = run(create, arguments, lambda: done(nodes[0]))
+    return code, nodes[0] if nodes else None
+
+
+def choose_scenario(config: Path | None, recording: Path | None = None) -> Scenario:
+    """Return the scenario of a file, by default that of a recording, or the paper's Table I."""
+    if config:
+        return Scenario.from_yaml(config)
+    return (read_scenario(recording) if recording else None) or Scenario()
+
+
+def topic_prefix(namespace: str) -> str:
+    """Return the prefix of the full names of the topics in a namespace."""
+    return f'/{namespace.strip("/")}/'.replace('//', '/')
+
+
+def recorded(
+        path: Path, namespace: str, scenario: Scenario, kinds: Collection[type]
+) -> Iterator[tuple[Any, float]]:
+    """Yield what a network published, from a recording, in the order in which it was written.
+
+    Parameters
+    ----------
+    kinds
+        Messages of the protocol; also `Codebook`, and `Report` for pairs of the name of a node and
+        its report.
+
+    Yields
+    ------
+    tuple
+        Message and time of recording [s].
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a recording, or a message is malformed or does not fit the scenario.
+    """
+    prefix = topic_prefix(namespace)
+    names: dict[type, str] = {**topics.NAMES, Codebook: topics.CODEBOOK}
+    by_topic = {f'{prefix}{names[kind]}': kind for kind in kinds if kind is not Report}
+    if Report in kinds:
+        # Before version 1.0, the topic was in the namespace.
+        reports = topics.DIAGNOSTICS, f'{prefix}{topics.DIAGNOSTICS.lstrip("/")}'
+        by_topic.update(dict.fromkeys(reports, Report))
+    for topic, found, time_s in read(path, by_topic):
+        kind = by_topic[topic]
+        try:
+            if kind is Report:
+                yield from ((pair, time_s) for pair in diagnostics.from_ros(found, namespace))
+            elif kind is Codebook:
+                codebook = convert.codebook_from_ros(found)
+                codebook.check(scenario)
+                yield codebook, time_s
+            else:
+                message = convert.from_ros(kind, found)
+                m.check(message, scenario.sizes)
+                yield message, time_s
+        except (m.MessageError, CodebookError) as error:
+            raise RecordingError(f'{path}: {topic}: {error}') from None
+
+
+class Session:
+    """A context manager with one node, which the command itself spins.
+
+    Parameters
+    ----------
+    arguments
+        Name of the program and command line with the ROS arguments.
+    """
+
+    def __init__(self, arguments: Sequence[str] = ('',)) -> None:
         use_discovery_profile()
-        rclpy.init(args=prepare(['']))
+        rclpy.init(args=prepare(arguments))
         with one_line():
             self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **WITHOUT_SERVICES)
         self._executor = SingleThreadedExecutor()
@@ -118,15 +231,7 @@ class Session:
         try_shutdown()
 
     def spin_until(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Spin until a condition holds; return whether it does.
-
-        Parameters
-        ----------
-        condition
-            Evaluated after every callback and poll.
-        timeout_s
-            Maximum duration [s]; None: unlimited.
-        """
+        """Spin until a condition holds, or for a time [s] if given; return whether it holds."""
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not condition():
             if end_s is not None and time.monotonic() >= end_s:
@@ -142,28 +247,23 @@ class Session:
         timeout_s
             Maximum duration [s].
         """
-        end_s = time.monotonic() + timeout_s
         graph, changed_s = self._graph(), time.monotonic()
-        while (now_s := time.monotonic()) < end_s:
-            self._executor.spin_once(timeout_sec=_POLL_PERIOD_S)
+
+        def settled() -> bool:
+            nonlocal graph, changed_s
             previous, graph = graph, self._graph()
             if graph != previous:
-                changed_s = now_s
-            if len(self.node.get_node_names()) > 1 and now_s - changed_s > _SETTLE_S:
-                return
+                changed_s = time.monotonic()
+            return (len(self.node.get_node_names()) > 1
+                    and time.monotonic() - changed_s > _SETTLE_S)
+        self.spin_until(settled, timeout_s)
 
     def _graph(self) -> list[Any]:
         return sorted([*self.node.get_topic_names_and_types(),
                        *self.node.get_node_names_and_namespaces()], key=repr)
 
     def full_name(self, topic: str) -> str:
-        """Return the full name of a topic whose name may be relative.
-
-        Raises
-        ------
-        ToolError
-            If it is not a valid name of a topic.
-        """
+        """Return the full name of a topic whose name may be relative, or raise `ToolError`."""
         try:
             name = expand_topic_name(topic, self.node.get_name(), self.node.get_namespace())
             validate_full_topic_name(name)
@@ -173,37 +273,15 @@ class Session:
         return name
 
 
-def print_now(*values: object, end: str = '\n') -> None:
-    """Print and flush, so that a pipe receives the text at once."""
-    print(*values, end=end, flush=True)
+def run_verb(options: argparse.Namespace, arguments: list[str]) -> int:
+    """Call ``options.verb`` with a session and the options, and return the exit code.
 
-
-def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
-    """Run the command of a command line.
-
-    Parameters
-    ----------
-    parser
-        Its subparsers set ``verb``, a callable that takes session and options.
-    arguments
-        Command line; by default that of the process.
-
-    Returns
-    -------
-    int
-        Exit code: 0, including after a signal or when the reader closes the output; 1 after an
-        error.
+    Errors have no name of a program in front, as those of ``ros2``.
     """
-    check_domain(parser)
-    options = parser.parse_args(arguments)
     try:
-        with Session() as session, one_line():
+        with Session(arguments) as session, one_line():
             options.verb(session, options)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
     except (ToolError, SecurityError) as error:
         print(error, file=sys.stderr)
         return 1
-    except BrokenPipeError:
-        discard_stdout()
     return 0

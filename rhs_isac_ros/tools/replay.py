@@ -1,7 +1,6 @@
 """``scripts/replay FILE``: feeds the received signals of a recording to estimators.
 
-With ``--publish``, they are published again to running nodes; see
-`rhs_isac_ros.tools.replay`.
+With ``--publish``, it publishes them to running nodes instead.
 """
 
 import argparse
@@ -20,7 +19,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
-import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.executables import exit_code_of
@@ -41,11 +39,19 @@ from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
-from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
+from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
-from rhs_isac_ros.tools.command import ToolError, run_command
+from rhs_isac_ros.tools.command import (
+    ToolError,
+    choose_scenario,
+    print_now,
+    recorded,
+    run_command,
+    text_table,
+    topic_prefix,
+)
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
@@ -56,6 +62,14 @@ _DISCOVERY_TIMEOUT_S = 2.0
 # complete [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
 _ACK_TIMEOUT = Duration(seconds=5)
+
+
+# Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
+# and announcements of nodes would contradict those of the running nodes.
+_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
+# Defaults of the options for running nodes.
+_RATE = 1.0
+_TIMEOUT_S = 60.0
 
 
 class RepublisherNode(Node):
@@ -165,32 +179,11 @@ class RepublisherNode(Node):
                 if self.count_publishers(publisher.topic_name) > 1]
 
 
-def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
-    """Publish a recording to running nodes.
-
-    Parameters
-    ----------
-    options
-        ``file``, ``namespace``, ``topic``, ``rate``, ``codebook``, ``config``, ``timeout``.
-    arguments
-        Name of the program and command line with the ROS arguments.
-
-    Returns
-    -------
-    int
-        Exit code: 0, including after a signal; 2 if a ROS argument is invalid.
-
-    Raises
-    ------
-    ToolError
-        If a topic has no subscribers, or another node publishes it as well.
-    RecordingError, ScenarioError, CodebookError
-        If a file is invalid.
-    """
+def _publish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Publish a recording to running nodes; return the exit code of `run`."""
     names = options.topic or [_SIGNALS]
-    scenario = (Scenario.from_yaml(options.config) if options.config
-                else read_scenario(options.file) or Scenario())
-    first_codebook = _first_codebook(options, names)
+    scenario = choose_scenario(options.config, options.file)
+    first_codebook = _first_codebook(options) if _SIGNALS in names else None
     if first_codebook:
         first_codebook.check(scenario)
     nodes: list[RepublisherNode] = []
@@ -212,11 +205,6 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     return code
 
 
-def topic_prefix(namespace: str) -> str:
-    """Return the prefix of the full names of the topics in a namespace."""
-    return f'/{namespace.strip("/")}/'.replace('//', '/')
-
-
 def _messages(
         options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, Any, float]]:
     """Yield messages of a recording with the relative names of their topics."""
@@ -225,31 +213,29 @@ def _messages(
         yield full_names[topic], message, time_s
 
 
-def _first_codebook(options: argparse.Namespace, names: Collection[str]) -> Codebook | None:
-    """Return the codebook of the first signals; None if no signals are to be published."""
-    used: list[str] = []
+def _first_codebook(options: argparse.Namespace) -> Codebook:
+    """Return the codebook with which the first signals were received."""
+    used = ''
     codebooks: dict[str, Any] = {}
     for name, message, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):
         if name == topics.CODEBOOK:
             codebooks.setdefault(message.codebook_id, message)
         else:
-            used.append(message.codebook_id)
-    if _SIGNALS not in names:
-        return None
+            used = used or message.codebook_id
     if not used:
         raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
                              f'{options.namespace}')
     if options.codebook:
         codebook = Codebook.load(options.codebook)
-        if codebook.id != used[0]:
+        if codebook.id != used:
             raise RecordingError(
                 f'{options.codebook}: codebook {codebook.id}, but the signals were received with '
-                f'{used[0]}: running nodes would drop them')
+                f'{used}: running nodes would drop them')
         return codebook
-    if used[0] not in codebooks:
-        raise RecordingError(f'codebook {used[0]}: not in the recording, expected its file: '
+    if used not in codebooks:
+        raise RecordingError(f'codebook {used}: not in the recording, expected its file: '
                              '--codebook FILE')
-    return convert.codebook_from_ros(codebooks[used[0]])
+    return convert.codebook_from_ros(codebooks[used])
 
 
 def _check(node: RepublisherNode, end_s: float, timeout_s: float) -> None:
@@ -286,15 +272,6 @@ def _full_name(endpoint: Any) -> str:
     return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
 
 
-# Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
-# and announcements of nodes would contradict those of the running nodes.
-_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
-
-# Defaults of the options for running nodes.
-_RATE = 1.0
-_TIMEOUT_S = 60.0
-
-
 @dataclasses.dataclass(frozen=True)
 class Recording:
     """Complete cycles of one network, with its scenario and its codebooks by id."""
@@ -304,45 +281,38 @@ class Recording:
     codebooks: dict[str, Codebook]
 
 
-def load(path: str | Path, namespace: str = '/', scenario: Scenario | None = None) -> Recording:
-    """Load the cycles of a recording.
+def load(path: Path, namespace: str = '/', config: Path | None = None) -> Recording:
+    """Load the complete cycles of a network from a recording.
 
     Parameters
     ----------
-    namespace
-        Namespace of the network.
-    scenario
-        Scenario to use instead of the recorded one.
+    config
+        File of the scenario to use instead of the recorded one.
 
     Raises
     ------
     RecordingError
         If the file is not a recording, has no complete cycle in the namespace, or contains a
-        malformed message.
-    ScenarioError, CodebookError
-        If the scenario or a recorded codebook is invalid.
+        message that is malformed or does not fit the scenario.
+    ScenarioError
+        If the scenario is invalid.
     """
-    scenario = scenario or read_scenario(path) or Scenario()
-    prefix = topic_prefix(namespace)
-    kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
+    scenario = choose_scenario(config, path)
     log = CycleLog()
     codebooks: dict[str, Codebook] = {}
-    for topic, ros_message, time_s in read(path):
-        try:
-            if topic in kinds:
-                message = convert.from_ros(kinds[topic], ros_message)
-                m.check(message, scenario.sizes)
-                log.add(message, time_s)
-            elif topic == f'{prefix}{topics.CODEBOOK}' and isinstance(ros_message, ros.Codebook):
-                codebooks[ros_message.codebook_id] = convert.codebook_from_ros(ros_message)
-        except m.MessageError as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
+    for found, time_s in recorded(path, namespace, scenario, [*RECEIVES, Codebook]):
+        if isinstance(found, Codebook):
+            codebooks[found.id] = found
+        else:
+            log.add(found, time_s)
     if not log.complete:
         raise RecordingError(f'{path}: no complete cycle in the namespace {namespace}')
     return Recording(scenario, log.complete, codebooks)
 
 
-def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator]) -> np.ndarray:
+def errors_m(
+        cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
+        track_speed_mps: float | None = None) -> np.ndarray:
     """Estimate the position of every cycle again, and return the errors.
 
     Parameters
@@ -351,37 +321,23 @@ def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator
         Complete cycles, with their received signals and true positions.
     estimators
         Estimators by the id of the codebook with which the signals were received.
+    track_speed_mps
+        Typical speed of the users [m/s], to track them over the cycles; None: no tracks.
 
     Returns
     -------
     numpy.ndarray
         Distances from the true positions, float64 [len(cycles)] [m]; NaN without a fix.
     """
-    errors = []
-    for cycle in cycles:
-        signals = cycle.signals.signals
-        estimate = estimators[cycle.signals.codebook_id].estimate(
-            signals.reshape(len(signals), -1))
-        errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
-                      if estimate.fix else np.nan)
-    return np.array(errors)
-
-
-def tracked_errors_m(
-        cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
-        speed_mps: float = Motion.speed_mps) -> np.ndarray:
-    """Track the users over the cycles, and return the errors; see `errors_m`.
-
-    Parameters
-    ----------
-    speed_mps
-        Typical speed of the users [m/s].
-    """
     tracks, errors = Tracks(), []
     for cycle in cycles:
-        estimate = tracks.locate(
-            cycle.signals, estimators[cycle.signals.codebook_id], speed_mps,
-            cycle.phase_s.get(m.Phase.ESTIMATING, cycle.ended_s))
+        signals, estimator = cycle.signals.signals, estimators[cycle.signals.codebook_id]
+        if track_speed_mps is None:
+            estimate = estimator.estimate(signals.reshape(len(signals), -1))
+        else:
+            estimate = tracks.locate(
+                cycle.signals, estimator, track_speed_mps,
+                cycle.phase_s.get(m.Phase.ESTIMATING, cycle.ended_s))
         errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
                       if estimate.fix else np.nan)
     return np.array(errors)
@@ -414,34 +370,34 @@ def _conflict(options: argparse.Namespace) -> str:
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     """Publish a recording, or print a table of its errors and of those of estimators."""
     if options.publish:
-        return republish(options, arguments)
-    scenario = Scenario.from_yaml(options.config) if options.config else None
-    recording = load(options.file, options.namespace, scenario)
+        return _publish(options, arguments)
+    recording = load(options.file, options.namespace, options.config)
     codebooks = _codebooks(recording, options.codebook)
-    live = np.array([cycle.error_m for cycle in recording.cycles])
     names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
-    print(f'{len(live)} cycles\n{"":12s} median error  root mean square  no fix')
-    print(_row(f'live {", ".join(names)}', live))
+    live = np.array([cycle.error_m for cycle in recording.cycles])
+    print_now(f'{len(live)} cycles')
+    rows = [_row(f'live {", ".join(names)}', live)]
     known = {}
     if options.calibration:
         known['surface'] = load_surface(str(options.calibration), recording.scenario)
-    for name in options.estimator or ['bayes']:
+    for name in options.estimator or [BayesEstimator.name]:
         estimators = {codebook_id: make_estimator(
             name, recording.scenario, codebook,
             **file_options(name, default_folder(), options.model or ''), **known)
             for codebook_id, codebook in codebooks.items()}
-        print(_row(name, errors_m(recording.cycles, estimators)))
+        rows.append(_row(name, errors_m(recording.cycles, estimators)))
         if options.track and name == BayesEstimator.name:
-            print(_row('track', tracked_errors_m(
+            rows.append(_row('track', errors_m(
                 recording.cycles, estimators, options.track_speed)))
+    print(text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
     return 0
 
 
-def _row(name: str, errors: np.ndarray) -> str:
+def _row(name: str, errors: np.ndarray) -> list[str]:
     fixes = errors[~np.isnan(errors)]
     median, rms = ((np.median(fixes), np.sqrt(np.mean(fixes**2))) if len(fixes)
                    else (np.nan, np.nan))
-    return f'{name:12s} {median:10.6f} m {rms:15.6f} m {len(errors) - len(fixes):7d}'
+    return [name, f'{median:.6f} m', f'{rms:.6f} m', str(len(errors) - len(fixes))]
 
 
 def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:

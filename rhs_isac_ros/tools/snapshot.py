@@ -1,29 +1,34 @@
 """``scripts/snapshot``: draws a picture of a running network."""
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 from rclpy.node import Node
 
-from rhs_isac_ros.executables import exit_code_of, print_error
+from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station_memory import join_users
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import subscribe_messages
-from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
     nonnegative_float,
     picture_file,
 )
-from rhs_isac_ros.support import pictures
-from rhs_isac_ros.tools.command import run_command
+from rhs_isac_ros.support.pictures import write_picture
+from rhs_isac_ros.tools.command import (
+    ToolError,
+    choose_scenario,
+    none_within,
+    observe,
+    run_command,
+)
 from rhs_isac_ros.tools.pictures import compose_scene
 
 _PROGRAM = 'snapshot'
@@ -89,57 +94,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
-    scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
-    nodes: list[SnapshotNode] = []
+    scenario = choose_scenario(options.config)
     end_s = time.monotonic() + options.timeout
 
-    def create() -> list[SnapshotNode]:
-        nodes.append(SnapshotNode(scenario))
-        return nodes
-
-    def done() -> bool:
-        return (nodes[0].is_ready(options.wait) or nodes[0].has_other_scenario
+    def done(node: SnapshotNode) -> bool:
+        return (node.is_ready(options.wait) or node.has_other_scenario
                 or time.monotonic() > end_s)
-    code = run(create, arguments, done)
-    if not nodes or not done():
-        return code
-    return write_picture(nodes[0].scene, nodes[0].mismatch, scenario, options)
+    code, node = observe(lambda: SnapshotNode(scenario), arguments, done)
+    if node and done(node):
+        if node.mismatch and node.scene.configuration is None:
+            raise ToolError(f'{node.mismatch}; if the network uses another scenario, pass it with '
+                            '--config FILE')
+        if not node.scene.users:
+            raise none_within('no user found', options.timeout)
+        draw(node.scene, scenario, options.output)
+    return code
 
 
-def write_picture(
-        scene: SceneState, mismatch: str, scenario: Scenario, options: argparse.Namespace) -> int:
-    """Draw a scene and print what it lacks, or print why there is nothing to draw.
-
-    Parameters
-    ----------
-    mismatch
-        Error of a message that does not match the scenario, or empty.
-    options
-        ``output``, ``timeout``.
-
-    Returns
-    -------
-    int
-        Exit code: 0 or 1, as for `main`.
-    """
-    if mismatch and scene.configuration is None:
-        print_error(f'{mismatch}; if the network uses another scenario, pass it with '
-                    '--config FILE', _PROGRAM)
-        return 1
-    if not scene.users:
-        print_error(f'no user found within {options.timeout:g} s, in the domain '
-                    f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace', _PROGRAM)
-        return 1
+def draw(scene: SceneState, scenario: Scenario, path: Path) -> None:
+    """Draw a scene and print what it lacks, or raise ToolError if the file cannot be written."""
     missing = _missing(scene)
     if missing:
         print(f'{_PROGRAM}: not in the picture: {"; ".join(missing)}', file=sys.stderr)
     try:
-        pictures.write_picture(options.output, compose_scene(scene, scenario))
+        write_picture(path, compose_scene(scene, scenario))
     except OSError as error:
-        print_error(f'{options.output}: cannot be written: {error.strerror}', _PROGRAM)
-        return 1
-    print(options.output)
-    return 0
+        raise ToolError(f'{path}: cannot be written: {error.strerror}') from None
+    print(path)
 
 
 def _missing(scene: SceneState) -> list[str]:
@@ -160,16 +141,16 @@ def _parser() -> argparse.ArgumentParser:
         prog=_PROGRAM, description='Draw the scene of a network when every user has an '
         'estimate, or some seconds after the first one. ROS arguments select the namespace: '
         '--ros-args -r __ns:=/lab')
-    parser.add_argument('--output', type=picture_file, default='scene.png', metavar='FILE',
-                        help='picture to write: PNG, PDF or SVG (default: scene.png)')
-    parser.add_argument('--wait', type=nonnegative_float, default=5.0, metavar='S',
-                        help='wait for the estimates of further users after the first one '
-                        '(default: 5 s)')
-    parser.add_argument('--timeout', type=nonnegative_float, default=30.0, metavar='S',
-                        help='maximum wait in all; the scene is then drawn as far as it is known '
-                        '(default: 30 s)')
-    parser.add_argument('--config', type=input_file, metavar='FILE',
-                        help="scenario file of the network; by default the paper's Table I")
+    add = parser.add_argument
+    add('--output', type=picture_file, default='scene.png', metavar='FILE',
+        help='picture to write: PNG, PDF or SVG (default: scene.png)')
+    add('--wait', type=nonnegative_float, default=5.0, metavar='S',
+        help='wait for the estimates of further users after the first one (default: 5 s)')
+    add('--timeout', type=nonnegative_float, default=30.0, metavar='S',
+        help='maximum wait in all; the scene is then drawn as far as it is known '
+        '(default: 30 s)')
+    add('--config', type=input_file, metavar='FILE',
+        help="scenario file of the network; by default the paper's Table I")
     return parser
 
 

@@ -1,6 +1,7 @@
 """``scripts/view``: shows a running network or a recording in the browser."""
 
 import argparse
+import contextlib
 import functools
 import itertools
 import math
@@ -24,10 +25,10 @@ from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.monitoring.shapes import Entry
 from rhs_isac_ros.positioning import (
     BayesEstimator,
-    Estimate,
     Motion,
     SignalError,
     TrackEstimate,
@@ -38,13 +39,12 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.protocol.role import NewestDict
-from rhs_isac_ros.ros import convert, diagnostics, qos, topics
+from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import steady_timer, subscribe, subscribe_messages
-from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
-from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
@@ -53,14 +53,30 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.tools.command import ToolError, print_now, run_command
-from rhs_isac_ros.tools.replay import topic_prefix
+from rhs_isac_ros.tools.command import (
+    ToolError,
+    choose_scenario,
+    observe,
+    print_now,
+    recorded,
+    run_command,
+)
 from rhs_isac_ros.tools.rerun_stream import RerunStream
 
 # Number of codebooks, each with tables of some megabytes; more are unusual even in a recording.
 _MAX_CODEBOOKS = 32
 # With Table I, the bound on the root mean squared error then has a standard error of 2.4 %.
 _N_PHASES = 256
+# If no cycle is observed for this time, the reason is logged.
+_SILENCE_S = 5.0
+# Maximum number of users whose tracks are followed, because their numbers come from messages.
+_MAX_TRACKS = 64
+# Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
+_BEAM_PERIOD_S = 0.2
+_PROGRAM = 'view'
+_PORT = 9090
+_POLL_S = 0.2
+_SWITCH_INTERVAL_S = 5e-4
 
 
 class Posteriors:
@@ -74,11 +90,8 @@ class Posteriors:
         What is known of the surface, as in `make_estimator`.
     """
 
-    def __init__(
-            self, scenario: Scenario, surface: Surface | None = None,
-            table_folder: Path | None = None) -> None:
+    def __init__(self, scenario: Scenario, surface: Surface | None = None) -> None:
         self._scenario, self._surface = scenario, surface
-        self._table_folder = table_folder or default_folder()
         self._estimators: NewestDict[str, BayesEstimator] = NewestDict(_MAX_CODEBOOKS)
         self._tracks = Tracks()
 
@@ -88,66 +101,44 @@ class Posteriors:
         return self._estimators
 
     def add(self, codebook: Codebook) -> None:
-        """Prepare for signals received with a codebook.
-
-        Raises
-        ------
-        CodebookError
-            If the codebook does not fit the scenario.
-        """
+        """Prepare for signals received with a codebook, or raise CodebookError."""
         codebook.check(self._scenario)
         self._estimators.put(codebook.id, BayesEstimator(
-            self._scenario, codebook, self._table_folder, surface=self._surface))
+            self._scenario, codebook, default_folder(), surface=self._surface))
 
     def bound_m2(self, codebook: Codebook) -> float:
-        """Compute the global bound on the mean squared error with a codebook [m^2].
-
-        This takes some seconds.
-        """
+        """Compute the global bound on the mean squared error [m^2], which takes some seconds."""
         return global_bound(
             self._scenario, codebook, np.random.default_rng(0), _N_PHASES).value
 
     def modes(self, received: m.ReceivedSignals) -> WeightedModes | None:
         """Return the modes of the posterior; None without a position or a known codebook."""
         estimator = self._estimators.get(received.codebook_id)
-        if estimator is None:
-            return None
-        try:
-            return weighted_modes(estimator, received.signals)
-        except SignalError:
-            return None
+        with contextlib.suppress(SignalError):
+            return weighted_modes(estimator, received.signals) if estimator else None
+        return None
 
     def track(
-            self, received: m.ReceivedSignals, now_s: float, speed_mps: float) -> Estimate | None:
-        """Continue the track of a user.
+            self, received: m.ReceivedSignals, now_s: float, speed_mps: float
+    ) -> TrackPoint | None:
+        """Continue the track of a user whose signals arrived at `now_s` [s].
+
+        Return None before the second position, or without a known codebook.
 
         Parameters
         ----------
-        now_s
-            Time at which the signals arrived [s].
         speed_mps
             Typical speed of the users [m/s].
-
-        Returns
-        -------
-        Estimate or None
-            A `TrackEstimate` from the second position on; None without a known codebook.
         """
         estimator = self._estimators.get(received.codebook_id)
         if estimator is None:
             return None
-        try:
-            return self._tracks.locate(received, estimator, speed_mps, now_s)
-        except SignalError:
-            return None
-
-
-# If no cycle is observed for this time, the reason is logged.
-_SILENCE_S = 5.0
-# Maximum number of users whose tracks are followed, because their numbers come from messages.
-_MAX_TRACKS = 64
-# Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
-_BEAM_PERIOD_S = 0.2
+        with contextlib.suppress(SignalError):
+            estimate = self._tracks.locate(received, estimator, speed_mps, now_s)
+            if isinstance(estimate, TrackEstimate) and estimate.fix:
+                return TrackPoint(
+                    received.user, estimate.mean, estimate.covariance, estimate.velocity)
+        return None
 
 
 class ViewNode(Node):
@@ -308,8 +299,6 @@ def entries(
 
     Parameters
     ----------
-    namespace
-        Namespace of the network.
     posteriors
         Receives the recorded codebooks.
     track_speed_mps
@@ -323,63 +312,29 @@ def entries(
         If the file is not a recording, has no messages in the namespace, or contains a message
         that is malformed or does not fit the scenario.
     """
-    prefix = topic_prefix(namespace)
     view = NetworkView(scenario)
-    for topic, found, _ in read(path, [f'{prefix}{topics.CODEBOOK}']):
-        try:
-            codebook = convert.codebook_from_ros(found)
-            if codebook.id in posteriors.codebooks:
-                continue
+    for codebook, _ in recorded(path, namespace, scenario, [Codebook]):
+        if codebook.id not in posteriors.codebooks:
             posteriors.add(codebook)
-        except (m.MessageError, CodebookError) as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
-        view.set_bound(codebook.id, posteriors.bound_m2(codebook))
+            view.set_bound(codebook.id, posteriors.bound_m2(codebook))
     yield from view.begin()
-    kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
-    # Before version 1.0, the topic was in the namespace.
-    reports = {topics.DIAGNOSTICS, f'{prefix}{topics.DIAGNOSTICS.lstrip("/")}'}
-    for topic, found, time_s in read(path, [*kinds, *reports]):
-        if topic in reports:
-            for node, report in diagnostics.from_ros(found, namespace):
-                yield from view.add_report(node, report)
+    for found, time_s in recorded(path, namespace, scenario, [*RECEIVES, Report]):
+        if isinstance(found, tuple):
+            yield from view.add_report(*found)
             continue
-        try:
-            message = convert.from_ros(kinds[topic], found)
-            _check_scenario(message, scenario)
-            m.check(message, scenario.sizes)
-        except m.MessageError as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
-        yield from view.add(message, time_s)
-        if isinstance(message, m.ReceivedSignals):
-            yield from view.add_modes(message, posteriors.modes(message))
-            if track_speed_mps is not None:
-                yield from _track(view, message, posteriors.track(
-                    message, time_s, track_speed_mps))
+        if found.scenario_id not in ('', scenario.id):
+            raise RecordingError(
+                f'{path}: recorded with scenario {found.scenario_id}, expected {scenario.id}')
+        yield from view.add(found, time_s)
+        if isinstance(found, m.ReceivedSignals):
+            yield from view.add_modes(found, posteriors.modes(found))
+            if track_speed_mps is not None and (
+                    point := posteriors.track(found, time_s, track_speed_mps)):
+                yield from view.add_track(found.cycle_id, point)
         if max_cycles and view.n_ended >= max_cycles:
             break
     if not view.n_cycles:
         raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
-
-
-def _check_scenario(message: m.Message, scenario: Scenario) -> None:
-    if message.scenario_id not in ('', scenario.id):
-        raise m.MessageError(
-            f'recorded with scenario {message.scenario_id}, expected {scenario.id}')
-
-
-def _track(
-        view: NetworkView, received: m.ReceivedSignals,
-        estimate: Estimate | None) -> list[Entry]:
-    if not isinstance(estimate, TrackEstimate) or not estimate.fix:
-        return []
-    return view.add_track(received.cycle_id, TrackPoint(
-        received.user, estimate.mean, estimate.covariance, estimate.velocity))
-
-
-_PROGRAM = 'view'
-_PORT = 9090
-_POLL_S = 0.2
-_SWITCH_INTERVAL_S = 5e-4
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -401,7 +356,7 @@ def _conflict(options: argparse.Namespace) -> str:
 def _view(options: argparse.Namespace, arguments: list[str]) -> int:
     stream = RerunStream()
     try:
-        scenario = _scenario(options)
+        scenario = choose_scenario(options.config, options.file)
         surface = (load_surface(str(options.calibration), scenario) if options.calibration
                    else None)
         posteriors = Posteriors(scenario, surface)
@@ -412,12 +367,6 @@ def _view(options: argparse.Namespace, arguments: list[str]) -> int:
     finally:
         # After `close`, there is nothing left to discard.
         stream.discard()
-
-
-def _scenario(options: argparse.Namespace) -> Scenario:
-    if options.config:
-        return Scenario.from_yaml(options.config)
-    return (options.file and read_scenario(options.file)) or Scenario()
 
 
 def _open(stream: RerunStream, options: argparse.Namespace) -> None:
@@ -440,17 +389,11 @@ def _show_live(
         options: argparse.Namespace, arguments: Sequence[str]) -> int:
     # With many messages, the background threads would otherwise wait 5 ms for each step.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    nodes: list[ViewNode] = []
-
-    def create() -> list[ViewNode]:
-        nodes.append(ViewNode(scenario, posteriors, stream.write))
-        return nodes
-
-    def done() -> bool:
-        return bool(options.cycles) and nodes[0].view.n_ended >= options.cycles
-    code = run(create, arguments, done)
-    if options.save and nodes and not nodes[0].view.n_cycles:
-        raise ToolError(f'{options.save} is not written: {nodes[0].silence}')
+    code, node = observe(
+        lambda: ViewNode(scenario, posteriors, stream.write), arguments,
+        lambda node: bool(options.cycles) and node.view.n_ended >= options.cycles)
+    if options.save and node and not node.view.n_cycles:
+        raise ToolError(f'{options.save} is not written: {node.silence}')
     if not code:
         _finish(stream, options)
     return code

@@ -118,6 +118,6 @@ def test_a_tool_that_is_refused_a_topic_or_a_service_ends_with_one_line(
         return condition()
     session = SimpleNamespace(node=node, full_name='/{}'.format, spin_until=spin_until)
     monkeypatch.setattr(
-        'rhs_isac_ros.tools.command.Session', lambda: contextlib.nullcontext(session))
+        'rhs_isac_ros.tools.command.Session', lambda arguments: contextlib.nullcontext(session))
     assert main(arguments) == 1
     assert capsys.readouterr().err == 'DDS security: Failed to create: not allowed\n'

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.calibrate import PilotLog
@@ -18,8 +17,8 @@ def codebook(random_beams):
 
 @pytest.fixture
 def log(codebook):
-    log = PilotLog(SCENARIO)
-    log.add_codebook(codebook)
+    log = PilotLog()
+    log.add(codebook)
     return log
 
 
@@ -58,8 +57,8 @@ def test_repeated_signals_count_once(log, codebook):
 
 
 def test_signals_of_one_user_may_be_selected(codebook):
-    log = PilotLog(SCENARIO, user=2)
-    log.add_codebook(codebook)
+    log = PilotLog(user=2)
+    log.add(codebook)
     for user in (1, 2):
         log.add(truth(user, user))
         log.add(signals(user, codebook.id, user))
@@ -71,10 +70,5 @@ def test_signals_of_an_unknown_codebook_wait_for_it(log, random_beams, codebook)
     for message in (truth(1), signals(1, other.id), truth(2), signals(2, codebook.id)):
         log.add(message)
     assert (log.missing_codebooks, log.n_pilots) == ([other.id], 1)
-    log.add_codebook(codebook, other.id)
+    log.codebooks[other.id] = codebook
     assert (log.missing_codebooks, log.n_pilots, len(log.pilots())) == ([], 2, 2)
-
-
-def test_a_codebook_of_another_scenario_is_refused(log, shipped):
-    with pytest.raises(CodebookError, match='analog: shape'):
-        log.add_codebook(shipped)

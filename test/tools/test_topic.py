@@ -1,17 +1,24 @@
 """``scripts/topic`` on a network in another process."""
 
+import array
 import os
 import re
 import signal
 import subprocess
 from pathlib import Path
 
+import numpy as np
+import pytest
 import yaml
+from geometry_msgs.msg import Point32, PolygonStamped
+from std_msgs.msg import Header, MultiArrayDimension, MultiArrayLayout
 
+import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.tools.topic import main
+from rhs_isac_ros.tools.topic import Rate, as_yaml, main
 
 SCRIPT = Path(__file__).parents[2] / 'scripts' / 'topic'
+ARRAY = ros.RealArray(shape=array.array('I', [2, 2]), data=array.array('d', [1.0, -2.5, 0.0, 4.0]))
 
 
 def test_list_prints_every_topic(output_of):
@@ -19,12 +26,7 @@ def test_list_prints_every_topic(output_of):
     assert {f'/{name}' for name in topics.NAMES.values()} <= names
     typed = output_of(main, 'list', '-t').splitlines()
     assert '/capacity [rhs_isac_msgs/msg/Capacity]' in typed
-    assert int(output_of(main, 'list', '-c')) == len(typed)
-    counted = output_of(main, 'list', '-v')
-    published, subscribed = counted.split('Subscribed topics:')
-    assert published.startswith('Published topics:\n * /ack [rhs_isac_msgs/msg/Ack] 2 publishers')
-    assert ' * /ack [rhs_isac_msgs/msg/Ack] 1 subscriber\n' in subscribed
-    assert '/capacity ' not in subscribed
+    assert not any('/_' in line for line in typed)
 
 
 def test_info_counts_publishers_and_subscriptions(output_of):
@@ -50,15 +52,14 @@ def test_echo_receives_latched_messages(output_of):
     assert "data: '<sequence type: double, length: 216>'" in text
 
 
-def test_echo_of_a_field_and_as_csv(output_of):
+def test_echo_of_a_field_and_with_a_given_type(output_of):
     point = yaml.safe_load(output_of(
         main, 'echo', '--once', '--field', 'position', 'ground_truth').removesuffix('---\n'))
     assert set(point) == {'x', 'y', 'z'}
     assert float(output_of(main, 'echo', '--once', '--field', 'position.x', 'ground_truth')
                  .removesuffix('---\n')) > 0
-    line = output_of(
-        main, 'echo', '--once', '--csv', 'ground_truth', 'rhs_isac_msgs/msg/GroundTruth')
-    assert len(line.strip().split(',')) == 13
+    given = output_of(main, 'echo', '--once', 'ground_truth', 'rhs_isac_msgs/msg/GroundTruth')
+    assert yaml.safe_load(given.removesuffix('---\n'))['user'] in (1, 2)
 
 
 def test_echo_and_info_name_the_error(call):
@@ -94,3 +95,85 @@ def test_hz_reports_until_it_is_interrupted(built_scripts, shared_session):
 
 def test_topic_exits_when_the_reader_closes_the_pipe(run_script):
     assert run_script('scripts/topic echo ground_truth | head -n 2') == 'header:\n  stamp:\n'
+
+
+def test_fields_keep_their_order_and_arrays_are_block_sequences():
+    assert as_yaml(ARRAY) == (
+        'shape:\n- 2\n- 2\ndata:\n- 1.0\n- -2.5\n- 0.0\n- 4.0\n')
+
+
+def test_nested_messages_and_empty_arrays():
+    message = ros.Codebook(header=Header(frame_id='map'), codebook_id='cb')
+    assert as_yaml(message) == (
+        "header:\n  stamp:\n    sec: 0\n    nanosec: 0\n  frame_id: map\nsender: 0\n"
+        "scenario_id: ''\ncodebook_id: cb\n"
+        "analog:\n  shape: []\n  data: []\ndigital:\n  shape: []\n  re: []\n  im: []\n"
+        "average_crlb_m2: 0.0\n")
+
+
+def test_long_arrays_and_strings_are_truncated():
+    assert yaml.safe_load(as_yaml(ARRAY, max_length=2)) == {
+        'shape': [2, 2], 'data': [1.0, -2.5, '...']}
+    assert as_yaml(Header(frame_id='somewhere'), max_length=4).endswith(
+        'frame_id: some...\n')
+
+
+@pytest.mark.parametrize('message, field, text', [
+    (ARRAY, 'data', '<sequence type: double, length: 4>'),
+    (ros.PositionEstimate(), 'covariance_m2', '<array type: double[9]>'),
+    (MultiArrayLayout(dim=[MultiArrayDimension()]), 'dim',
+     '<sequence type: std_msgs/msg/MultiArrayDimension, length: 1>'),
+])
+def test_arrays_may_be_summarized(message, field, text):
+    assert yaml.safe_load(as_yaml(message, arrays=False))[field] == text
+
+
+def test_arrays_of_numpy_and_of_messages_are_lists():
+    message = ros.PositionEstimate(covariance_m2=np.arange(9.0))
+    content = yaml.safe_load(as_yaml(message))
+    assert content['covariance_m2'] == list(map(float, range(9)))
+    polygon = PolygonStamped()
+    polygon.polygon.points = [Point32(x=1.0), Point32(y=2.0)]
+    assert yaml.safe_load(as_yaml(polygon))['polygon']['points'] == [
+        {'x': 1.0, 'y': 0.0, 'z': 0.0}, {'x': 0.0, 'y': 2.0, 'z': 0.0}]
+
+
+def numbers(report):
+    return [float(number) for number in re.findall(r'[\d.]+(?=s| |\n|$)', report)]
+
+
+def test_the_layout_is_that_of_ros2():
+    rate = Rate(100)
+    for time_s in (1.0, 1.25, 1.75):
+        rate.add(round(time_s * 1e9))
+    assert rate.report() == (
+        'average rate: 2.667\n\tmin: 0.250s max: 0.500s std dev: 0.12500s window: 2')
+
+
+def test_the_rate_within_the_window_matches_numpy():
+    times_s = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 50))
+    rate = Rate(10)
+    for time_s in times_s:
+        rate.add(round(time_s * 1e9))
+    steps_s = np.diff(times_s[-11:])
+    assert numbers(rate.report()) == pytest.approx(
+        [1 / steps_s.mean(), steps_s.min(), steps_s.max(), steps_s.std(), 10], abs=1e-3)
+
+
+def test_the_report_is_empty_without_a_new_message():
+    rate = Rate(10)
+    assert rate.report() == ''
+    rate.add(1)
+    assert rate.report() == ''
+    rate.add(2)
+    assert rate.report()
+    assert rate.report() == ''
+
+
+def test_a_clock_that_goes_back_restarts_the_measurement():
+    rate = Rate(10)
+    for time_ns in (10**9, 2 * 10**9, 5, 5 + 10**8):
+        rate.add(time_ns)
+    report = rate.report()
+    assert report.startswith('average rate: 10.000')
+    assert report.endswith('window: 1')
