@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,34 +22,8 @@ _MAX_NODES = 4096
 _MAX_DIGITS = 18
 
 
-@dataclasses.dataclass(frozen=True)
-class Fix:
-    """The latest complete cycle of a user.
-
-    Attributes
-    ----------
-    received_s
-        Arrival of the cycle's last message [s].
-    """
-
-    cycle: CompleteCycle
-    received_s: float
-
-    @property
-    def sigma_m(self) -> float:
-        """Square root of the trace of the covariance [m], to compare with the error."""
-        return math.sqrt(max(np.trace(self.cycle.estimate.covariance_m2), 0.0))
-
-
-@dataclasses.dataclass(frozen=True)
-class NodeStatus:
-    """The latest report of a node.
-
-    Attributes
-    ----------
-    received_s
-        Time at which the report arrived [s].
-    """
+class NodeStatus(NamedTuple):
+    """The latest report of a node, and its arrival [s]."""
 
     report: Report
     received_s: float
@@ -66,29 +41,29 @@ class NodeStatus:
 
 
 class Overview:
-    """Phase, cycles, users and nodes of one network.
+    """Phase, cycles, users and nodes of one network; what is unknown is 0, empty or None.
 
     Attributes
     ----------
     phase
-        Phase of the base station, `RESTING` between cycles; empty before the first message.
+        Phase of the base station, `RESTING` between cycles.
     phase_began_s
         Time at which the phase began [s].
     cycle_id, user
-        Current cycle and its user; 0 where unknown.
+        Current cycle and its user.
     codebook_id
-        Codebook of the latest signals; empty before the first.
+        Codebook of the latest signals.
     served, given_up
         Numbers of cycles that ended.
     last_failure
-        Description of the last cycle that was given up; empty if there was none.
+        Description of the last cycle that was given up.
     began_s
         Arrival of the first message [s]; infinite before.
     users
-        Latest fix of each user by id; None before the first. At most `MAX_USERS`, because the ids
-        come from messages.
+        Latest complete cycle of each user by id.
     nodes
-        Status of each node by name; at most 4096, for the same reason.
+        Status of each node by name. As it and the ids of users come from messages, their numbers
+        are limited.
     """
 
     def __init__(self) -> None:
@@ -96,7 +71,7 @@ class Overview:
         self.phase_began_s = math.nan
         self.cycle_id = self.user = self.served = self.given_up = 0
         self.codebook_id = self.last_failure = ''
-        self.users: dict[int, Fix | None] = {}
+        self.users: dict[int, CompleteCycle | None] = {}
         self.nodes: dict[str, NodeStatus] = {}
         self._log = CycleLog()
         self._served_s: collections.deque[float] = collections.deque()
@@ -121,7 +96,7 @@ class Overview:
         self._log.add(message, now_s)
         for cycle in self._log.complete:
             if cycle.user in self.users or len(self.users) < MAX_USERS:
-                self.users[cycle.user] = Fix(cycle, now_s)
+                self.users[cycle.user] = cycle
         self._log.clear()
 
     def add_report(self, node: str, report: Report, now_s: float) -> None:
@@ -130,19 +105,11 @@ class Overview:
             self.nodes[node] = NodeStatus(report, now_s)
 
     def rate_hz(self, now_s: float) -> float:
-        """Return the rate of served cycles [Hz].
-
-        It is averaged over the last ten seconds, or since the first message if that is less.
-        """
+        """Return the rate of served cycles over the last ten seconds, or since the start [Hz]."""
         begin_s = max(now_s - _RATE_WINDOW_S, self.began_s)
         while self._served_s and self._served_s[0] < begin_s:
             self._served_s.popleft()
         return len(self._served_s) / (now_s - begin_s) if now_s > begin_s else 0.0
-
-    @property
-    def fixes(self) -> list[Fix]:
-        """The fixes of all users that have one, the latest first."""
-        return sorted(filter(None, self.users.values()), key=lambda fix: -fix.received_s)
 
     @property
     def paused(self) -> bool:
@@ -173,7 +140,8 @@ _MAX_PATH_LENGTH = 200
 _MIN_STEP_M = 0.05
 
 
-def _empty_path() -> collections.deque[np.ndarray]:
+def new_path() -> collections.deque[np.ndarray]:
+    """Return an empty path, which keeps its latest 200 positions."""
     return collections.deque(maxlen=_MAX_PATH_LENGTH)
 
 
@@ -183,14 +151,10 @@ class UserState:
 
     Attributes
     ----------
-    user
-        Id of the user.
     updated_s
         Arrival of the latest message about the user [s].
-    truth
-        The true position; None before the first.
-    estimate
-        The latest estimate; None before the first.
+    truth, estimate
+        The latest true position and estimate; None before the first.
     true_path, estimated_path
         True positions and estimates, float64 [3] [m] each, the latest last.
     """
@@ -199,9 +163,8 @@ class UserState:
     updated_s: float
     truth: m.GroundTruth | None = None
     estimate: m.PositionEstimate | None = None
-    true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=_empty_path)
-    estimated_path: collections.deque[np.ndarray] = dataclasses.field(
-        default_factory=_empty_path)
+    true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
+    estimated_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
     # The true position at which the pilots of the latest cycle were sent.
     _cycle_truth: m.GroundTruth | None = None
 
@@ -232,10 +195,8 @@ class SceneState:
 
     Attributes
     ----------
-    configuration
-        Configuration that the surface applies; None before the first message.
-    beam
-        Latest beam of a transmission; None before the first.
+    configuration, beam
+        What the surface applies, and the latest beam of a transmission; None before the first.
     users
         Users by id, at most `MAX_USERS`, because the ids come from messages. Further users are
         ignored until others are discarded.
@@ -254,26 +215,21 @@ class SceneState:
                 self.configuration = message
             case m.Beam():
                 self.beam, self._beam_s = message, now_s
-            case m.GroundTruth():
-                self._add_truth(message, now_s)
             case m.GroundTruths():
                 for truth in message.each():
-                    self._add_truth(truth, now_s)
+                    self.add(truth, now_s)
+            case m.GroundTruth():
+                if state := self._updated_user(message.user, now_s):
+                    state.add_truth(message)
             case m.PositionEstimate():
                 if state := self._updated_user(message.user, now_s):
                     state.add_estimate(message)
 
-    def _add_truth(self, truth: m.GroundTruth, now_s: float) -> None:
-        if state := self._updated_user(truth.user, now_s):
-            state.add_truth(truth)
-
     def _updated_user(self, user: int, now_s: float) -> UserState | None:
         """Return the state of a user; None if it is new and there are too many."""
-        state = self.users.get(user)
-        if state is None:
-            if len(self.users) >= MAX_USERS:
-                return None
-            state = self.users[user] = UserState(user, now_s)
+        if user not in self.users and len(self.users) >= MAX_USERS:
+            return None
+        state = self.users.setdefault(user, UserState(user, now_s))
         state.updated_s = now_s
         return state
 
@@ -306,17 +262,14 @@ class SceneState:
 
     @property
     def shown_user(self) -> UserState | None:
-        """The user of the latest cycle with an estimate and a beam, or else with an estimate.
-
-        None if there is no estimate.
-        """
+        """The user of the latest cycle with estimate and beam, or else with an estimate."""
         if self.beam is not None:
             state = self.users.get(self.beam.user)
             if state and state.estimate and state.estimate.cycle_id == self.beam.cycle_id:
                 return state
-        cycles = [(state.estimate.cycle_id, user) for user, state in self.users.items()
-                  if state.estimate]
-        return self.users[max(cycles)[1]] if cycles else None
+        estimated = [state for state in self.users.values() if state.estimate]
+        return max(estimated, key=lambda state: (
+            state.estimate.cycle_id if state.estimate else 0, state.user), default=None)
 
     @property
     def shown_beam(self) -> m.Beam | None:

@@ -6,7 +6,6 @@ plane; colours are red, green and blue from 0 to 1, float64 [N, 3] for N shapes.
 """
 
 import colorsys
-import dataclasses
 import math
 from collections.abc import Iterable
 from typing import NamedTuple, TypeAlias
@@ -24,8 +23,7 @@ from rhs_isac_ros.protocol import messages as m
 Colour: TypeAlias = tuple[float, float, float]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Points:
+class Points(NamedTuple):
     """Balls, or discs in a plane, with one label each or none."""
 
     positions: np.ndarray
@@ -34,8 +32,7 @@ class Points:
     labels: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Ellipsoids:
+class Ellipsoids(NamedTuple):
     """Ellipsoids with half the lengths of their axes, float64 [N, 3].
 
     Unit quaternions, float64 [N, 4] (x, y, z, w), rotate the coordinate axes to theirs.
@@ -47,8 +44,7 @@ class Ellipsoids:
     colours: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Boxes:
+class Boxes(NamedTuple):
     """Cuboids along the coordinate axes, solid or as outlines."""
 
     centres: np.ndarray
@@ -57,8 +53,7 @@ class Boxes:
     solid: bool
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Lines:
+class Lines(NamedTuple):
     """Lines of one colour through the points of each strip; the width is in screen points."""
 
     strips: tuple[np.ndarray, ...]
@@ -66,23 +61,20 @@ class Lines:
     width: float
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Mesh:
+class Mesh(NamedTuple):
     """A surface through a grid of points, float64 [M, N, 3]."""
 
     points: np.ndarray
     colour: Colour
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Picture:
+class Picture(NamedTuple):
     """A picture in shades of grey, uint8 [height, width], the top row first."""
 
     pixels: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Series:
+class Series(NamedTuple):
     """The style of the numbers on a path: a line, or dots."""
 
     name: str
@@ -90,22 +82,19 @@ class Series:
     dots: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A value of a series."""
 
     value: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Text:
+class Text(NamedTuple):
     """A line of the log."""
 
     text: str
     warning: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
 class Clear:
     """Removes the entities of a path and of the paths below it."""
 

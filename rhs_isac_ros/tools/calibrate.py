@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from rclpy.node import Node
 
-import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import (
     CalibrationError,
     Pilots,
@@ -28,15 +27,14 @@ from rhs_isac_ros.calibration import (
     survey,
     survey_report,
 )
-from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
+from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
+from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
@@ -54,6 +52,7 @@ from rhs_isac_ros.tools.command import (
     observe,
     recorded,
     run_command,
+    subscribe_codebooks,
 )
 
 # Messages that the log needs.
@@ -130,19 +129,8 @@ class CalibratorNode(Node):
 
     def __init__(self, log: PilotLog, scenario: Scenario) -> None:
         super().__init__('calibrator', **WITHOUT_SERVICES)
-        self._log, self._scenario = log, scenario
         subscribe_messages(self, RECEIVES, scenario.sizes, log.add, scenario_id=scenario.id)
-        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, qos.LATCHED)
-
-    def _on_codebook(self, message: ros.Codebook) -> None:
-        try:
-            codebook = convert.codebook_from_ros(message)
-            codebook.check(self._scenario)
-        except (m.MessageError, CodebookError) as error:
-            self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'dropped codebook: {error}')
-            return
-        self._log.add(codebook)
+        subscribe_codebooks(self, scenario, log.add)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
+import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import CalibrationError
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import discard_stdout, print_error
@@ -25,9 +26,10 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, diagnostics, topics
+from rhs_isac_ros.ros import convert, diagnostics, qos, topics
 from rhs_isac_ros.ros.command_line import parse
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
+from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.security import SecurityError, is_enabled, one_line, prepare
@@ -142,6 +144,20 @@ def observe(
         return nodes
     code = run(create, arguments, lambda: done(nodes[0]))
     return code, nodes[0] if nodes else None
+
+
+def subscribe_codebooks(
+        node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
+    """Subscribe to the codebooks of a network; those that do not fit the scenario are dropped."""
+    def receive(message: ros.Codebook) -> None:
+        try:
+            codebook = convert.codebook_from_ros(message)
+            codebook.check(scenario)
+        except (m.MessageError, CodebookError) as error:
+            node.get_logger().warning(f'dropped codebook: {error}')
+            return
+        on_codebook(codebook)
+    subscribe(node, ros.Codebook, topics.CODEBOOK, receive, qos.LATCHED)
 
 
 def choose_scenario(config: Path | None, recording: Path | None = None) -> Scenario:

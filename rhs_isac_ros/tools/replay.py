@@ -78,10 +78,9 @@ class RepublisherNode(Node):
     Parameters
     ----------
     messages
-        Relative name of the topic, message and time [s], sorted by time; codebooks are passed to
-        the optimizer instead.
+        Relative name of the topic, message and time [s], sorted by time.
     names
-        Relative names of the topics.
+        Relative names of the topics; codebooks are passed to the optimizer instead.
     rate
         Speed relative to the recording.
 
@@ -140,10 +139,9 @@ class RepublisherNode(Node):
         if name == _SIGNALS:
             # Observers may subscribe to the signals as well. Wait for the nodes that publish
             # estimates, which subscribe to the signals only once their tables are complete.
-            estimators = {_full_name(endpoint) for endpoint in self.get_publishers_info_by_topic(
-                self.resolve_topic_name(_ESTIMATES))} - {self.get_fully_qualified_name()}
-            subscribers = {_full_name(endpoint) for endpoint in
-                           self.get_subscriptions_info_by_topic(publisher.topic_name)}
+            estimators = _nodes_of(self.get_publishers_info_by_topic(
+                self.resolve_topic_name(_ESTIMATES))) - {self.get_fully_qualified_name()}
+            subscribers = _nodes_of(self.get_subscriptions_info_by_topic(publisher.topic_name))
             if not estimators or not estimators <= subscribers:
                 return False
             n_expected = len(subscribers)
@@ -173,10 +171,13 @@ class RepublisherNode(Node):
             publisher.wait_for_all_acked(_ACK_TIMEOUT)
         self.finished = True
 
-    def conflicts(self) -> list[str]:
-        """Return the relative names of the topics that another node publishes as well."""
-        return [name for name, publisher in self._message_publishers.items()
-                if self.count_publishers(publisher.topic_name) > 1]
+    def check(self, end_s: float, timeout_s: float) -> None:
+        """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
+        for name, publisher in self._message_publishers.items():
+            if self.count_publishers(publisher.topic_name) > 1:
+                raise ToolError(f'{name}: already published by another node')
+        if self.waits_for and time.monotonic() > end_s:
+            raise ToolError(f'{self.waits_for}: no subscriber within {timeout_s:g} s')
 
 
 def _publish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -197,7 +198,7 @@ def _publish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         return [node, *filter(None, [node.optimizer])]
 
     def done() -> bool:
-        _check(nodes[0], end_s, options.timeout)
+        nodes[0].check(end_s, options.timeout)
         return nodes[0].finished
     code = run(create, arguments, done)
     if nodes:
@@ -238,14 +239,6 @@ def _first_codebook(options: argparse.Namespace) -> Codebook:
     return convert.codebook_from_ros(codebooks[used])
 
 
-def _check(node: RepublisherNode, end_s: float, timeout_s: float) -> None:
-    """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
-    if conflicts := node.conflicts():
-        raise ToolError(f'{conflicts[0]}: already published by another node')
-    if node.waits_for and time.monotonic() > end_s:
-        raise ToolError(f'{node.waits_for}: no subscriber within {timeout_s:g} s')
-
-
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
     """Create an optimizer that provides a codebook; it reads the scenario from a file once."""
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as folder:
@@ -268,8 +261,9 @@ def _parameters(codebook: Codebook) -> list[Parameter]:
     return [Parameter(name, value=value) for name, value in codebook.to_parameters().items()]
 
 
-def _full_name(endpoint: Any) -> str:
-    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+def _nodes_of(endpoints: Iterable[Any]) -> set[str]:
+    return {f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+            for endpoint in endpoints}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -291,11 +285,8 @@ def load(path: Path, namespace: str = '/', config: Path | None = None) -> Record
 
     Raises
     ------
-    RecordingError
-        If the file is not a recording, has no complete cycle in the namespace, or contains a
-        message that is malformed or does not fit the scenario.
-    ScenarioError
-        If the scenario is invalid.
+    RecordingError, ScenarioError
+        If a file is invalid, as for `recorded`, or there is no complete cycle in the namespace.
     """
     scenario = choose_scenario(config, path)
     log = CycleLog()
@@ -405,56 +396,50 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
     used = sorted({cycle.signals.codebook_id for cycle in recording.cycles})
     if file:
         codebook = Codebook.load(file)
+        codebook.check(recording.scenario)
         for codebook_id in used:
             if codebook_id != codebook.id:
                 print(f'signals received with codebook {codebook_id} are evaluated with '
                       f'{codebook.id}', file=sys.stderr)
-        assumed = dict.fromkeys(used, codebook)
-    else:
-        missing = [codebook_id for codebook_id in used if codebook_id not in recording.codebooks]
-        if missing:
-            raise RecordingError(f'codebook {missing[0]}: not in the recording; give its file '
+        return dict.fromkeys(used, codebook)
+    for codebook_id in used:
+        if codebook_id not in recording.codebooks:
+            raise RecordingError(f'codebook {codebook_id}: not in the recording; give its file '
                                  'with --codebook FILE')
-        assumed = {codebook_id: recording.codebooks[codebook_id] for codebook_id in used}
-    for codebook in assumed.values():
-        codebook.check(recording.scenario)
-    return assumed
+    return {codebook_id: recording.codebooks[codebook_id] for codebook_id in used}
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='replay', description='Feed the received signals of a recording to estimators, and '
         'compare their errors with those of the recorded network.')
-    parser.add_argument('file', type=input_file, help='recording')
-    parser.add_argument('--estimator', action='append',
-                        choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
-                        help='may be repeated (default: bayes)')
-    parser.add_argument('--track', action='store_true',
-                        help='also track the users with the estimator bayes')
-    parser.add_argument('--track-speed', type=positive_float, default=Motion.speed_mps,
-                        metavar='MPS', help='typical speed of the users (default: 1 m/s)')
-    parser.add_argument('--codebook', type=input_file, metavar='FILE',
-                        help='codebook to assume; by default the recorded one')
-    parser.add_argument('--config', type=input_file, metavar='FILE',
-                        help='scenario file; by default the recorded scenario')
-    parser.add_argument('--calibration', type=input_file, metavar='FILE',
-                        help='calibration of the surface; by default that of the scenario')
-    parser.add_argument('--model', type=input_file, metavar='FILE',
-                        help='model of the estimator neural')
-    parser.add_argument('--namespace', default='/',
-                        help='namespace of the recorded network (default: /)')
-    live = parser.add_argument_group(
+    add = parser.add_argument
+    add('file', type=input_file, help='recording')
+    add('--estimator', action='append',
+        choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
+        help='may be repeated (default: bayes)')
+    add('--track', action='store_true', help='also track the users with the estimator bayes')
+    add('--track-speed', type=positive_float, default=Motion.speed_mps, metavar='MPS',
+        help='typical speed of the users (default: 1 m/s)')
+    add('--codebook', type=input_file, metavar='FILE',
+        help='codebook to assume; by default the recorded one')
+    add('--config', type=input_file, metavar='FILE',
+        help='scenario file; by default the recorded scenario')
+    add('--calibration', type=input_file, metavar='FILE',
+        help='calibration of the surface; by default that of the scenario')
+    add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')
+    add('--namespace', default='/', help='namespace of the recorded network (default: /)')
+    add = parser.add_argument_group(
         'running nodes', 'Publish the recorded signals again, with their timing, in the namespace '
         'of --ros-args -r __ns:=... If the namespace has no optimizer, the replay provides the '
-        'recorded codebook instead.')
-    live.add_argument('--publish', action='store_true', help='publish instead of estimating')
-    live.add_argument('--rate', type=positive_float, default=_RATE, metavar='R',
-                      help='speed relative to the recording (default: 1)')
-    live.add_argument('--topic', action='append', choices=_TOPICS, metavar='NAME',
-                      help='relative name; may be repeated (default: '
-                      f'{topics.NAMES[m.ReceivedSignals]})')
-    live.add_argument('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
-                      help='maximum time to wait for subscribers (default: 60 s)')
+        'recorded codebook instead.').add_argument
+    add('--publish', action='store_true', help='publish instead of estimating')
+    add('--rate', type=positive_float, default=_RATE, metavar='R',
+        help='speed relative to the recording (default: 1)')
+    add('--topic', action='append', choices=_TOPICS, metavar='NAME',
+        help=f'relative name; may be repeated (default: {_SIGNALS})')
+    add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
+        help='maximum time to wait for subscribers (default: 60 s)')
     return parser
 
 

@@ -17,10 +17,9 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 
-import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.calibration import load_surface
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
@@ -39,7 +38,7 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.protocol.role import NewestDict
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import qos, topics
 from rhs_isac_ros.ros.background import BackgroundWorker
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
@@ -60,6 +59,7 @@ from rhs_isac_ros.tools.command import (
     print_now,
     recorded,
     run_command,
+    subscribe_codebooks,
 )
 from rhs_isac_ros.tools.rerun_stream import RerunStream
 
@@ -101,8 +101,7 @@ class Posteriors:
         return self._estimators
 
     def add(self, codebook: Codebook) -> None:
-        """Prepare for signals received with a codebook, or raise CodebookError."""
-        codebook.check(self._scenario)
+        """Prepare for signals received with a codebook, which fits the scenario."""
         self._estimators.put(codebook.id, BayesEstimator(
             self._scenario, codebook, default_folder(), surface=self._surface))
 
@@ -142,15 +141,10 @@ class Posteriors:
 
 
 class ViewNode(Node):
-    """Converts the messages of its namespace to entries.
+    """Converts the messages of its namespace to entries, with which it calls `write`.
 
     Modes and bounds are computed in the background. If cycles are faster, the modes and the beam
     of some are left out.
-
-    Parameters
-    ----------
-    write
-        Called with the entries.
 
     Attributes
     ----------
@@ -176,7 +170,7 @@ class ViewNode(Node):
         self._users: set[int] = set()
         self._beam_s = -math.inf
         write(self.view.begin())
-        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, qos.LATCHED)
+        subscribe_codebooks(self, scenario, self._on_codebook)
         subscribe_reports(self, lambda node, report: self._write(
             self.view.add_report(node, report)))
         subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
@@ -221,36 +215,17 @@ class ViewNode(Node):
                 f'{error}; if the network uses another scenario, pass it with --config FILE')
         self.mismatch = str(error)
 
-    def _on_codebook(self, message: ros.Codebook) -> None:
-        try:
-            codebook = convert.codebook_from_ros(message)
-        except (m.MessageError, CodebookError) as error:
-            self._no_modes(error)
-            return
+    def _on_codebook(self, codebook: Codebook) -> None:
         if codebook.id not in self._requested | self._posteriors.codebooks.keys():
             self._requested.add(codebook.id)
-            self._worker.run(functools.partial(self._add, codebook),
-                             functools.partial(self._on_added, codebook))
+            self._worker.run(functools.partial(self._posteriors.add, codebook),
+                             lambda _: self._on_added(codebook))
 
-    def _add(self, codebook: Codebook) -> CodebookError | None:
-        try:
-            self._posteriors.add(codebook)
-        except CodebookError as error:
-            return error
-        return None
-
-    def _on_added(self, codebook: Codebook, error: CodebookError | None) -> None:
+    def _on_added(self, codebook: Codebook) -> None:
         self._requested.discard(codebook.id)
-        if error:
-            self._no_modes(error)
-            return
         self._bounds.run(functools.partial(self._posteriors.bound_m2, codebook),
                          functools.partial(self.view.set_bound, codebook.id))
         self._search()
-
-    def _no_modes(self, error: Exception) -> None:
-        self.get_logger().warning(  # type: ignore[no-untyped-call]
-            f'no modes: {error}')
 
     def _search(self) -> None:
         """Start the search for the modes of the latest signals, unless one is running."""
@@ -309,8 +284,7 @@ def entries(
     Raises
     ------
     RecordingError
-        If the file is not a recording, has no messages in the namespace, or contains a message
-        that is malformed or does not fit the scenario.
+        If the file is invalid, as for `recorded`, or there is no cycle in the namespace.
     """
     view = NetworkView(scenario)
     for codebook, _ in recorded(path, namespace, scenario, [Codebook]):
@@ -428,32 +402,30 @@ def _parser() -> argparse.ArgumentParser:
         prog=_PROGRAM, description='Show a running network, or a recording, in three dimensions '
         'and in charts over the cycles: in the browser until Ctrl-C, or as a file for Rerun. ROS '
         'arguments select the namespace of a running network: --ros-args -r __ns:=/lab')
-    parser.add_argument('file', nargs='?', type=input_file,
-                        help='recording; by default the running network')
-    parser.add_argument('--save', type=_recording_file, metavar='FILE',
-                        help='write a file for Rerun, *.rrd, instead of serving the viewer')
-    parser.add_argument('--cycles', type=positive_int, default=0, metavar='N',
-                        help='show N cycles; the view of a running network then ends')
-    parser.add_argument('--config', type=input_file, metavar='FILE',
-                        help="scenario file; by default that of the recording, or the paper's "
-                        'Table I')
-    parser.add_argument('--calibration', type=input_file, metavar='FILE',
-                        help='calibration of the surface, for the modes of the posterior; by '
-                        'default that of the scenario')
-    server = parser.add_argument_group('browser')
-    server.add_argument('--port', type=integer(1, 65533), default=_PORT, metavar='P',
-                        help=f'port of the viewer; its data use the next two (default: {_PORT})')
-    server.add_argument('--bind', default='127.0.0.1', metavar='ADDRESS',
-                        help='address that the viewer listens on; by default only this machine '
-                        'can connect, with 0.0.0.0 any other')
-    server.add_argument('--open', action='store_true', help='open the browser')
-    recording = parser.add_argument_group('recording')
-    recording.add_argument('--namespace', help='namespace of the recorded network (default: /)')
-    recording.add_argument('--track', action='store_true',
-                           help='track the users, as positioner does with prior:=track')
-    recording.add_argument('--track-speed', type=positive_float, metavar='MPS',
-                           help='typical speed of the users for --track (default: '
-                           f'{Motion.speed_mps:g} m/s)')
+    add = parser.add_argument
+    add('file', nargs='?', type=input_file, help='recording; by default the running network')
+    add('--save', type=_recording_file, metavar='FILE',
+        help='write a file for Rerun, *.rrd, instead of serving the viewer')
+    add('--cycles', type=positive_int, default=0, metavar='N',
+        help='show N cycles; the view of a running network then ends')
+    add('--config', type=input_file, metavar='FILE',
+        help="scenario file; by default that of the recording, or the paper's Table I")
+    add('--calibration', type=input_file, metavar='FILE',
+        help='calibration of the surface, for the modes of the posterior; by default that of '
+        'the scenario')
+    add = parser.add_argument_group('browser').add_argument
+    add('--port', type=integer(1, 65533), default=_PORT, metavar='P',
+        help=f'port of the viewer; its data use the next two (default: {_PORT})')
+    add('--bind', default='127.0.0.1', metavar='ADDRESS',
+        help='address that the viewer listens on; by default only this machine can connect, '
+        'with 0.0.0.0 any other')
+    add('--open', action='store_true', help='open the browser')
+    add = parser.add_argument_group('recording').add_argument
+    add('--namespace', help='namespace of the recorded network (default: /)')
+    add('--track', action='store_true',
+        help='track the users, as positioner does with prior:=track')
+    add('--track-speed', type=positive_float, metavar='MPS',
+        help=f'typical speed of the users for --track (default: {Motion.speed_mps:g} m/s)')
     return parser
 
 

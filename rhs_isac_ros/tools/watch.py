@@ -11,8 +11,8 @@ import numpy as np
 from rclpy.node import Node
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.monitoring.cycle_log import RECEIVES
-from rhs_isac_ros.monitoring.network_state import Fix, Overview
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle
+from rhs_isac_ros.monitoring.network_state import Overview
 from rhs_isac_ros.protocol.base_station_memory import State
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.early import WITHOUT_SERVICES
@@ -81,19 +81,18 @@ def _users(overview: Overview, now_s: float) -> 'RenderableType':
     table = _table('Users', 'right', 'user', 'position\n[m]', 'error\n[m]', 'sigma\n[m]',
                    'capacity\n[Mbit/s]', 'loss\n[%]', 'age\n[s]')
     # In order of their numbers, so that each user keeps its row.
-    for user, fix in sorted(overview.users.items())[:_MAX_USERS]:
-        table.add_row(*(_user_row(fix, now_s) if fix else (str(user), 'no fix yet', *[''] * 5)))
+    for user, cycle in sorted(overview.users.items())[:_MAX_USERS]:
+        table.add_row(str(user), *(_results(cycle, now_s) if cycle else ['no fix yet']))
     if len(overview.users) > _MAX_USERS:
         table.caption = f'and {len(overview.users) - _MAX_USERS} more'
     return table
 
 
-def _user_row(fix: Fix, now_s: float) -> list[str]:
-    cycle = fix.cycle
+def _results(cycle: CompleteCycle, now_s: float) -> list[str]:
     position = ' '.join(f'{x:6.2f}' for x in cycle.estimate.position)
-    return [str(cycle.user), position, f'{cycle.error_m:.2f}', f'{fix.sigma_m:.2f}',
+    return [position, f'{cycle.error_m:.2f}', f'{cycle.sigma_m:.2f}',
             _number(cycle.capacity.actual_bps / 1e6, 2),
-            _number(cycle.capacity.loss_percent, 3), f'{now_s - fix.received_s:.1f}']
+            _number(cycle.capacity.loss_percent, 3), f'{now_s - cycle.ended_s:.1f}']
 
 
 def _number(value: float, digits: int) -> str:
@@ -204,9 +203,10 @@ def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
     def done(node: WatchNode) -> bool:
         now_s = time.monotonic()
         return now_s > end_s or bool(
-            node.overview.fixes and now_s > node.overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
+            any(node.overview.users.values())
+            and now_s > node.overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
     code, node = observe(WatchNode, arguments, done)
-    if node and node.overview.fixes:
+    if node and any(node.overview.users.values()):
         Console().print(render(node.overview, time.monotonic()))
     elif time.monotonic() > end_s:
         raise none_within('no complete cycle', timeout_s)
