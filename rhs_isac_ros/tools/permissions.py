@@ -54,20 +54,11 @@ class Permissions(NamedTuple):
 
 
 def permissions(users: int) -> dict[str, Permissions]:
-    """Return the permissions that the nodes of a network may need, and no others.
+    """Return the permissions that the nodes of a network may need, by node, for a number of users.
 
-    Parameters
-    ----------
-    users
-        Number of users; they are numbered from 1.
-
-    Returns
-    -------
-    dict
-        Permissions by node. ``users`` is a node with all users, ``network`` the process of all
-        nodes of `ROSTER`. ``operator`` stands for all tools, which may read every topic, set
-        parameters and pause cycles, except for ``replay``, which may publish every topic and
-        take the place of the optimizer.
+    ``users`` is a node with all users, ``network`` the process of all nodes of `ROSTER`.
+    ``operator`` stands for all tools, which may read every topic, set parameters and pause cycles,
+    except for ``replay``, which may publish every topic and take the place of the optimizer.
     """
     numbers = range(1, users + 1)
     nodes = {
@@ -131,28 +122,19 @@ def _operator(nodes: Iterable[str], users: Iterable[int]) -> Permissions:
 
 
 def policy(namespace: str = '/', users: int = 2) -> str:
-    """Return the policy of a network in the XML format of SROS2, with one enclave for each node.
-
-    Parameters
-    ----------
-    namespace
-        Namespace of the network and of its enclaves.
-    users
-        Number of users.
-    """
+    """Return the policy of a network as XML for SROS2, with one enclave for each node."""
+    add = ElementTree.SubElement
     root = ElementTree.Element('policy', version=_VERSION)
-    enclaves = ElementTree.SubElement(root, 'enclaves')
+    enclaves = add(root, 'enclaves')
     for node, allowed in permissions(users).items():
-        enclave = ElementTree.SubElement(
-            enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
-        profiles = ElementTree.SubElement(enclave, 'profiles')
-        profile = ElementTree.SubElement(profiles, 'profile', ns=namespace, node=node)
+        enclave = add(enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
+        profile = add(add(enclave, 'profiles'), 'profile', ns=namespace, node=node)
         for right, names in allowed._asdict().items():
             kind = 'topic' if right in ('publish', 'subscribe') else 'service'
             if names:
-                rules = ElementTree.SubElement(profile, f'{kind}s', {right: 'ALLOW'})
+                rules = add(profile, f'{kind}s', {right: 'ALLOW'})
                 for name in names:
-                    ElementTree.SubElement(rules, kind).text = name
+                    add(rules, kind).text = name
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding='unicode')
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'
