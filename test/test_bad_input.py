@@ -73,7 +73,7 @@ CALLS = [
     ('tools.watch', ['--once', 'twice'], 'unrecognized arguments: twice'),
     ('tools.topic', ['show'], "invalid choice: 'show'"),
     ('tools.topic', ['echo'], 'required: topic_name'),
-    ('tools.topic', ['hz', 'beam', '--window', '0'], 'expected at least 1'),
+    ('tools.topic', ['hz'], 'required: topic_name'),
     ('tools.topic', ['list', '--spin-time', 'nan'], 'expected a number of at least 0'),
     ('tools.param', ['get', 'bs'], 'required: parameter_name'),
     ('tools.param', ['list', '--timeout', 'x'], 'expected a number of at least 0'),

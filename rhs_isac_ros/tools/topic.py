@@ -7,27 +7,24 @@ import argparse
 import array
 import collections
 import importlib
-import itertools
-import re
-import statistics
 import sys
+import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import yaml
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.qos import QoSPresetProfiles, qos_profile_sensor_data
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.ros.endpoints import steady_timer
-from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, positive_int
+from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.tools.command import Session, ToolError, print_now, run_command, run_verb
 
 _MAX_LENGTH = 128
-_RATE_WINDOW = 10000
+# Number of messages whose rate is measured.
+_MAX_TIMES = 10001
 # Time for the discovery of other nodes [s]: unlike ``ros2``, there is no daemon with their names.
 _DISCOVERY_TIMEOUT_S = 3.0
 
@@ -37,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(run_verb, _parser(), arguments)
 
 
-def as_yaml(message: Any, max_length: int | None = None, arrays: bool = True) -> str:
+def as_yaml(message: Any, max_length: int | None = None) -> str:
     """Return a ROS message as YAML, ending with a newline.
 
     Parameters
@@ -45,83 +42,37 @@ def as_yaml(message: Any, max_length: int | None = None, arrays: bool = True) ->
     max_length
         Maximum number of entries of an array or characters of a string; the rest is replaced by
         dots. None: unlimited.
-    arrays
-        Whether to write the entries of arrays; otherwise only type and length.
     """
-    return yaml.dump(_plain(message, '', max_length, arrays), sort_keys=False,
-                     allow_unicode=True, width=sys.maxsize, default_flow_style=False)
+    return yaml.dump(_plain(message, max_length), sort_keys=False, allow_unicode=True,
+                     width=sys.maxsize, default_flow_style=False)
 
 
-def _plain(value: Any, kind: str, max_length: int | None, arrays: bool) -> Any:
-    """Convert a value to types that YAML supports; the kind of the entries of an array is ''."""
+def _plain(value: Any, max_length: int | None) -> Any:
+    """Convert a value to types that YAML supports."""
     match value:
         case bytes():
-            return _truncate(''.join(map(chr, value)), max_length)
+            return _plain(''.join(map(chr, value)), max_length)
         case str():
-            return _truncate(value, max_length)
+            text = value[:max_length]
+            return text if text == value else f'{text}...'
         case list() | tuple() | array.array() | np.ndarray():
-            if kind and not arrays:
-                return _array_summary(kind, len(value))
-            entries = [_plain(entry, '', max_length, arrays) for entry in value[:max_length]]
+            entries = [_plain(entry, max_length) for entry in value[:max_length]]
             return entries + ['...'] * (len(value) > len(entries))
         case np.generic():
             return value.item()
         case bool() | int() | float():
             return value
-    return {name: _plain(getattr(value, name), kind, max_length, arrays)
-            for name, kind in value.get_fields_and_field_types().items()}
+    return {name: _plain(getattr(value, name), max_length)
+            for name in value.get_fields_and_field_types()}
 
 
-def _truncate(text: str, max_length: int | None) -> str:
-    if max_length is None or len(text) <= max_length:
-        return text
-    return f'{text[:max_length]}...'
-
-
-def _array_summary(kind: str, length: int) -> str:
-    """Return type and length of an array, whose type is as in the message class."""
-    if sequence := re.fullmatch(r'sequence<(.+?)(?:, (\d+))?>', kind):
-        entry, bound = sequence.groups()
-    else:
-        entry, _, bound = kind.removesuffix(']').rpartition('[')
-    entry = entry.replace('/', '/msg/')
-    bound = f'[{bound}]' if bound else ''
-    return (f'<sequence type: {entry}{bound}, length: {length}>' if sequence
-            else f'<array type: {entry}{bound}>')
-
-
-class Rate:
-    """Intervals between the latest messages of a topic.
-
-    Parameters
-    ----------
-    window
-        Number of intervals to keep.
-    """
-
-    def __init__(self, window: int) -> None:
-        self._times_ns: collections.deque[int] = collections.deque(maxlen=window + 1)
-        self._changed = False
-
-    def add(self, time_ns: int) -> None:
-        """Add a message that arrived at a time [ns]; discard the others if the clock went back."""
-        if self._times_ns and time_ns < self._times_ns[-1]:
-            self._times_ns.clear()
-        self._times_ns.append(time_ns)
-        self._changed = True
-
-    def report(self) -> str:
-        """Return the two lines that ``ros2 topic hz`` prints, or '' if nothing has arrived."""
-        intervals_s = [1e-9 * (after - before)
-                       for before, after in itertools.pairwise(self._times_ns)]
-        if not self._changed or not intervals_s:
-            return ''
-        self._changed = False
-        mean_s = statistics.fmean(intervals_s)
-        rate_hz = 1 / mean_s if mean_s else 0.0
-        return (f'average rate: {rate_hz:.3f}\n\tmin: {min(intervals_s):.3f}s '
-                f'max: {max(intervals_s):.3f}s std dev: {statistics.pstdev(intervals_s):.5f}s '
-                f'window: {len(intervals_s)}')
+def rate_text(times_ns: Sequence[int]) -> str:
+    """Return the two lines that ``ros2 topic hz`` prints for the times of messages [ns]."""
+    intervals_s = 1e-9 * np.diff(times_ns)
+    mean_s = intervals_s.mean()
+    return (f'average rate: {1 / mean_s if mean_s else 0.0:.3f}\n\tmin: {intervals_s.min():.3f}s '
+            f'max: {intervals_s.max():.3f}s std dev: {intervals_s.std():.5f}s '
+            f'window: {len(intervals_s)}')
 
 
 def show_list(session: Session, options: argparse.Namespace) -> None:
@@ -152,9 +103,8 @@ def show_info(session: Session, options: argparse.Namespace) -> None:
 def echo(session: Session, options: argparse.Namespace) -> None:
     """Print the messages of a topic, or raise `ToolError`."""
     name = session.full_name(options.topic_name)
-    kind = (_load_type(options.message_type) if options.message_type
-            else _published_type(session, name, options.topic_name, options.spin_time))
-    max_length, arrays = None if options.full_length else _MAX_LENGTH, not options.no_arr
+    kind = _published_type(session, name, options.topic_name, options.spin_time)
+    max_length = None if options.full_length else _MAX_LENGTH
     printed = 0
 
     def show(message: Any) -> None:
@@ -163,7 +113,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
         if options.once and printed:
             return
         value = _select(message, options.field)
-        text = (as_yaml(value, max_length, arrays) if hasattr(value, 'get_fields_and_field_types')
+        text = (as_yaml(value, max_length) if hasattr(value, 'get_fields_and_field_types')
                 else f'{value}\n')
         print_now(f'{text}---')
         printed += 1
@@ -191,15 +141,18 @@ def show_rate(session: Session, options: argparse.Namespace) -> None:
     """Print the rate of the messages of a topic once a second, or raise `ToolError`."""
     name = session.full_name(options.topic_name)
     kind = _published_type(session, name, options.topic_name, None)
-    rate, clock = Rate(options.window_size), Clock(clock_type=ClockType.STEADY_TIME)
+    times_ns: collections.deque[int] = collections.deque(maxlen=_MAX_TIMES)
+    reported_ns = 0
     # Raw messages: long ones would take time to deserialize.
     session.node.create_subscription(
-        kind, name, lambda _: rate.add(clock.now().nanoseconds), qos_profile_sensor_data,
+        kind, name, lambda _: times_ns.append(time.monotonic_ns()), qos_profile_sensor_data,
         raw=True)
 
     def report() -> None:
-        if text := rate.report():
-            print_now(text)
+        nonlocal reported_ns
+        if len(times_ns) > 1 and times_ns[-1] > reported_ns:
+            reported_ns = times_ns[-1]
+            print_now(rate_text(times_ns))
     steady_timer(session.node, 1.0, report)
     session.spin_until(lambda: False)
 
@@ -219,17 +172,11 @@ def _published_type(
     if len(found) > 1:
         raise ToolError(f"Cannot echo topic '{given_name}', as it contains more than one type: "
                         f'[{", ".join(found)}]')
-    return _load_type(found[0])
-
-
-def _load_type(name: str) -> type[Any]:
-    """Return the message class of a name such as ``std_msgs/msg/String``."""
+    package, folder, message = found[0].split('/')
     try:
-        package, folder, kind = name.split('/')
-        loaded: type[Any] = getattr(importlib.import_module(f'{package}.{folder}'), kind)
-    except (ValueError, ImportError, AttributeError):
-        raise ToolError(f"The message type '{name}' is invalid") from None
-    return loaded
+        return getattr(importlib.import_module(f'{package}.{folder}'), message)
+    except (ImportError, AttributeError):
+        raise ToolError(f"The message type '{found[0]}' is invalid") from None
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -252,12 +199,8 @@ def _parser() -> argparse.ArgumentParser:
     verb = add_verb('info', show_info, 'Print type, publishers and subscriptions of a topic.')
     verb.add_argument('-v', '--verbose', action='store_true',
                       help='print every publisher and subscription')
-    verb = add_verb('hz', show_rate, 'Print the rate of the messages of a topic once a second.')
-    verb.add_argument('-w', '--window', dest='window_size', type=positive_int,
-                      default=_RATE_WINDOW, metavar='N',
-                      help=f'number of intervals to average over (default: {_RATE_WINDOW})')
+    add_verb('hz', show_rate, 'Print the rate of the messages of a topic once a second.')
     verb = add_verb('echo', echo, 'Print the messages of a topic.')
-    verb.add_argument('message_type', nargs='?', help='such as std_msgs/msg/String')
     verb.add_argument('--once', action='store_true', help='exit after one message')
     verb.add_argument('--timeout', type=nonnegative_float, metavar='N',
                       help='exit after N seconds')
@@ -265,8 +208,6 @@ def _parser() -> argparse.ArgumentParser:
                       help='print only this field; dots select nested fields')
     verb.add_argument('-f', '--full-length', action='store_true',
                       help=f'print more than {_MAX_LENGTH} entries of arrays and strings')
-    verb.add_argument('--no-arr', action='store_true',
-                      help='print type and length of arrays only')
     return parser
 
 
