@@ -46,14 +46,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
 )
 from rhs_isac_ros.support.files import ArchiveError, read_arrays
-from rhs_isac_ros.tools.command import (
-    choose_scenario,
-    none_within,
-    observe,
-    recorded,
-    run_command,
-    subscribe_codebooks,
-)
+from rhs_isac_ros.tools import command
 
 # Messages that the log needs.
 RECEIVES = (m.GroundTruth, m.ReceivedSignals)
@@ -130,12 +123,12 @@ class CalibratorNode(Node):
     def __init__(self, log: PilotLog, scenario: Scenario) -> None:
         super().__init__('calibrator', **WITHOUT_SERVICES)
         subscribe_messages(self, RECEIVES, scenario.sizes, log.add, scenario_id=scenario.id)
-        subscribe_codebooks(self, scenario, log.add)
+        command.subscribe_codebooks(self, scenario, log.add)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Calibrate, print the result and write the file; 1 if there were too few pilots in time."""
-    return run_command(
+    return command.run_command(
         _calibrate, _parser(), arguments, ['file', '--config', '--codebook', '--calibration'],
         ['--output'])
 
@@ -143,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
     has_arrays = options.file and options.file.suffix == '.npz'
     try:
-        scenario = choose_scenario(options.config, None if has_arrays else options.file)
+        scenario = command.choose_scenario(options.config, None if has_arrays else options.file)
         pilots = ([_arrays(options)] if has_arrays
                   else _collected(options, scenario, arguments))
         if options.multipath:
@@ -175,7 +168,8 @@ def _collected(
     """Return the pilots of a recording, or of a running network."""
     log = PilotLog(options.user)
     if options.file:
-        for found, _ in recorded(options.file, options.namespace, scenario, [*RECEIVES, Codebook]):
+        for found, _ in command.recorded(
+                options.file, options.namespace, scenario, [*RECEIVES, Codebook]):
             log.add(found)
     else:
         _listen(options, scenario, log, arguments)
@@ -198,11 +192,11 @@ def _listen(options: argparse.Namespace, scenario: Scenario, log: PilotLog,
             arguments: Sequence[str]) -> None:
     """Collect pilots of a running network, or raise ToolError if there are not enough in time."""
     end_s = time.monotonic() + options.timeout
-    observe(lambda: CalibratorNode(log, scenario), arguments, lambda _: (
+    command.observe(lambda: CalibratorNode(log, scenario), arguments, lambda _: (
         log.n_signals >= options.cycles and log.n_pilots >= options.cycles
         or time.monotonic() > end_s))
     if log.n_pilots < options.cycles:
-        raise none_within(f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
+        raise command.none_within(f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
 
 
 def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:

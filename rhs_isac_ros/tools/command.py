@@ -45,6 +45,8 @@ _SETTLE_S = 1.0 if is_enabled() else 0.4
 # Errors of arguments and files.
 INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
            plugins.PluginError, OSError)
+# End of the error that messages do not match the scenario.
+OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
 
 

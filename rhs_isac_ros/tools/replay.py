@@ -43,15 +43,8 @@ from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
-from rhs_isac_ros.tools.command import (
-    ToolError,
-    choose_scenario,
-    print_now,
-    recorded,
-    run_command,
-    text_table,
-    topic_prefix,
-)
+from rhs_isac_ros.tools import command
+from rhs_isac_ros.tools.command import ToolError
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
@@ -183,7 +176,7 @@ class RepublisherNode(Node):
 def _publish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Publish a recording to running nodes; return the exit code of `run`."""
     names = options.topic or [_SIGNALS]
-    scenario = choose_scenario(options.config, options.file)
+    scenario = command.choose_scenario(options.config, options.file)
     first_codebook = _first_codebook(options) if _SIGNALS in names else None
     if first_codebook:
         first_codebook.check(scenario)
@@ -209,7 +202,7 @@ def _publish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
 def _messages(
         options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, Any, float]]:
     """Yield messages of a recording with the relative names of their topics."""
-    full_names = {f'{topic_prefix(options.namespace)}{name}': name for name in names}
+    full_names = {f'{command.topic_prefix(options.namespace)}{name}': name for name in names}
     for topic, message, time_s in read(options.file, full_names):
         yield full_names[topic], message, time_s
 
@@ -288,10 +281,10 @@ def load(path: Path, namespace: str = '/', config: Path | None = None) -> Record
     RecordingError, ScenarioError
         If a file is invalid, as for `recorded`, or there is no complete cycle in the namespace.
     """
-    scenario = choose_scenario(config, path)
+    scenario = command.choose_scenario(config, path)
     log = CycleLog()
     codebooks: dict[str, Codebook] = {}
-    for found, time_s in recorded(path, namespace, scenario, [*RECEIVES, Codebook]):
+    for found, time_s in command.recorded(path, namespace, scenario, [*RECEIVES, Codebook]):
         if isinstance(found, Codebook):
             codebooks[found.id] = found
         else:
@@ -336,7 +329,7 @@ def errors_m(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the recorded position errors and those of estimators applied to the same signals."""
-    return run_command(_replay, _parser(), arguments, conflict=_conflict)
+    return command.run_command(_replay, _parser(), arguments, conflict=_conflict)
 
 
 def _conflict(options: argparse.Namespace) -> str:
@@ -366,7 +359,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     codebooks = _codebooks(recording, options.codebook)
     names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
     live = np.array([cycle.error_m for cycle in recording.cycles])
-    print_now(f'{len(live)} cycles')
+    command.print_now(f'{len(live)} cycles')
     rows = [_row(f'live {", ".join(names)}', live)]
     known = {}
     if options.calibration:
@@ -380,7 +373,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         if options.track and name == BayesEstimator.name:
             rows.append(_row('track', errors_m(
                 recording.cycles, estimators, options.track_speed)))
-    print(text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
+    print(command.text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
     return 0
 
 

@@ -1,6 +1,7 @@
 """``scripts/snapshot``: draws a picture of a running network."""
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -22,13 +23,8 @@ from rhs_isac_ros.support.arguments import (
     picture_file,
 )
 from rhs_isac_ros.support.pictures import write_picture
-from rhs_isac_ros.tools.command import (
-    ToolError,
-    choose_scenario,
-    none_within,
-    observe,
-    run_command,
-)
+from rhs_isac_ros.tools import command
+from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.pictures import compose_scene
 
 _PROGRAM = 'snapshot'
@@ -38,12 +34,10 @@ _REPORT_PERIOD_S = 0.5
 
 
 class SnapshotNode(Node):
-    """Collects the scene of its namespace.
+    """Collects the scene of its namespace, with times of `time.monotonic`.
 
     Attributes
     ----------
-    scene
-        The scene, with times of `time.monotonic`.
     mismatch
         Error of the last message that does not match the scenario; empty if there was none.
     """
@@ -52,17 +46,17 @@ class SnapshotNode(Node):
         super().__init__('snapshot', **WITHOUT_SERVICES)
         self.scene = SceneState()
         self.mismatch = ''
-        self._began_s: float | None = None
-        self._drawable_s: float | None = None
+        # Times of the first message, and at which the scene could be drawn first.
+        self._began_s = self._drawable_s = math.inf
         subscribe_messages(
             self, SCENE_RECEIVES, scenario.sizes, self._on_message, self._on_mismatch)
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()
-        self._began_s = self._began_s or now_s
+        self._began_s = min(self._began_s, now_s)
         self.scene.add(message, now_s)
-        if self._drawable_s is None and self.scene.drawable:
-            self._drawable_s = now_s
+        if self.scene.drawable:
+            self._drawable_s = min(self._drawable_s, now_s)
 
     def _on_mismatch(self, error: m.MessageError) -> None:
         self.mismatch = str(error)
@@ -72,41 +66,35 @@ class SnapshotNode(Node):
 
         It is complete, or it has been drawable for a time [s] although users lack an estimate.
         """
-        if not self._receiving_for(_REPORT_PERIOD_S):
-            return False
-        return self.scene.complete or (
-            self._drawable_s is not None and self.scene.drawable
-            and time.monotonic() > self._drawable_s + wait_s)
+        now_s, scene = time.monotonic(), self.scene
+        return now_s > self._began_s + _REPORT_PERIOD_S and (
+            scene.complete or scene.drawable and now_s > self._drawable_s + wait_s)
 
     @property
     def has_other_scenario(self) -> bool:
         """Whether the network uses another scenario: no surface configuration matches."""
         return bool(self.mismatch and self.scene.configuration is None
-                    and self._receiving_for(2 * _REPORT_PERIOD_S))
-
-    def _receiving_for(self, duration_s: float) -> bool:
-        return self._began_s is not None and time.monotonic() > self._began_s + duration_s
+                    and time.monotonic() > self._began_s + 2 * _REPORT_PERIOD_S)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw the scene when it is complete, or after some time as far as it is known."""
-    return run_command(_snapshot, _parser(), arguments, ['--config'], ['--output'])
+    return command.run_command(_snapshot, _parser(), arguments, ['--config'], ['--output'])
 
 
 def _snapshot(options: argparse.Namespace, arguments: list[str]) -> int:
-    scenario = choose_scenario(options.config)
+    scenario = command.choose_scenario(options.config)
     end_s = time.monotonic() + options.timeout
 
     def done(node: SnapshotNode) -> bool:
         return (node.is_ready(options.wait) or node.has_other_scenario
                 or time.monotonic() > end_s)
-    code, node = observe(lambda: SnapshotNode(scenario), arguments, done)
+    code, node = command.observe(lambda: SnapshotNode(scenario), arguments, done)
     if node and done(node):
         if node.mismatch and node.scene.configuration is None:
-            raise ToolError(f'{node.mismatch}; if the network uses another scenario, pass it with '
-                            '--config FILE')
+            raise ToolError(f'{node.mismatch}{command.OTHER_SCENARIO}')
         if not node.scene.users:
-            raise none_within('no user found', options.timeout)
+            raise command.none_within('no user found', options.timeout)
         draw(node.scene, scenario, options.output)
     return code
 

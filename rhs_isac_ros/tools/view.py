@@ -9,8 +9,7 @@ import os
 import signal
 import sys
 import time
-import webbrowser
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,15 +51,8 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.tools.command import (
-    ToolError,
-    choose_scenario,
-    observe,
-    print_now,
-    recorded,
-    run_command,
-    subscribe_codebooks,
-)
+from rhs_isac_ros.tools import command
+from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.rerun_stream import RerunStream
 
 # Number of codebooks, each with tables of some megabytes; more are unusual even in a recording.
@@ -95,10 +87,9 @@ class Posteriors:
         self._estimators: NewestDict[str, BayesEstimator] = NewestDict(_MAX_CODEBOOKS)
         self._tracks = Tracks()
 
-    @property
-    def codebooks(self) -> Mapping[str, object]:
-        """The codebooks that were added, by id, up to 32."""
-        return self._estimators
+    def __contains__(self, codebook_id: str) -> bool:
+        """Return whether a codebook was added, as one of the latest 32."""
+        return codebook_id in self._estimators
 
     def add(self, codebook: Codebook) -> None:
         """Prepare for signals received with a codebook, which fits the scenario."""
@@ -122,18 +113,12 @@ class Posteriors:
     ) -> TrackPoint | None:
         """Continue the track of a user whose signals arrived at `now_s` [s].
 
-        Return None before the second position, or without a known codebook.
-
-        Parameters
-        ----------
-        speed_mps
-            Typical speed of the users [m/s].
+        Return None before the second position, or without a known codebook. Users move at
+        `speed_mps` [m/s], typically.
         """
         estimator = self._estimators.get(received.codebook_id)
-        if estimator is None:
-            return None
         with contextlib.suppress(SignalError):
-            estimate = self._tracks.locate(received, estimator, speed_mps, now_s)
+            estimate = estimator and self._tracks.locate(received, estimator, speed_mps, now_s)
             if isinstance(estimate, TrackEstimate) and estimate.fix:
                 return TrackPoint(
                     received.user, estimate.mean, estimate.covariance, estimate.velocity)
@@ -170,7 +155,7 @@ class ViewNode(Node):
         self._users: set[int] = set()
         self._beam_s = -math.inf
         write(self.view.begin())
-        subscribe_codebooks(self, scenario, self._on_codebook)
+        command.subscribe_codebooks(self, scenario, self._on_codebook)
         subscribe_reports(self, lambda node, report: self._write(
             self.view.add_report(node, report)))
         subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
@@ -187,8 +172,10 @@ class ViewNode(Node):
     def _log_silence(self) -> None:
         self._silence_timer.cancel()
         if not self.view.n_cycles:
-            self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'{self.silence}; still waiting')
+            self._warn(f'{self.silence}; still waiting')
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)  # type: ignore[no-untyped-call]
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()
@@ -211,12 +198,11 @@ class ViewNode(Node):
 
     def _on_mismatch(self, error: m.MessageError) -> None:
         if not self.mismatch:
-            self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'{error}; if the network uses another scenario, pass it with --config FILE')
+            self._warn(f'{error}{command.OTHER_SCENARIO}')
         self.mismatch = str(error)
 
     def _on_codebook(self, codebook: Codebook) -> None:
-        if codebook.id not in self._requested | self._posteriors.codebooks.keys():
+        if codebook.id not in self._requested and codebook.id not in self._posteriors:
             self._requested.add(codebook.id)
             self._worker.run(functools.partial(self._posteriors.add, codebook),
                              lambda _: self._on_added(codebook))
@@ -230,8 +216,8 @@ class ViewNode(Node):
     def _search(self) -> None:
         """Start the search for the modes of the latest signals, unless one is running."""
         received = self._waiting
-        if received is None or self._is_searching or (
-                received.codebook_id not in self._posteriors.codebooks):
+        if (received is None or self._is_searching
+                or received.codebook_id not in self._posteriors):
             return
         self._waiting, self._is_searching = None, True
         self._worker.run(functools.partial(self._posteriors.modes, received),
@@ -287,12 +273,12 @@ def entries(
         If the file is invalid, as for `recorded`, or there is no cycle in the namespace.
     """
     view = NetworkView(scenario)
-    for codebook, _ in recorded(path, namespace, scenario, [Codebook]):
-        if codebook.id not in posteriors.codebooks:
+    for codebook, _ in command.recorded(path, namespace, scenario, [Codebook]):
+        if codebook.id not in posteriors:
             posteriors.add(codebook)
             view.set_bound(codebook.id, posteriors.bound_m2(codebook))
     yield from view.begin()
-    for found, time_s in recorded(path, namespace, scenario, [*RECEIVES, Report]):
+    for found, time_s in command.recorded(path, namespace, scenario, [*RECEIVES, Report]):
         if isinstance(found, tuple):
             yield from view.add_report(*found)
             continue
@@ -313,7 +299,7 @@ def entries(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Show a network or a recording until a signal arrives, or write a file."""
-    return run_command(
+    return command.run_command(
         _view, _parser(), arguments, ['file', '--config', '--calibration'], ['--save'],
         _conflict)
 
@@ -330,14 +316,18 @@ def _conflict(options: argparse.Namespace) -> str:
 def _view(options: argparse.Namespace, arguments: list[str]) -> int:
     stream = RerunStream()
     try:
-        scenario = choose_scenario(options.config, options.file)
-        surface = (load_surface(str(options.calibration), scenario) if options.calibration
-                   else None)
-        posteriors = Posteriors(scenario, surface)
+        scenario = command.choose_scenario(options.config, options.file)
+        posteriors = Posteriors(scenario, load_surface(str(options.calibration or ''), scenario))
         _open(stream, options)
-        if options.file is None:
-            return _show_live(stream, scenario, posteriors, options, arguments)
-        return _show_recording(stream, scenario, posteriors, options)
+        if options.file:
+            code = _show_recording(stream, scenario, posteriors, options)
+        else:
+            code = _show_live(stream, scenario, posteriors, options, arguments)
+        if not code:
+            stream.close()
+            if options.save:
+                print(options.save)
+        return code
     finally:
         # After `close`, there is nothing left to discard.
         stream.discard()
@@ -353,9 +343,7 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
     except (OSError, RuntimeError) as error:
         raise ToolError(f'{options.bind}, ports {options.port} to {options.port + 2}: {error}; '
                          'choose others with --port') from None
-    print_now(address)
-    if options.open:
-        webbrowser.open(address)
+    command.print_now(address)
 
 
 def _show_live(
@@ -363,13 +351,11 @@ def _show_live(
         options: argparse.Namespace, arguments: Sequence[str]) -> int:
     # With many messages, the background threads would otherwise wait 5 ms for each step.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    code, node = observe(
+    code, node = command.observe(
         lambda: ViewNode(scenario, posteriors, stream.write), arguments,
         lambda node: bool(options.cycles) and node.view.n_ended >= options.cycles)
     if options.save and node and not node.view.n_cycles:
         raise ToolError(f'{options.save} is not written: {node.silence}')
-    if not code:
-        _finish(stream, options)
     return code
 
 
@@ -386,15 +372,7 @@ def _show_recording(
         options.cycles)))
     while not (signals or options.save):
         time.sleep(_POLL_S)
-    _finish(stream, options)
     return 0
-
-
-def _finish(stream: RerunStream, options: argparse.Namespace) -> None:
-    """End the service, or complete the file and print its name."""
-    stream.close()
-    if options.save:
-        print(options.save)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -419,7 +397,6 @@ def _parser() -> argparse.ArgumentParser:
     add('--bind', default='127.0.0.1', metavar='ADDRESS',
         help='address that the viewer listens on; by default only this machine can connect, '
         'with 0.0.0.0 any other')
-    add('--open', action='store_true', help='open the browser')
     add = parser.add_argument_group('recording').add_argument
     add('--namespace', help='namespace of the recorded network (default: /)')
     add('--track', action='store_true',
