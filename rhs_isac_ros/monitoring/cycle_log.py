@@ -161,12 +161,18 @@ class CycleLog:
                 record.estimate = message
             case m.Capacity():
                 record.capacity = message
-            case m.ProtocolState() if message.outcome:
-                self._end(record, message, now_s)
             case m.ProtocolState():
                 record.user, record.state = message.user, message
-                record.phase_s[message.phase] = now_s
-        self._close(record)
+                if message.outcome:
+                    if not record.outcome:
+                        self.ended.append(record)
+                    record.outcome, record.ended_s = message.outcome, now_s
+                else:
+                    record.phase_s[message.phase] = now_s
+        if cycle := record.completed():
+            self.complete.append(cycle)
+        if cycle or record.outcome not in ('', 'served'):
+            del self._open[record.cycle_id]
 
     def clear(self) -> None:
         """Discard all cycles that have ended."""
@@ -181,18 +187,3 @@ class CycleLog:
             record.began_s = now_s
         while len(self._open) > _MAX_OPEN_CYCLES:
             del self._open[next(iter(self._open))]
-
-    def _end(self, record: CycleRecord, state: m.ProtocolState, now_s: float) -> None:
-        if not record.outcome:
-            self.ended.append(record)
-        record.user, record.outcome, record.ended_s = state.user, state.outcome, now_s
-        record.state = state
-
-    def _close(self, record: CycleRecord) -> None:
-        """Stop collecting messages for a record that is complete or was given up."""
-        cycle = record.completed()
-        if cycle is not None:
-            self.complete.append(cycle)
-        elif record.outcome in ('', 'served'):
-            return
-        del self._open[record.cycle_id]

@@ -57,15 +57,10 @@ _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects received signals, the true positions of their users, and codebooks.
+    """Collects received signals of one user or, if 0, all, their true positions, and codebooks.
 
     Unlike in a `CycleLog`, cycles without a fix count: before a calibration, there may be no
     others.
-
-    Parameters
-    ----------
-    user
-        The only user whose signals are collected; 0 for all users.
     """
 
     def __init__(self, user: int = 0) -> None:
@@ -84,10 +79,10 @@ class PilotLog:
             case m.ReceivedSignals() if self._user in (0, found.user):
                 self._signals.setdefault(found.cycle_id, found)
 
-    @property
-    def n_signals(self) -> int:
-        """Number of phases whose signals were received."""
-        return len(self._signals)
+    def has_pilots(self, n: int) -> bool:
+        """Return whether position and codebook of a number of pilots are known."""
+        # There are at most as many as signals, which are quicker to count.
+        return len(self._signals) >= n and self.n_pilots >= n
 
     @property
     def n_pilots(self) -> int:
@@ -192,10 +187,10 @@ def _listen(options: argparse.Namespace, scenario: Scenario, log: PilotLog,
             arguments: Sequence[str]) -> None:
     """Collect pilots of a running network, or raise ToolError if there are not enough in time."""
     end_s = time.monotonic() + options.timeout
-    command.observe(lambda: CalibratorNode(log, scenario), arguments, lambda _: (
-        log.n_signals >= options.cycles and log.n_pilots >= options.cycles
-        or time.monotonic() > end_s))
-    if log.n_pilots < options.cycles:
+    command.observe(
+        lambda: CalibratorNode(log, scenario), arguments,
+        lambda _: log.has_pilots(options.cycles) or time.monotonic() > end_s)
+    if not log.has_pilots(options.cycles):
         raise command.none_within(f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
 
 
@@ -228,16 +223,13 @@ def _prior(scenario: Scenario, options: argparse.Namespace) -> SurfacePrior:
 
 def _error(scenario: Scenario, pilots: Sequence[Pilots], surface: SurfaceEstimate | None) -> str:
     """Return root mean square error and number of missing fixes as text."""
-    errors: list[np.ndarray] = []
-    left = _N_COMPARED
+    distances = np.empty(0)
     for group in pilots:
-        if not isinstance(group.beams, Codebook) or not left:
-            continue
-        estimator = make_estimator('bayes', scenario, group.beams, surface=surface)
-        estimate = estimator.estimate(group.received[:left])
-        errors.append(np.linalg.norm(estimate.mean - group.positions[:left], axis=1))
-        left -= len(errors[-1])
-    distances = np.concatenate(errors)
+        left = _N_COMPARED - len(distances)
+        if isinstance(group.beams, Codebook) and left:
+            estimator = make_estimator('bayes', scenario, group.beams, surface=surface)
+            errors = estimator.estimate(group.received[:left]).mean - group.positions[:left]
+            distances = np.append(distances, np.linalg.norm(errors, axis=1))
     fixes = distances[np.isfinite(distances)]
     rms = f'{np.sqrt(np.mean(fixes**2)):.3f} m rms' if len(fixes) else 'none'
     return f'{rms}, {len(distances) - len(fixes)} of {len(distances)} without a fix'

@@ -107,15 +107,7 @@ def print_now(*values: object, end: str = '\n') -> None:
 
 
 def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Return a table of cells.
-
-    Parameters
-    ----------
-    heads
-        Headings, which may have several lines.
-    align
-        ``<`` or ``>`` for each column.
-    """
+    """Return a table; `align` is ``<`` or ``>`` for each column, whose head may have two lines."""
     lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return '\n'.join('  '.join(
@@ -134,10 +126,7 @@ def observe(
         done: Callable[[_NodeT], bool] = lambda node: False) -> tuple[int, _NodeT | None]:
     """Spin a node until a signal arrives or it is done.
 
-    Returns
-    -------
-    tuple
-        Exit code of `rhs_isac_ros.ros.run.run`, and the node; None if it could not be created.
+    Return the exit code of `rhs_isac_ros.ros.run.run`, and the node, or None if that fails.
     """
     nodes: list[_NodeT] = []
 
@@ -177,18 +166,13 @@ def topic_prefix(namespace: str) -> str:
 def recorded(
         path: Path, namespace: str, scenario: Scenario, kinds: Collection[type]
 ) -> Iterator[tuple[Any, float]]:
-    """Yield what a network published, from a recording, in the order in which it was written.
+    """Yield what a network published, and when [s], in the order in which it was recorded.
 
     Parameters
     ----------
     kinds
         Messages of the protocol; also `Codebook`, and `Report` for pairs of the name of a node and
         its report.
-
-    Yields
-    ------
-    tuple
-        Message and time of recording [s].
 
     Raises
     ------
@@ -220,13 +204,7 @@ def recorded(
 
 
 class Session:
-    """A context manager with one node, which the command itself spins.
-
-    Parameters
-    ----------
-    arguments
-        Name of the program and command line with the ROS arguments.
-    """
+    """A context manager with one node, which the command itself spins."""
 
     def __init__(self, arguments: Sequence[str] = ('',)) -> None:
         use_discovery_profile()
@@ -258,13 +236,7 @@ class Session:
         return True
 
     def discover(self, timeout_s: float) -> None:
-        """Spin until other nodes have been discovered and the graph no longer changes.
-
-        Parameters
-        ----------
-        timeout_s
-            Maximum duration [s].
-        """
+        """Spin until the graph has other nodes and no longer changes, or for a time [s]."""
         graph, changed_s = self._graph(), time.monotonic()
 
         def settled() -> bool:

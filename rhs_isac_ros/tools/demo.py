@@ -82,12 +82,7 @@ def max_user_processes() -> int:
 
 
 def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
-    """Load a scenario, by default the paper's Table I, and check that a codebook matches it.
-
-    Returns
-    -------
-    tuple of Scenario and pathlib.Path
-        The scenario, and the absolute path of the codebook file, by default that of the package.
+    """Return a scenario, and the absolute path of a codebook file that matches it.
 
     Raises
     ------
@@ -161,7 +156,7 @@ def watch(
     Returns
     -------
     str
-        Description of the error that ended the wait; empty if there was none.
+        The error that ended the wait; empty if there was none.
     """
     seen, changed_s = -1, time.monotonic()
     while seen < cycles:
@@ -205,17 +200,16 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
     lengths = np.array([cycle.duration_s for cycle in cycles])
     losses = np.array([cycle.capacity.loss_percent for cycle in cycles])
     users = len({cycle.user for cycle in cycles})
-    lines = [
+    return '\n'.join([
         f'{len(cycles)} cycles of {users} users served, {len(given_up)} given up',
         f'position error: median {np.median(errors):.2f} m, root mean square '
         f'{np.sqrt(np.mean(errors**2)):.2f} m; median √CRLB {np.median(bounds):.2f} m',
         f'cycle: median {1e3 * np.nanmedian(lengths):.1f} ms; estimator: median '
         f'{1e3 * np.median([cycle.estimate.latency_s for cycle in cycles]):.1f} ms',
         f'capacity: median {np.median([c.capacity.actual_bps for c in cycles]) / 1e6:.2f} '
-        f'Mbit/s; loss: median {np.median(losses):.3f} %, worst {losses.max():.3f} %']
-    lines += [f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
-              for record in given_up]
-    return '\n'.join(lines)
+        f'Mbit/s; loss: median {np.median(losses):.3f} %, worst {losses.max():.3f} %',
+        *(f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
+          for record in given_up)])
 
 
 def process_age_s() -> float | None:
@@ -237,17 +231,16 @@ class Parts:
 
     def __init__(self, begin_s: float) -> None:
         self._begin_s = self._last_s = begin_s
-        self._parts: list[tuple[str, float]] = []
+        self._parts: list[str] = []
 
     def end(self, part: str, now_s: float) -> None:
         """End a part, which began at the end of the previous one."""
-        self._parts.append((part, now_s - self._last_s))
+        self._parts.append(f'{part} {now_s - self._last_s:.2f}')
         self._last_s = now_s
 
     def text(self) -> str:
         """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.4, ...)``."""
-        parts = ', '.join(f'{name} {duration_s:.2f}' for name, duration_s in self._parts)
-        return f'time: {self._last_s - self._begin_s:.2f} s ({parts})'
+        return f'time: {self._last_s - self._begin_s:.2f} s ({", ".join(self._parts)})'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -262,9 +255,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     check_domain(parser)
-    together = options.users > min(MAX_USER_NODES, max_user_processes())
-    if together:
-        print(f'the {options.users} users share one process', file=sys.stderr)
     check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
                    {'--record': options.record, '--picture': options.picture})
     try:
@@ -272,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recorder = Recorder(options.record, scenario) if options.record else None
         os.environ.update(private_domain())
         use_discovery_profile()
-        return _run(scenario, codebook_file, recorder, options, together, _parts())
+        return _run(scenario, codebook_file, recorder, options)
     except CodebookError as error:
         print_error(f'{error}; to create a codebook for a scenario: python3 -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
@@ -283,9 +273,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(
         scenario: Scenario, codebook_file: Path, recorder: Recorder | None,
-        options: argparse.Namespace, together: bool, parts: Parts) -> int:
+        options: argparse.Namespace) -> int:
     """Run the network until its cycles are complete, and report on them; return the exit code."""
-    log, code = CycleLog(), 0
+    log, code, parts = CycleLog(), 0, _parts()
+    together = options.users > min(MAX_USER_NODES, max_user_processes())
+    if together:
+        print(f'the {options.users} users share one process', file=sys.stderr)
     # The parameter does not admit 0.
     positioner = {} if options.prior == REGION else {
         'prior': options.prior, 'track_speed_mps': max(scenario.max_user_speed_mps, 0.01)}
@@ -315,10 +308,8 @@ def _run(
 def _parts() -> Parts:
     """Return the parts of the run so far: the scripts, and the imports of this process."""
     now_s, age_s = time.monotonic(), process_age_s()
-    if age_s is None:
-        parts = Parts(STARTED_S)
-    else:
-        parts = Parts(now_s - age_s)
+    parts = Parts(STARTED_S if age_s is None else now_s - age_s)
+    if age_s is not None:
         parts.end('environment', STARTED_S)
     parts.end('imports', now_s)
     return parts
@@ -378,15 +369,15 @@ def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='demo', description='Start a network, every node as a process, and report on its '
         'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
-    parser.add_argument('--cycles', type=positive_int, default=20, help='cycles to wait for')
+    add = parser.add_argument
+    add('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
+    add('--cycles', type=positive_int, default=20, help='cycles to wait for')
     add_network_options(parser)
-    parser.add_argument('--prior', choices=PRIORS, default=REGION,
-                        help='prior of the positions: the region, or the track of each user')
-    parser.add_argument('--record', type=output_file, metavar='FILE',
-                        help='recording to write (MCAP)')
-    parser.add_argument('--picture', type=picture_file, default='demo.png', metavar='FILE',
-                        help='file to draw: PNG, PDF or SVG')
+    add('--prior', choices=PRIORS, default=REGION,
+        help='prior of the positions: the region, or the track of each user')
+    add('--record', type=output_file, metavar='FILE', help='recording to write (MCAP)')
+    add('--picture', type=picture_file, default='demo.png', metavar='FILE',
+        help='file to draw: PNG, PDF or SVG')
     return parser
 
 

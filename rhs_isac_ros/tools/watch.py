@@ -36,13 +36,7 @@ _DIAGNOSTICS_TIMEOUT_S = 1.3
 
 
 def render(overview: Overview, now_s: float) -> 'RenderableType':
-    """Return the view at a time [s], on the clock of the overview, for a console of rich.
-
-    Raises
-    ------
-    ImportError
-        If rich is not installed.
-    """
+    """Return the view at a time [s], on the clock of the overview, for a console of rich."""
     from rich.console import Group
 
     return Group(_header(overview, now_s), _users(overview, now_s), _nodes(overview, now_s))
@@ -126,13 +120,7 @@ def _printable(text: str) -> str:
 
 
 class WatchNode(Node):
-    """Maintains an overview of its namespace.
-
-    Attributes
-    ----------
-    overview
-        The overview, with times of `time.monotonic`.
-    """
+    """Maintains an overview of its namespace, with times of `time.monotonic`."""
 
     def __init__(self) -> None:
         super().__init__('watch', **WITHOUT_SERVICES)

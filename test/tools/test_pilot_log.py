@@ -38,6 +38,7 @@ def test_signals_are_paired_with_the_position_of_their_cycle(log, codebook):
         log.add(message)
     (pilots,) = log.pilots()
     assert (log.n_pilots, pilots.beams) == (2, codebook)
+    assert log.has_pilots(2) and not log.has_pilots(3)
     np.testing.assert_array_equal(pilots.positions[:, 1], [2, 1])
     np.testing.assert_array_equal(pilots.received[:, 0, 0], [2 + 1j, 1 + 1j])
 
@@ -47,7 +48,8 @@ def test_signals_are_paired_with_the_position_of_their_cycle(log, codebook):
 def test_positions_of_others_do_not_count(log, codebook, message):
     log.add(message)
     log.add(signals(3, codebook.id))
-    assert (log.n_signals, log.n_pilots, log.pilots()) == (1, 0, [])
+    assert (log.n_pilots, log.pilots()) == (0, [])
+    assert not log.has_pilots(1)
 
 
 def test_repeated_signals_count_once(log, codebook):
