@@ -255,7 +255,7 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
     This is the mean of (v_0 g^U / (4 pi f_c,i r))^2, with the distance r from the surface's
     centre. A gain pattern g^U is evaluated at the angle from the boresight there.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
+    nodes, weights = legendre_quadrature(_ROI_NODES)
     low, high = scenario.roi_bounds_m
     x, y, z = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     squares = x[:, None, None]**2 + y[:, None]**2 + z**2
@@ -404,6 +404,15 @@ def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     return tuple(stretches)
 
 
+@functools.cache
+def legendre_quadrature(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the n nodes and weights of the Gauss-Legendre quadrature over [-1, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    # The arrays are shared by all callers.
+    nodes.flags.writeable = weights.flags.writeable = False
+    return nodes, weights
+
+
 def complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Draw circularly symmetric complex normal numbers of unit variance, complex128."""
     return rng.standard_normal((*shape, 2)).view(complex)[..., 0] * np.sqrt(0.5)
@@ -421,7 +430,7 @@ def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase
     The phase [rad] over the elements determines the number. Of an even profile, only the positive
     angles are included.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
+    nodes, weights = legendre_quadrature(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
     signs = (1,) if is_even else (-1, 1)

@@ -23,6 +23,7 @@ import numpy as np
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
+    legendre_quadrature,
     measurement_correlation,
     spatial_covariance,
 )
@@ -233,7 +234,7 @@ def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
     The gain is that of the direct path, averaged over the region of interest, and of the
     multipath. Returns complex128 [N_SB F, N_SB F, N_E], read-only.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
+    nodes, weights = legendre_quadrature(_ROI_NODES)
     low, high = scenario.roi_bounds_m
     axes = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     positions = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
