@@ -1,13 +1,13 @@
 """What the commands share: their entry, nodes that observe a network, recordings, and tables."""
 
 import argparse
+import contextlib
 import itertools
 import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import rclpy
@@ -203,7 +203,7 @@ def recorded(
             raise RecordingError(f'{path}: {topic}: {error}') from None
 
 
-class Session:
+class Session(contextlib.AbstractContextManager['Session']):
     """A context manager with one node, which the command itself spins."""
 
     def __init__(self, arguments: Sequence[str] = ('',)) -> None:
@@ -214,13 +214,7 @@ class Session:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
 
-    def __enter__(self) -> 'Session':
-        """Return `self`."""
-        return self
-
-    def __exit__(
-            self, kind: type[BaseException] | None, error: BaseException | None,
-            traceback: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         """Destroy the node and shut the context down."""
         self._executor.shutdown()
         self.node.destroy_node()

@@ -226,21 +226,20 @@ def process_age_s() -> float | None:
         return None
 
 
-class Parts:
-    """Consecutive parts of a duration; times are those of `time.monotonic` [s]."""
+def parts_text(begin_s: float, parts: Sequence[tuple[str, float]]) -> str:
+    """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.40, ...)``.
 
-    def __init__(self, begin_s: float) -> None:
-        self._begin_s = self._last_s = begin_s
-        self._parts: list[str] = []
-
-    def end(self, part: str, now_s: float) -> None:
-        """End a part, which began at the end of the previous one."""
-        self._parts.append(f'{part} {now_s - self._last_s:.2f}')
-        self._last_s = now_s
-
-    def text(self) -> str:
-        """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.4, ...)``."""
-        return f'time: {self._last_s - self._begin_s:.2f} s ({", ".join(self._parts)})'
+    Parameters
+    ----------
+    begin_s
+        Time at which the first part began [s].
+    parts
+        Name of each part, and the time at which it ended [s].
+    """
+    times_s = [begin_s, *(end_s for _, end_s in parts)]
+    texts = [f'{name} {end_s - start_s:.2f}' for (name, end_s), start_s in zip(
+        parts, times_s, strict=False)]
+    return f'time: {times_s[-1] - begin_s:.2f} s ({", ".join(texts)})'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -275,7 +274,11 @@ def _run(
         scenario: Scenario, codebook_file: Path, recorder: Recorder | None,
         options: argparse.Namespace) -> int:
     """Run the network until its cycles are complete, and report on them; return the exit code."""
-    log, code, parts = CycleLog(), 0, _parts()
+    log, code = CycleLog(), 0
+    now_s, age_s = time.monotonic(), process_age_s()
+    parts = [('imports', now_s)]
+    if age_s is not None:
+        parts.insert(0, ('environment', STARTED_S))
     together = options.users > min(MAX_USER_NODES, max_user_processes())
     if together:
         print(f'the {options.users} users share one process', file=sys.stderr)
@@ -300,24 +303,14 @@ def _run(
             with contextlib.suppress(KeyboardInterrupt):
                 code = _report(log, scenario, options, problem)
     if log.complete:
-        parts.end('end', time.monotonic())
-        print(parts.text())
+        parts.append(('end', time.monotonic()))
+        print(parts_text(STARTED_S if age_s is None else now_s - age_s, parts))
     return code
-
-
-def _parts() -> Parts:
-    """Return the parts of the run so far: the scripts, and the imports of this process."""
-    now_s, age_s = time.monotonic(), process_age_s()
-    parts = Parts(STARTED_S if age_s is None else now_s - age_s)
-    if age_s is not None:
-        parts.end('environment', STARTED_S)
-    parts.end('imports', now_s)
-    return parts
 
 
 def _observe(
         log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int,
-        parts: Parts) -> str:
+        parts: list[tuple[str, float]]) -> str:
     """Observe a number of cycles, and return the error that ended them; empty if none did."""
     # The network needs a moment to start.
     prepare_drawing()
@@ -332,9 +325,9 @@ def _observe(
         if log.complete:
             begin_s = log.complete[0].began_s
             # On a busy machine, a cycle may end before this process has discovered all nodes.
-            parts.end('start and discovery of the nodes', min([*discovered_s, begin_s]))
-            parts.end('codebook and tables', begin_s)
-            parts.end('cycles', log.complete[-1].ended_s)
+            parts += [('start and discovery of the nodes', min([*discovered_s, begin_s])),
+                      ('codebook and tables', begin_s),
+                      ('cycles', log.complete[-1].ended_s)]
         observer.destroy_node()  # type: ignore[no-untyped-call]
         try_shutdown()
 

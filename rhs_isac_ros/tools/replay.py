@@ -5,6 +5,7 @@ With ``--publish``, it publishes them to running nodes instead.
 
 import argparse
 import dataclasses
+import math
 import sys
 import tempfile
 import time
@@ -55,8 +56,6 @@ _DISCOVERY_TIMEOUT_S = 2.0
 # complete [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
 _ACK_TIMEOUT = Duration(seconds=5)
-
-
 # Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
 # and announcements of nodes would contradict those of the running nodes.
 _TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
@@ -95,10 +94,7 @@ class RepublisherNode(Node):
         super().__init__('replay', **WITHOUT_SERVICES)
         self.optimizer: OptimizerNode | None = None
         self.count, self.finished, self.waits_for = 0, False, next(iter(names))
-        self._messages, self._rate = iter(messages), rate
-        self._next: tuple[str, Any, float] | None = None
-        # Time on the steady clock at the recorded time 0 [s]; None before the first message.
-        self._origin_s: float | None = None
+        self._waits_s = self._publish(messages, rate)
         # Endpoints at the last poll, and the time since when they are the same [s].
         self._endpoints: list[tuple[int, int]] = []
         self._unchanged_since_s = time.monotonic()
@@ -112,9 +108,8 @@ class RepublisherNode(Node):
             (name for name in self._message_publishers if not self._has_subscribers(name)), '')
         if self._endpoints_settled() and not self.waits_for:
             self._timer.cancel()
-            self._next = next(self._messages, None)
-            self._timer = steady_timer(self, _POLL_PERIOD_S, self._publish_due)
-            self._publish_due()
+            self._timer = steady_timer(self, _POLL_PERIOD_S, self._continue)
+            self._continue()
 
     def _endpoints_settled(self) -> bool:
         """Return whether no endpoint of the topics has appeared or gone for some time."""
@@ -140,29 +135,34 @@ class RepublisherNode(Node):
             n_expected = len(subscribers)
         return publisher.get_subscription_count() >= n_expected
 
-    def _publish_due(self) -> None:
+    def _continue(self) -> None:
         """Publish the messages that are due, and set the timer for the next one."""
-        while self._next:
-            name, message, time_s = self._next
-            now_s = time.monotonic()
-            if self._origin_s is None and name != topics.CODEBOOK:
-                self._origin_s = now_s - time_s / self._rate
-            due_s = now_s if self._origin_s is None else self._origin_s + time_s / self._rate
-            if (wait_s := due_s - now_s) > 0:
-                self._timer.timer_period_ns = max(int(wait_s * 1e9), 1)
-                self._timer.reset()
-                return
+        if (wait_s := next(self._waits_s, None)) is not None:
+            self._timer.timer_period_ns = max(int(wait_s * 1e9), 1)
+            self._timer.reset()
+            return
+        self._timer.cancel()
+        for publisher in self._message_publishers.values():
+            publisher.wait_for_all_acked(_ACK_TIMEOUT)
+        self.finished = True
+
+    def _publish(
+            self, messages: Iterable[tuple[str, Any, float]], rate: float) -> Iterator[float]:
+        """Publish messages; yield the time until the next one is due, whenever it is not [s]."""
+        # Time on the steady clock at the recorded time 0 [s]. Codebooks before the first message
+        # are due at once.
+        origin_s = -math.inf
+        for name, message, time_s in messages:
+            if origin_s == -math.inf and name != topics.CODEBOOK:
+                origin_s = time.monotonic() - time_s / rate
+            while (wait_s := origin_s + time_s / rate - time.monotonic()) > 0:
+                yield wait_s
             if name != topics.CODEBOOK:
                 self._message_publishers[name].publish(message)
                 self.count += 1
             elif self.optimizer:
                 self.optimizer.set_parameters_atomically(
                     _parameters(convert.codebook_from_ros(message)))
-            self._next = next(self._messages, None)
-        self._timer.cancel()
-        for publisher in self._message_publishers.values():
-            publisher.wait_for_all_acked(_ACK_TIMEOUT)
-        self.finished = True
 
     def check(self, end_s: float, timeout_s: float) -> None:
         """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
@@ -173,7 +173,7 @@ class RepublisherNode(Node):
             raise ToolError(f'{self.waits_for}: no subscriber within {timeout_s:g} s')
 
 
-def _publish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Publish a recording to running nodes; return the exit code of `run`."""
     names = options.topic or [_SIGNALS]
     scenario = command.choose_scenario(options.config, options.file)
@@ -186,9 +186,14 @@ def _publish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     def create() -> list[Node]:
         node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names, options.rate)
         nodes.append(node)
-        if first_codebook and not _optimizer_present(node):
-            node.optimizer = _optimizer(scenario, first_codebook)
-        return [node, *filter(None, [node.optimizer])]
+        if first_codebook is None:
+            return [node]
+        if _optimizer_present(node):
+            print(f'using the codebook of the {topics.OPTIMIZER_NODE} in the namespace',
+                  file=sys.stderr)
+            return [node]
+        node.optimizer = _optimizer(scenario, first_codebook)
+        return [node, node.optimizer]
 
     def done() -> bool:
         nodes[0].check(end_s, options.timeout)
@@ -242,12 +247,8 @@ def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
 
 
 def _optimizer_present(node: Node) -> bool:
-    present = AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
+    return AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
         _DISCOVERY_TIMEOUT_S)
-    if present:
-        print(f'using the codebook of the {topics.OPTIMIZER_NODE} in the namespace',
-              file=sys.stderr)
-    return present
 
 
 def _parameters(codebook: Codebook) -> list[Parameter]:
@@ -354,7 +355,7 @@ def _conflict(options: argparse.Namespace) -> str:
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     """Publish a recording, or print a table of its errors and of those of estimators."""
     if options.publish:
-        return _publish(options, arguments)
+        return _republish(options, arguments)
     recording = load(options.file, options.namespace, options.config)
     codebooks = _codebooks(recording, options.codebook)
     names = sorted({cycle.estimate.estimator for cycle in recording.cycles})

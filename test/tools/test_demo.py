@@ -6,7 +6,7 @@ import pytest
 
 from rhs_isac_ros.executables import STARTED_S
 from rhs_isac_ros.tools import demo
-from rhs_isac_ros.tools.demo import Parts, main, process_age_s
+from rhs_isac_ros.tools.demo import main, parts_text, process_age_s
 
 # That of the clock in which the system gives the start of a process.
 RESOLUTION_S = 0.02
@@ -35,10 +35,8 @@ def test_a_signal_during_the_start_completes_the_recording(tmp_path, monkeypatch
 
 
 def test_the_text_contains_the_total_and_each_part():
-    parts = Parts(10.0)
-    parts.end('imports', 10.5)
-    parts.end('cycles', 12.25)
-    assert parts.text() == 'time: 2.25 s (imports 0.50, cycles 1.75)'
+    assert parts_text(10.0, [('imports', 10.5), ('cycles', 12.25)]) == (
+        'time: 2.25 s (imports 0.50, cycles 1.75)')
 
 
 @pytest.mark.skipif(not demo._STAT_FILE.exists(), reason='this system has no /proc')
