@@ -176,18 +176,18 @@ class UserState:
             return math.nan
         return float(np.linalg.norm(estimate.position - truth.position))
 
-    def add_truth(self, truth: m.GroundTruth) -> None:
-        """Add a true position."""
-        self.truth = truth
-        if truth.cycle_id:
-            self._cycle_truth = truth
-        if not self.true_path or math.dist(self.true_path[-1], truth.position) > _MIN_STEP_M:
-            self.true_path.append(truth.position)
-
-    def add_estimate(self, estimate: m.PositionEstimate) -> None:
-        """Add an estimate."""
-        self.estimate = estimate
-        self.estimated_path.append(estimate.position)
+    def add(self, message: m.GroundTruth | m.PositionEstimate, now_s: float) -> None:
+        """Add a true position or an estimate that arrived at `now_s` [s]."""
+        self.updated_s = now_s
+        if isinstance(message, m.PositionEstimate):
+            self.estimate = message
+            self.estimated_path.append(message.position)
+            return
+        self.truth = message
+        if message.cycle_id:
+            self._cycle_truth = message
+        if not self.true_path or math.dist(self.true_path[-1], message.position) > _MIN_STEP_M:
+            self.true_path.append(message.position)
 
 
 class SceneState:
@@ -218,20 +218,10 @@ class SceneState:
             case m.GroundTruths():
                 for truth in message.each():
                     self.add(truth, now_s)
-            case m.GroundTruth():
-                if state := self._updated_user(message.user, now_s):
-                    state.add_truth(message)
-            case m.PositionEstimate():
-                if state := self._updated_user(message.user, now_s):
-                    state.add_estimate(message)
-
-    def _updated_user(self, user: int, now_s: float) -> UserState | None:
-        """Return the state of a user; None if it is new and there are too many."""
-        if user not in self.users and len(self.users) >= MAX_USERS:
-            return None
-        state = self.users.setdefault(user, UserState(user, now_s))
-        state.updated_s = now_s
-        return state
+            case m.GroundTruth() | m.PositionEstimate():
+                if message.user in self.users or len(self.users) < MAX_USERS:
+                    self.users.setdefault(message.user, UserState(message.user, now_s)).add(
+                        message, now_s)
 
     def discard_stale(self, before_s: float) -> list[int]:
         """Discard users and a beam without a message since `before_s` [s]; return the users.
@@ -263,19 +253,19 @@ class SceneState:
     @property
     def shown_user(self) -> UserState | None:
         """The user of the latest cycle with estimate and beam, or else with an estimate."""
-        if self.beam is not None:
-            state = self.users.get(self.beam.user)
-            if state and state.estimate and state.estimate.cycle_id == self.beam.cycle_id:
-                return state
-        estimated = [state for state in self.users.values() if state.estimate]
-        return max(estimated, key=lambda state: (
-            state.estimate.cycle_id if state.estimate else 0, state.user), default=None)
+        state = self.users.get(self.beam.user) if self.beam else None
+        if state and state.estimate and self.beam and (
+                state.estimate.cycle_id == self.beam.cycle_id):
+            return state
+        cycles = [(state.estimate.cycle_id, user) for user, state in self.users.items()
+                  if state.estimate]
+        return self.users[max(cycles)[1]] if cycles else None
 
     @property
     def shown_beam(self) -> m.Beam | None:
         """The beam of the cycle in which the shown user was estimated; None if it is unknown."""
-        shown = self.shown_user
-        if shown is None or shown.estimate is None or self.beam is None:
-            return None
-        same = (shown.user, shown.estimate.cycle_id) == (self.beam.user, self.beam.cycle_id)
-        return self.beam if same else None
+        shown, beam = self.shown_user, self.beam
+        if shown and shown.estimate and beam and (
+                (shown.user, shown.estimate.cycle_id) == (beam.user, beam.cycle_id)):
+            return beam
+        return None

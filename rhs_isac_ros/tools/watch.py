@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -145,9 +145,14 @@ def _watch(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def _show_live(arguments: Sequence[str]) -> int:
-    drawn_s = 0.0
-    with contextlib.ExitStack() as stack:
-        draw, period_s = _renderer(stack)
+    """Replace the view on a terminal; print the views one after the other elsewhere."""
+    from rich.console import Console
+    from rich.live import Live
+
+    console, drawn_s = Console(), 0.0
+    on_terminal = Live(console=console, screen=True, auto_refresh=False)
+    with on_terminal if console.is_terminal else contextlib.nullcontext() as live:
+        period_s = _REFRESH_PERIOD_S if live else _PRINT_PERIOD_S
 
         def refresh(node: WatchNode) -> bool:
             """Draw between two executor iterations; an exception here ends the program."""
@@ -155,32 +160,16 @@ def _show_live(arguments: Sequence[str]) -> int:
             now_s = time.monotonic()
             if now_s > drawn_s + period_s:
                 drawn_s = now_s
-                draw(render(node.overview, now_s))
+                view = render(node.overview, now_s)
+                if live:
+                    live.update(view, refresh=True)
+                else:
+                    with console.capture() as text:
+                        console.print(view)
+                    print_now(text.get())
             return False
         code, _ = observe(WatchNode, arguments, refresh)
         return code
-
-
-def _renderer(
-        stack: contextlib.ExitStack) -> tuple[Callable[['RenderableType'], None], float]:
-    """Return a function that shows a view, and the period of its calls [s].
-
-    On a terminal, each view replaces the previous one until the stack is closed; otherwise the
-    views are printed one after the other.
-    """
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console()
-    if console.is_terminal:
-        live = stack.enter_context(Live(console=console, screen=True, auto_refresh=False))
-        return lambda view: live.update(view, refresh=True), _REFRESH_PERIOD_S
-
-    def print_view(view: 'RenderableType') -> None:
-        with console.capture() as text:
-            console.print(view)
-        print_now(text.get())
-    return print_view, _PRINT_PERIOD_S
 
 
 def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
