@@ -1,4 +1,4 @@
-"""What the commands share: their entry, nodes that observe a network, recordings, and tables."""
+"""The entry of the commands, and what several of them use: nodes, recordings and tables."""
 
 import argparse
 import contextlib
@@ -107,7 +107,7 @@ def print_now(*values: object, end: str = '\n') -> None:
 
 
 def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Return a table; `align` is ``<`` or ``>`` for each column, whose head may have two lines."""
+    """Return a table, aligned by ``<`` or ``>`` for each column; heads may have several lines."""
     lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return '\n'.join('  '.join(
