@@ -22,6 +22,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import fisher_information_of
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -180,8 +181,7 @@ class _Lattice:
         signals = model.whiten(model.mean(truth))
         noise = rng.standard_normal((2, *signals.shape)) / np.sqrt(2)
         signals += noise[0] + 1j * noise[1]
-        for first in range(0, n, _BLOCK):
-            block = slice(first, first + _BLOCK)
+        for block in blocks(n, _BLOCK):
             for products, ray, index in zip(
                     self._products(signals[block]), rays[block], ranges[block], strict=True):
                 yield self._moments(products, ray, index)
@@ -256,7 +256,7 @@ def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarra
     diagonal = np.einsum('nap,nab,nbp->np', slopes, information, slopes).mean(axis=0)
     low, high = _polar_box(model.scenario)
     extent = high - low
-    steps: np.ndarray = np.minimum(
+    steps = np.minimum(
         _STEPS / np.sqrt(np.maximum(diagonal, 1e-30)),
         np.where(extent > 0, extent / _MIN_STEPS, np.inf))
     n_points = np.prod(np.maximum(extent / steps, 1.0))

@@ -46,20 +46,12 @@ class SurfacePrior:
 
 
 class Posterior(NamedTuple):
-    """Gaussian approximation of a posterior, over real and then imaginary parts.
+    """Gaussian approximation of a posterior, over real and then imaginary parts."""
 
-    Attributes
-    ----------
-    mean, covariance
-        Of the P = 2 N_E + N_B gains, offsets and band gains, float64 [2 P] and [2 P, 2 P].
-    failed
-        The most likely states, bool [N_E].
-    failed_probability
-        Float64 [N_E].
-    """
-
+    # Of the P = 2 N_E + N_B gains, offsets and band gains, float64 [2 P] and [2 P, 2 P].
     mean: np.ndarray
     covariance: np.ndarray
+    # The most likely states, bool [N_E], and probabilities, float64 [N_E].
     failed: np.ndarray
     failed_probability: np.ndarray
 
@@ -211,5 +203,5 @@ class _Search:
         precision, mean = self._precision[indices], self._mean[indices]
         best = np.linalg.solve(curvature, gradient[..., None])[..., 0]
         exponents = np.log(precision) + gradient * best - precision * mean**2
-        evidence: np.ndarray = exponents.sum(axis=1) - np.linalg.slogdet(curvature)[1]
+        evidence = exponents.sum(axis=1) - np.linalg.slogdet(curvature)[1]
         return evidence / 2

@@ -1,7 +1,6 @@
 """The executable ``visualizer``: shows a network in RViz and Foxglove."""
 
 import copy
-import sys
 import time
 from typing import Any
 
@@ -14,8 +13,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, markers, parameters, qos, topics, transforms
+from rhs_isac_ros.ros import convert, parameters, scene, topics
 from rhs_isac_ros.ros.endpoints import (
+    EXCHANGE,
     UserTopics,
     create_publisher,
     steady_timer,
@@ -23,7 +23,7 @@ from rhs_isac_ros.ros.endpoints import (
 )
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.transforms import TransformPublisher
+from rhs_isac_ros.ros.scene import TransformPublisher
 
 
 class VisualizerNode(Node):
@@ -39,7 +39,7 @@ class VisualizerNode(Node):
         # The latest beam and its marker, cached because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
-        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, qos.EXCHANGE,
+        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, EXCHANGE,
                                            overridable=True)
         self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path},
                                  values.user_topics)
@@ -56,7 +56,7 @@ class VisualizerNode(Node):
         self._scene.add(message, time.monotonic())
         # As for the topics, the number of frames is bounded: tf2 keeps every frame.
         if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
-            self._transforms.publish(transforms.user(
+            self._transforms.publish(scene.user_transform(
                 self._frame, message.user, message.position, convert.stamp_of(message, self)))
 
     def _show(self) -> None:
@@ -74,39 +74,35 @@ class VisualizerNode(Node):
         # Without publishers, the zip is empty.
         for publisher, path in zip(self._paths.publishers(user.user), paths, strict=False):
             if path and publisher.get_subscription_count():
-                publisher.publish(markers.path(path, stamp, self._frame))
+                publisher.publish(scene.path(path, stamp, self._frame))
 
     def _show_markers(self, stamp: Time) -> None:
-        scene = self._scene
+        state = self._scene
         bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes] = {
             ('region', 0): shapes.region(self._scenario),
             ('board', 0): shapes.board(
-                self._scenario, scene.configuration.analog if scene.configuration else None)}
-        for number, user in scene.users.items():
+                self._scenario, state.configuration.analog if state.configuration else None)}
+        for number, user in state.users.items():
             if user.truth:
                 bodies['truth', number], _ = shapes.truth(user.truth)
             if user.estimate:
                 _, bodies['estimate', number] = shapes.estimate(user.estimate)
-        array = [markers.marker(*key, body, stamp) for key, body in bodies.items()]
-        if scene.beam:
-            array.append(self._beam_marker(scene.beam, stamp))
-        array = [markers.place(marker, self._frame) for marker in array]
+        array = [scene.marker(*key, body, stamp) for key, body in bodies.items()]
+        if state.beam:
+            array.append(self._beam_marker(state.beam, stamp))
+        array = [scene.place(marker, self._frame) for marker in array]
         shown = {(marker.ns, marker.id) for marker in array}
-        array += [markers.deletion(*key, stamp) for key in sorted(self._shown - shown)]
+        array += [scene.deletion(*key, stamp) for key in sorted(self._shown - shown)]
         self._shown = shown
         self._publisher.publish(MarkerArray(markers=array))
 
     def _beam_marker(self, message: m.Beam, stamp: Time) -> Marker:
         if self._drawn is None or self._drawn[0] is not message:
             lobe = shapes.lobe(shapes.pattern(self._scenario, message), message.user)
-            self._drawn = message, markers.marker('beam', 0, lobe, stamp)
+            self._drawn = message, scene.marker('beam', 0, lobe, stamp)
         drawn = copy.copy(self._drawn[1])
         drawn.header = Header(stamp=stamp, frame_id=drawn.header.frame_id)
         return drawn
 
 
 main = entry('visualizer', lambda: [VisualizerNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -26,13 +26,18 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, diagnostics, qos, topics
-from rhs_isac_ros.ros.command_line import parse
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
+from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
 from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
-from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.security import SecurityError, is_enabled, one_line, prepare
+from rhs_isac_ros.ros.run import parse, run
+from rhs_isac_ros.ros.startup import (
+    WITHOUT_SERVICES,
+    SecurityError,
+    is_enabled,
+    one_line,
+    prepare,
+    use_discovery_profile,
+)
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct
 from rhs_isac_ros.support.optional import MissingLibraryError
@@ -148,7 +153,7 @@ def subscribe_codebooks(
             node.get_logger().warning(f'dropped codebook: {error}')
             return
         on_codebook(codebook)
-    subscribe(node, ros.Codebook, topics.CODEBOOK, receive, qos.LATCHED)
+    subscribe(node, ros.Codebook, topics.CODEBOOK, receive, endpoints.LATCHED)
 
 
 def choose_scenario(config: Path | None, recording: Path | None = None) -> Scenario:
@@ -196,7 +201,7 @@ def recorded(
                 codebook.check(scenario)
                 yield codebook, time_s
             else:
-                message = convert.from_ros(kind, found)
+                message: m.Message = convert.from_ros(kind, found)
                 m.check(message, scenario.sizes)
                 yield message, time_s
         except (m.MessageError, CodebookError) as error:

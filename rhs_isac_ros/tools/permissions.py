@@ -15,6 +15,7 @@ from rclpy.validate_namespace import validate_namespace
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.parameters import TF
 from rhs_isac_ros.ros.recording import recorded_topics
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
@@ -30,6 +31,9 @@ _CYCLE_SERVICES = (topics.PAUSE, topics.RESUME, topics.STEP)
 _LOCATE_TOPICS = tuple(f'{topics.LOCATE}/_action/{name}' for name in ('feedback', 'status'))
 _LOCATE_SERVICES = tuple(
     f'{topics.LOCATE}/_action/{name}' for name in ('cancel_goal', 'get_result', 'send_goal'))
+# A buffer of tf2 offers its frames.
+_TF_SERVICE = 'tf2_frames'
+_CLOCK = '/clock'
 _GET_CODEBOOK = f'{topics.OPTIMIZER_NODE}/get_parameters'
 _VERSION = '0.2.0'
 
@@ -53,12 +57,27 @@ class Permissions(NamedTuple):
     request: tuple[str, ...] = ()
 
 
-def permissions(users: int) -> dict[str, Permissions]:
-    """Return the permissions that the nodes of a network may need, by node, for a number of users.
+def permissions(
+        users: int, robots: Mapping[int, str] | None = None, is_simulated: bool = False
+) -> dict[str, Permissions]:
+    """Return the permissions that the nodes of a network may need, and no others.
 
-    ``users`` is a node with all users, ``network`` the process of all nodes of `ROSTER`.
-    ``operator`` stands for all tools, which may read every topic, set parameters and pause cycles,
-    except for ``replay``, which may publish every topic and take the place of the optimizer.
+    Parameters
+    ----------
+    users
+        Number of users; they are numbered from 1.
+    robots
+        Topic of the odometry, or ``tf``, of each user that is a robot.
+    is_simulated
+        Whether the nodes follow the clock of a simulation.
+
+    Returns
+    -------
+    dict
+        Permissions by node. ``users`` is a node with all users, ``network`` the process of all
+        nodes of `ROSTER`. ``operator`` stands for all tools, which may read every topic, set
+        parameters and pause cycles, except for ``replay``, which may publish every topic and
+        take the place of the optimizer.
     """
     numbers = range(1, users + 1)
     nodes = {
@@ -66,6 +85,8 @@ def permissions(users: int) -> dict[str, Permissions]:
             name, numbers if member.is_unique else [number])
         for name, member in sorted(ROSTER.items())
         for number in ((1,) if member.is_unique else numbers)}
+    for user, source in (robots or {}).items():
+        nodes[f'user_{user}'] = _with_robot(nodes[f'user_{user}'], source)
     nodes['users'] = _of_member('user', numbers)
     nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
     nodes['visualizer'] = Permissions(
@@ -77,7 +98,11 @@ def permissions(users: int) -> dict[str, Permissions]:
     replay = _together({optimizer: nodes[optimizer], 'replay': Permissions(
         publish=tuple(recorded_topics()), reply=(),
         request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
-    return {**nodes, 'operator': _operator(nodes, numbers), 'replay': replay}
+    nodes |= {'operator': _operator(nodes, numbers), 'replay': replay}
+    if is_simulated:
+        return {name: allowed._replace(subscribe=(*allowed.subscribe, _CLOCK))
+                for name, allowed in nodes.items()}
+    return nodes
 
 
 def _together(nodes: Mapping[str, Permissions]) -> Permissions:
@@ -98,6 +123,14 @@ def _of_member(name: str, users: Iterable[int]) -> Permissions:
         reply=(*_OFFERED_SERVICES,
                *((*_CYCLE_SERVICES, *_LOCATE_SERVICES) if name == 'bs' else ())),
         request=(_GET_CODEBOOK,) if member.has_codebook else ())
+
+
+def _with_robot(allowed: Permissions, source: str) -> Permissions:
+    """Return the permissions of a user that is a robot."""
+    if source != TF:
+        return allowed._replace(subscribe=(*allowed.subscribe, source))
+    return allowed._replace(subscribe=(*allowed.subscribe, topics.TF, topics.TF_STATIC),
+                            reply=(*allowed.reply, _TF_SERVICE))
 
 
 def _of_users(users: Iterable[int], *names: str) -> tuple[str, ...]:
@@ -121,14 +154,26 @@ def _operator(nodes: Iterable[str], users: Iterable[int]) -> Permissions:
                  *_LOCATE_SERVICES))
 
 
-def policy(namespace: str = '/', users: int = 2) -> str:
-    """Return the policy of a network as XML for SROS2, with one enclave for each node."""
+def policy(
+        namespace: str = '/', users: int = 2, robots: Mapping[int, str] | None = None,
+        is_simulated: bool = False) -> str:
+    """Return the policy of a network in the XML format of SROS2, with one enclave for each node.
+
+    Parameters
+    ----------
+    namespace
+        Namespace of the network and of its enclaves.
+    users, robots, is_simulated
+        As for `permissions`.
+    """
     add = ElementTree.SubElement
     root = ElementTree.Element('policy', version=_VERSION)
-    enclaves = add(root, 'enclaves')
-    for node, allowed in permissions(users).items():
-        enclave = add(enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
-        profile = add(add(enclave, 'profiles'), 'profile', ns=namespace, node=node)
+    enclaves = ElementTree.SubElement(root, 'enclaves')
+    for node, allowed in permissions(users, robots, is_simulated).items():
+        enclave = ElementTree.SubElement(
+            enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
+        profiles = ElementTree.SubElement(enclave, 'profiles')
+        profile = ElementTree.SubElement(profiles, 'profile', ns=namespace, node=node)
         for right, names in allowed._asdict().items():
             kind = 'topic' if right in ('publish', 'subscribe') else 'service'
             if names:
@@ -149,9 +194,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')
+    parser.add_argument('--robot', type=_robot, action='append', default=[], metavar='USER=TOPIC',
+                        help='user that is a robot, with the topic of its odometry, or tf')
+    parser.add_argument('--use-sim-time', action='store_true', help='permit /clock')
     options = parser.parse_args(arguments)
-    print(policy(options.namespace, options.users), end='')
+    robots = dict(options.robot)
+    if beyond := [user for user in robots if not 1 <= user <= options.users]:
+        parser.error(f'argument --robot: user {beyond[0]}, expected one of {options.users} users')
+    print(policy(options.namespace, options.users, robots, options.use_sim_time), end='')
     return 0
+
+
+def _robot(text: str) -> tuple[int, str]:
+    user, _, source = text.partition('=')
+    if not (user.isascii() and user.isdecimal() and source):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected USER=TOPIC or USER=tf')
+    return int(user), source
 
 
 def _namespace(text: str) -> str:

@@ -35,12 +35,12 @@ class RerunStream:
     """Writes the entries of a view, or raises MissingLibraryError without rerun-sdk 0.22."""
 
     def __init__(self) -> None:
-        with optional_import('view', extra='view', script='scripts/_view'):
+        with optional_import('view', extra='view'):
             import rerun
         if not rerun.__version__.startswith(f'{_VERSION}.'):
             raise MissingLibraryError(
                 f'view needs rerun-sdk {_VERSION}, found {rerun.__version__} '
-                "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/_view)")
+                "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/setup view)")
         self._rerun = rerun
         rerun.set_strict_mode(True)
         self._stream = rerun.new_recording('rhs_isac_ros')

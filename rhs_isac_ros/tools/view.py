@@ -37,12 +37,16 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.protocol.role import NewestDict
-from rhs_isac_ros.ros import qos, topics
-from rhs_isac_ros.ros.background import BackgroundWorker
+from rhs_isac_ros.ros import endpoints, topics
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import steady_timer, subscribe, subscribe_messages
+from rhs_isac_ros.ros.endpoints import (
+    BackgroundWorker,
+    steady_timer,
+    subscribe,
+    subscribe_messages,
+)
 from rhs_isac_ros.ros.recording import RecordingError
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
@@ -159,7 +163,7 @@ class ViewNode(Node):
         subscribe_reports(self, lambda node, report: self._write(
             self.view.add_report(node, report)))
         subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
-                           exchange=qos.OBSERVATION)
+                           exchange=endpoints.OBSERVATION)
         self._silence_timer = steady_timer(self, _SILENCE_S, self._log_silence)
 
     @property
@@ -234,7 +238,7 @@ class ViewNode(Node):
             return
         self._users.add(user)
         subscribe(self, Odometry, topics.ODOMETRY.format(user=user),
-                  functools.partial(self._on_track, user), qos.EXCHANGE)
+                  functools.partial(self._on_track, user), endpoints.EXCHANGE)
 
     def _on_track(self, user: int, message: Odometry) -> None:
         position, velocity = message.pose.pose.position, message.twist.twist.linear

@@ -17,7 +17,8 @@ from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
-from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.support import plugins
 
@@ -81,7 +82,7 @@ def second_estimate(bench, node, send, codebooks):
     def of(kind, topic):
         receiver, messages = bench.add(Node, 'receiver'), []
         estimates = bench.collect(receiver, m.PositionEstimate)
-        subscription = receiver.create_subscription(kind, topic, messages.append, qos.EXCHANGE)
+        subscription = receiver.create_subscription(kind, topic, messages.append, EXCHANGE)
         node.dispatch(CodebookOffered(codebooks[0]))
         # The first estimate creates the topic.
         send(3)

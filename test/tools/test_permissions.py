@@ -59,6 +59,27 @@ def test_a_user_may_not_publish_messages_of_another_role():
         assert not allowed[f'/user_{number}']['request']
 
 
+def test_a_robot_may_read_its_odometry_or_transforms(processes, make_watch):
+    watch = make_watch('/closed')
+    processes.start('user', name='user_1', namespace='/closed', use_sim_time=True,
+                    mobility='odometry', odometry_topic='/robot/odom')
+    allowed = rules(permissions.policy('/closed', 3, {1: '/robot/odom', 3: 'tf'}, True))
+    rights = allowed['/closed/user_1']['subscribe']
+
+    def subscribed():
+        if ('user_1', '/closed') not in watch.node.get_node_names_and_namespaces():
+            return set()
+        return {name for name, _ in
+                watch.node.get_subscriber_names_and_types_by_node('user_1', '/closed')}
+    watch.until(lambda: subscribed() >= rights, 'the subscriptions')
+    assert subscribed() == rights
+    plain, robot = allowed['/closed/user_2'], allowed['/closed/user_3']
+    assert '/clock' in plain['subscribe'] and '/robot/odom' not in plain['subscribe']
+    assert robot['subscribe'] - plain['subscribe'] == {topics.TF, topics.TF_STATIC}
+    assert '/closed/tf2_frames' in robot['reply']
+    assert allowed['/closed/network']['subscribe'] >= rights | robot['subscribe']
+
+
 def test_only_the_operator_may_set_parameters_of_other_nodes():
     allowed = rules(permissions.policy())
     assert {'/bs/set_parameters', '/bs/pause', '/users/set_parameters'} <= allowed.pop(
@@ -137,7 +158,8 @@ def test_publishers_are_those_of_the_documentation():
         assert allowed_to == expected
 
 
-@pytest.mark.parametrize('arguments', [['--namespace', 'lab'], ['--users', '-1']])
+@pytest.mark.parametrize('arguments', [
+    ['--namespace', 'lab'], ['--users', '-1'], ['--robot', '2'], ['--robot', '3=odom']])
 def test_invalid_arguments_are_rejected(arguments, capsys):
     with pytest.raises(SystemExit):
         permissions.main(arguments)

@@ -1,0 +1,200 @@
+"""Markers of the scene, and transforms of the surface and of the users."""
+
+import dataclasses
+import functools
+import importlib.util
+import math
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from rclpy.parameter import Parameter
+from rclpy.time import Time as RosTime
+from visualization_msgs.msg import Marker
+
+from rhs_isac_ros.link import beam_pattern, steer
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.monitoring import shapes
+from rhs_isac_ros.nodes.visualizer import VisualizerNode
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, scene, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED
+from rhs_isac_ros.ros.frames import Frame
+
+STAMP = Time(sec=3)
+
+
+def of(vector):
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def rgb(colour):
+    return (colour.r, colour.g, colour.b)
+
+
+def an_estimate(covariance_m2, user=1):
+    """The ellipsoid of an estimate as a marker, and as a shape."""
+    _, shape = shapes.estimate(m.PositionEstimate(
+        cycle_id=5, user=user, codebook_id='cb', position=np.array([9.0, -1.0, 0.5]),
+        covariance_m2=covariance_m2, crlb_m2=0.1, estimator='bayes', latency_s=0.01))
+    return scene.marker('estimate', user, shape, STAMP), shape
+
+
+def test_an_ellipsoid_keeps_its_axes():
+    marker, shape = an_estimate(np.diag([4.0, 1.0, 0.25]))
+    assert marker.type == Marker.SPHERE
+    assert of(marker.pose.position) == pytest.approx(shape.centres[0])
+    assert of(marker.scale) == pytest.approx(2 * shape.half_sizes_m[0])
+    turn = marker.pose.orientation
+    assert [turn.x, turn.y, turn.z, turn.w] == pytest.approx(shape.quaternions[0])
+    assert of(an_estimate(np.zeros((3, 3)))[0].scale).min() > 0
+
+
+def test_each_user_has_one_hue_for_truth_and_estimate():
+    hues = set()
+    for user in (1, 2, 2**32 - 1):
+        position = np.array([user % 7, 0.0, 0.0], float)
+        ball, _ = shapes.truth(m.GroundTruth(
+            cycle_id=0, user=user, position=position, velocity=np.zeros(3)))
+        one = scene.marker('truth', user, ball, STAMP)
+        other, _ = an_estimate(np.eye(3), user)
+        assert of(one.pose.position) == pytest.approx(position)
+        assert (one.ns, one.id) != (other.ns, other.id)
+        assert rgb(one.color) == rgb(other.color)
+        assert one.color.a == 1 > other.color.a > 0
+        hues.add(rgb(one.color))
+    assert len(hues) == 3
+
+
+def test_the_plates_of_the_board_keep_places_and_colours(small):
+    board = shapes.board(small.scenario, np.linspace(0, 1, small.scenario.n_elements)[None])
+    marker = scene.marker('board', 0, board, STAMP)
+    assert np.array([of(point) for point in marker.points]) == pytest.approx(board.centres)
+    assert np.array([rgb(colour) for colour in marker.colors]) == pytest.approx(board.colours)
+    assert of(marker.scale) == pytest.approx(2 * board.half_sizes_m[0])
+
+
+def test_the_region_is_translucent_and_visible_even_if_it_is_flat(small):
+    flat = dataclasses.replace(small.scenario, roi_size_m=(4.0, 3.0, 0.0))
+    for scenario in (small.scenario, flat):
+        marker = scene.marker('region', 0, shapes.region(scenario), STAMP)
+        low, high = scenario.roi_bounds_m
+        (centre,), size = map(of, marker.points), of(marker.scale)
+        assert centre == pytest.approx((low + high) / 2)
+        assert size == pytest.approx(high - low, abs=0.01)
+        assert size.min() > 0 and 0 < marker.colors[0].a < 1
+        assert (marker.header.frame_id, marker.header.stamp) == ('rhs_link', STAMP)
+        assert marker.pose.orientation.w == 1
+
+
+def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
+    scenario, place = Scenario(), np.array([9.0, 3.0, 0.3])
+    found = beam_pattern(scenario, steer(scenario, place), 10.0)
+    marker = scene.marker('beam', 0, shapes.lobe(found, 3), STAMP)
+    corners = np.array([of(point) for point in marker.points]).reshape(-1, 3, 3)
+    assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'rhs_link')
+    lengths = np.linalg.norm(corners, axis=-1)
+    assert lengths.max() == pytest.approx(10.0)
+    tip = corners.reshape(-1, 3)[lengths.argmax()] / 10.0
+    assert np.degrees(np.arccos(tip @ place / np.linalg.norm(place))) < 8.0
+    assert corners[..., 0].min() >= -1e-9
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum('nu,nu->n', normals, corners.mean(axis=1)) >= -1e-9).all()
+    assert 0 < marker.color.a < 1
+    assert rgb(marker.color) == pytest.approx(shapes.user_colour(3))
+
+
+def test_a_path_contains_its_positions_in_order():
+    places = np.array([[9.0, 1.0, 0.0], [8.5, 1.5, 0.1], [8.0, 1.0, 0.2]])
+    path = scene.path(places, STAMP, Frame())
+    assert (path.header.frame_id, path.header.stamp) == ('map', STAMP)
+    assert np.array([of(pose.pose.position) for pose in path.poses]) == pytest.approx(places)
+    assert all(pose.header == path.header and pose.pose.orientation.w == 1
+               for pose in path.poses)
+
+
+def test_a_deletion_names_its_marker():
+    marker = scene.deletion('truth', 4, STAMP)
+    assert (marker.ns, marker.id, marker.action) == ('truth', 4, Marker.DELETE)
+
+
+HAS_TF2 = importlib.util.find_spec('tf2_msgs') is not None
+
+
+def test_the_surface_is_at_the_origin_of_the_map():
+    transform = scene.surface_transform(Frame(), Time(sec=3))
+    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'rhs_link')
+    assert transform.header.stamp.sec == 3
+    assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [0.0] * 3
+    assert transform.transform.rotation.w == 1.0
+
+
+def test_a_user_is_at_its_estimate():
+    transform = scene.user_transform(Frame(), 7, np.array([9.0, -1.5, 0.25]), Time(sec=4))
+    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'user_7')
+    assert [getattr(transform.transform.translation, axis) for axis in 'xyz'] == [9.0, -1.5, 0.25]
+    assert [getattr(transform.transform.rotation, axis) for axis in 'xyzw'] == [0.0, 0.0, 0.0, 1.0]
+
+
+def test_two_networks_have_frames_of_their_own():
+    frames = [Frame('odom', prefix=f'{space}/') for space in ('left', 'right')]
+    children = [transform.child_frame_id for frame in frames for transform in (
+        scene.surface_transform(frame, Time()),
+        scene.user_transform(frame, 1, np.zeros(3), Time()))]
+    assert children == ['left/rhs_link', 'left/user_1', 'right/rhs_link', 'right/user_1']
+
+
+@pytest.mark.skipif(HAS_TF2, reason='tf2_msgs is installed')
+def test_without_tf2_msgs_the_visualizer_logs_one_line(bench, probe, capfd):
+    bench.add(VisualizerNode)
+    assert capfd.readouterr().err.count(
+        'no transforms, because tf2_msgs is not installed') == 1
+    assert probe.count_publishers(topics.TF) == probe.count_publishers(topics.TF_STATIC) == 0
+
+
+@pytest.mark.skipif(not HAS_TF2, reason='tf2_msgs is not installed')
+def test_the_visualizer_publishes_transforms(bench, probe):
+    from tf2_msgs.msg import TFMessage
+    bench.add(VisualizerNode)
+    found = {}
+
+    def store(message):
+        found.update({one.child_frame_id: one.transform.translation for one in message.transforms})
+    probe.create_subscription(TFMessage, topics.TF_STATIC, store, LATCHED)
+    probe.create_subscription(TFMessage, topics.TF, store, EXCHANGE)
+    bench.until(lambda: topics.RHS_FRAME in found, 'the surface')
+    bench.until(lambda: probe.count_publishers(topics.TF), 'the publisher')
+    estimates = bench.publisher(probe, m.PositionEstimate)
+    estimate = convert.to_ros(m.PositionEstimate(
+        cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
+        covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
+    probe.create_timer(0.05, lambda: estimates.publish(estimate))
+    bench.until(lambda: 'user_2' in found, 'the user')
+    assert found['user_2'].y == 2.5
+
+
+@pytest.mark.skipif(not HAS_TF2, reason='tf2_msgs is not installed')
+def test_two_networks_share_one_tree(bench, probe):
+    tf2_ros = pytest.importorskip('tf2_ros')
+    buffer = tf2_ros.Buffer(node=probe)
+    # It subscribes as long as it exists.
+    listener = tf2_ros.TransformListener(buffer, probe)
+    poses = {'left': [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+             'right': [0.0, 4.0, 0.0, 0.0, 0.0, -math.pi / 2]}
+    for space, pose in poses.items():
+        bench.add(VisualizerNode, namespace=f'/{space}', parameter_overrides=[
+            Parameter('frame_id', value='odom'), Parameter('surface_pose', value=pose)])
+        estimates = probe.create_publisher(
+            convert.ros_type(m.PositionEstimate), f'/{space}/position_estimate', EXCHANGE)
+        estimate = convert.to_ros(m.PositionEstimate(
+            cycle_id=1, user=2, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
+            covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01), Time())
+        probe.create_timer(0.05, functools.partial(estimates.publish, estimate))
+    for space, place in (('left', [9.0, 2.5, 0.1]), ('right', [2.5, -4.0, 0.1])):
+        bench.until(lambda space=space: buffer.can_transform(
+            'odom', f'{space}/user_2', RosTime()), f'the user of {space}')
+        found = buffer.lookup_transform('odom', f'{space}/user_2', RosTime())
+        moved = found.transform.translation
+        np.testing.assert_allclose([moved.x, moved.y, moved.z], place, atol=1e-9)
+        assert buffer.can_transform('odom', f'{space}/rhs_link', RosTime())
+    assert listener
