@@ -27,18 +27,7 @@ EXECUTABLES = {
 
 
 def __getattr__(name: str) -> Callable[[], int]:
-    """Return the main function of an executable.
-
-    Returns
-    -------
-    Callable
-        Imports the module of the executable, runs it and returns its exit code.
-
-    Raises
-    ------
-    AttributeError
-        If there is no such executable.
-    """
+    """Return the main function of an executable, which imports its module and returns its code."""
     if name not in EXECUTABLES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
@@ -91,8 +80,7 @@ def _join_network(name: str) -> None:
 def _end_with_parent() -> None:
     """Have the kernel send SIGTERM to this process when the parent that asked for it dies.
 
-    The child does so itself, because no Python code may run safely between fork and exec if the
-    parent has several threads.
+    The parent cannot do so between fork and exec, because it may have several threads.
     """
     parent = os.environ.pop(PARENT_ID, '')
     if parent:
@@ -106,23 +94,12 @@ def _end_with_parent() -> None:
 
 
 def print_error(error: object, program: str = '') -> None:
-    """Print an error as argparse does.
-
-    Parameters
-    ----------
-    error
-        The error or its text.
-    program
-        Name of the program; by default that of the process.
-    """
-    print(f'{program or _program()}: error: {error}', file=sys.stderr)
-
-
-def _program() -> str:
-    spec = getattr(sys.modules['__main__'], '__spec__', None)
-    if spec is None:
-        return os.path.basename(sys.argv[0])
-    return f'python3 -m {spec.name.removesuffix(".__main__")}'
+    """Print an error as argparse does, with the name of the program or that of the process."""
+    if not program:
+        spec = getattr(sys.modules['__main__'], '__spec__', None)
+        program = (f'python3 -m {spec.name.removesuffix(".__main__")}' if spec
+                   else os.path.basename(sys.argv[0]))
+    print(f'{program}: error: {error}', file=sys.stderr)
 
 
 def exit_code_of(
@@ -136,8 +113,6 @@ def exit_code_of(
         Returns an exit code; None is 0.
     errors
         Exceptions whose messages are errors of the user.
-    program
-        Name of the program, see `print_error`.
 
     Returns
     -------
@@ -146,10 +121,9 @@ def exit_code_of(
         the output cannot be written; 2 after one of the `errors`.
     """
     # If a standard stream is closed, Python has none, and the next file would take its place.
-    for name in ('stdin', 'stdout', 'stderr'):
+    for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, 'r' if name == 'stdin' else 'w',
-                                    encoding='utf-8'))
+            setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))
     try:
         try:
             return main() or 0
@@ -171,8 +145,5 @@ def exit_code_of(
 
 
 def discard_stdout() -> None:
-    """Redirect the standard output to `os.devnull` after its reader has closed it.
-
-    Otherwise the flush at the exit of Python would fail.
-    """
+    """Redirect the standard output to `os.devnull`, so that Python can flush it at its exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

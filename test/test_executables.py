@@ -34,8 +34,8 @@ def test_the_table_lists_the_installed_executables():
 @pytest.mark.parametrize(('name', 'folder'), executables.EXECUTABLES.items())
 def test_each_executable_has_a_module_with_a_main_function(name, folder):
     source = (ROOT / 'rhs_isac_ros' / folder / f'{name}.py').read_text(encoding='utf-8')
-    defined = {target.id for node in ast.parse(source).body if isinstance(node, ast.Assign)
-               for target in node.targets} | {
+    defined = {part.id for node in ast.parse(source).body if isinstance(node, ast.Assign)
+               for part in ast.walk(node) if isinstance(part, ast.Name)} | {
         node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
     assert 'main' in defined
 

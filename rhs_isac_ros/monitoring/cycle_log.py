@@ -17,7 +17,7 @@ RECEIVES = (m.Beacon, m.GroundTruth, m.ReceivedSignals, m.PositionEstimate, m.Ca
 
 @dataclasses.dataclass
 class CycleTimes:
-    """The times of one cycle, as observed by a subscriber.
+    """The times of one cycle: arrivals of messages at a subscriber [s], NaN before.
 
     Attributes
     ----------
@@ -28,9 +28,9 @@ class CycleTimes:
     phase_s
         Arrival of the first message of each later phase [s].
     ended_s
-        Arrival of the outcome [s]; NaN before.
+        Arrival of the outcome [s].
     state
-        The latest state; None before the first. It contains the times of the base station.
+        The latest state, which contains the times of the base station; None before the first.
     """
 
     cycle_id: int
@@ -50,12 +50,12 @@ class CycleTimes:
 
         Their sum is `duration_s`: the times do not depend on when messages arrive.
         """
-        starts = [] if self.state is None else [
-            (phase, float(start_s)) for phase, start_s in zip(
-                m.Phase, self.state.began_s, strict=True) if math.isfinite(start_s)]
-        ends = [start_s for _, start_s in starts[1:]] + [self.duration_s]
-        return {phase: end_s - start_s
-                for (phase, start_s), end_s in zip(starts, ends, strict=False)}
+        if self.state is None:
+            return {}
+        starts_s = {phase: float(start_s) for phase, start_s in zip(
+            m.Phase, self.state.began_s, strict=True) if math.isfinite(start_s)}
+        return dict(zip(starts_s, np.diff([*starts_s.values(), self.duration_s]).tolist(),
+                        strict=True))
 
 
 @dataclasses.dataclass
@@ -73,10 +73,15 @@ class CompleteCycle(CycleTimes):
         """Distance of the estimate from the true position [m]."""
         return float(np.linalg.norm(self.estimate.position - self.truth.position))
 
+    @property
+    def sigma_m(self) -> float:
+        """Square root of the trace of the covariance [m], to compare with the error."""
+        return math.sqrt(max(np.trace(self.estimate.covariance_m2), 0.0))
+
 
 @dataclasses.dataclass
 class CycleRecord(CycleTimes):
-    """A cycle that is still running, was given up, or lacks messages.
+    """A cycle that is still running, was given up, or lacks messages, which are None.
 
     Attributes
     ----------
@@ -84,8 +89,6 @@ class CycleRecord(CycleTimes):
         ``served``, or the reason why the cycle was given up; empty while it runs.
     truths
         True positions by the instance of the user that sent them.
-    signals, estimate, capacity
-        The messages of the cycle; None if not received.
     """
 
     outcome: str = ''
@@ -113,14 +116,12 @@ class CycleRecord(CycleTimes):
 
 
 class CycleLog:
-    """Collects the cycles of one network, including across restarts of its base station.
+    """Collects the cycles of one network, also across restarts of its base station.
 
     Attributes
     ----------
-    complete
-        Cycles that were served and received completely, in order.
-    ended
-        All cycles that have ended, in order.
+    complete, ended
+        Cycles that were served and received completely, and all that have ended, in order.
     """
 
     def __init__(self) -> None:
@@ -143,7 +144,7 @@ class CycleLog:
 
     def add(self, message: m.Message, now_s: float) -> None:
         """Add a message of one of the types `RECEIVES` that arrived at `now_s` [s]."""
-        if message.cycle_id == 0:
+        if not message.cycle_id:
             return
         if isinstance(message, m.Beacon):
             self._begin(message, now_s)
@@ -160,12 +161,18 @@ class CycleLog:
                 record.estimate = message
             case m.Capacity():
                 record.capacity = message
-            case m.ProtocolState() if message.outcome:
-                self._end(record, message, now_s)
             case m.ProtocolState():
                 record.user, record.state = message.user, message
-                record.phase_s[message.phase] = now_s
-        self._close(record)
+                if message.outcome:
+                    if not record.outcome:
+                        self.ended.append(record)
+                    record.outcome, record.ended_s = message.outcome, now_s
+                else:
+                    record.phase_s[message.phase] = now_s
+        if cycle := record.completed():
+            self.complete.append(cycle)
+        if cycle or record.outcome not in ('', 'served'):
+            del self._open[record.cycle_id]
 
     def clear(self) -> None:
         """Discard all cycles that have ended."""
@@ -180,18 +187,3 @@ class CycleLog:
             record.began_s = now_s
         while len(self._open) > _MAX_OPEN_CYCLES:
             del self._open[next(iter(self._open))]
-
-    def _end(self, record: CycleRecord, state: m.ProtocolState, now_s: float) -> None:
-        if not record.outcome:
-            self.ended.append(record)
-        record.user, record.outcome, record.ended_s = state.user, state.outcome, now_s
-        record.state = state
-
-    def _close(self, record: CycleRecord) -> None:
-        """Stop collecting messages for a record that is complete or was given up."""
-        cycle = record.completed()
-        if cycle is not None:
-            self.complete.append(cycle)
-        elif record.outcome in ('', 'served'):
-            return
-        del self._open[record.cycle_id]

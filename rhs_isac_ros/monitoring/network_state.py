@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,34 +23,8 @@ _MAX_NODES = 4096
 _MAX_DIGITS = 18
 
 
-@dataclasses.dataclass(frozen=True)
-class Fix:
-    """The latest complete cycle of a user.
-
-    Attributes
-    ----------
-    received_s
-        Arrival of the cycle's last message [s].
-    """
-
-    cycle: CompleteCycle
-    received_s: float
-
-    @property
-    def sigma_m(self) -> float:
-        """Square root of the trace of the covariance [m], to compare with the error."""
-        return math.sqrt(max(np.trace(self.cycle.estimate.covariance_m2), 0.0))
-
-
-@dataclasses.dataclass(frozen=True)
-class NodeStatus:
-    """The latest report of a node.
-
-    Attributes
-    ----------
-    received_s
-        Time at which the report arrived [s].
-    """
+class NodeStatus(NamedTuple):
+    """The latest report of a node, and its arrival [s]."""
 
     report: Report
     received_s: float
@@ -67,29 +42,29 @@ class NodeStatus:
 
 
 class Overview:
-    """Phase, cycles, users and nodes of one network.
+    """Phase, cycles, users and nodes of one network; what is unknown is 0, empty or None.
 
     Attributes
     ----------
     phase
-        Phase of the base station, `RESTING` between cycles; empty before the first message.
+        Phase of the base station, `RESTING` between cycles.
     phase_began_s
         Time at which the phase began [s].
     cycle_id, user
-        Current cycle and its user; 0 where unknown.
+        Current cycle and its user.
     codebook_id
-        Codebook of the latest signals; empty before the first.
+        Codebook of the latest signals.
     served, given_up
         Numbers of cycles that ended.
     last_failure
-        Description of the last cycle that was given up; empty if there was none.
+        Description of the last cycle that was given up.
     began_s
         Arrival of the first message [s]; infinite before.
     users
-        Latest fix of each user by id; None before the first. At most `MAX_USERS`, because the ids
-        come from messages.
+        Latest complete cycle of each user by id.
     nodes
-        Status of each node by name; at most 4096, for the same reason.
+        Status of each node by name. As it and the ids of users come from messages, their numbers
+        are limited.
     """
 
     def __init__(self) -> None:
@@ -97,7 +72,7 @@ class Overview:
         self.phase_began_s = math.nan
         self.cycle_id = self.user = self.served = self.given_up = 0
         self.codebook_id = self.last_failure = ''
-        self.users: dict[int, Fix | None] = {}
+        self.users: dict[int, CompleteCycle | None] = {}
         self.nodes: dict[str, NodeStatus] = {}
         self._log = CycleLog()
         self._served_s: collections.deque[float] = collections.deque()
@@ -122,7 +97,7 @@ class Overview:
         self._log.add(message, now_s)
         for cycle in self._log.complete:
             if cycle.user in self.users or len(self.users) < MAX_USERS:
-                self.users[cycle.user] = Fix(cycle, now_s)
+                self.users[cycle.user] = cycle
         self._log.clear()
 
     def add_report(self, node: str, report: Report, now_s: float) -> None:
@@ -131,19 +106,11 @@ class Overview:
             self.nodes[node] = NodeStatus(report, now_s)
 
     def rate_hz(self, now_s: float) -> float:
-        """Return the rate of served cycles [Hz].
-
-        It is averaged over the last ten seconds, or since the first message if that is less.
-        """
+        """Return the rate of served cycles over the last ten seconds, or since the start [Hz]."""
         begin_s = max(now_s - _RATE_WINDOW_S, self.began_s)
         while self._served_s and self._served_s[0] < begin_s:
             self._served_s.popleft()
         return len(self._served_s) / (now_s - begin_s) if now_s > begin_s else 0.0
-
-    @property
-    def fixes(self) -> list[Fix]:
-        """The fixes of all users that have one, the latest first."""
-        return sorted(filter(None, self.users.values()), key=lambda fix: -fix.received_s)
 
     @property
     def paused(self) -> bool:
@@ -174,7 +141,8 @@ _MAX_PATH_LENGTH = 200
 _MIN_STEP_M = 0.05
 
 
-def _empty_path() -> collections.deque[np.ndarray]:
+def new_path() -> collections.deque[np.ndarray]:
+    """Return an empty path, which keeps its latest 200 positions."""
     return collections.deque(maxlen=_MAX_PATH_LENGTH)
 
 
@@ -184,14 +152,10 @@ class UserState:
 
     Attributes
     ----------
-    user
-        Id of the user.
     updated_s
         Arrival of the latest message about the user [s].
-    truth
-        The true position; None before the first.
-    estimate
-        The latest estimate; None before the first.
+    truth, estimate
+        The latest true position and estimate; None before the first.
     true_path, estimated_path
         True positions and estimates, float64 [3] [m] each, the latest last.
     """
@@ -200,9 +164,8 @@ class UserState:
     updated_s: float
     truth: m.GroundTruth | None = None
     estimate: m.PositionEstimate | None = None
-    true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=_empty_path)
-    estimated_path: collections.deque[np.ndarray] = dataclasses.field(
-        default_factory=_empty_path)
+    true_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
+    estimated_path: collections.deque[np.ndarray] = dataclasses.field(default_factory=new_path)
     # The true position at which the pilots of the latest cycle were sent.
     _cycle_truth: m.GroundTruth | None = None
 
@@ -214,18 +177,18 @@ class UserState:
             return math.nan
         return float(np.linalg.norm(estimate.position - truth.position))
 
-    def add_truth(self, truth: m.GroundTruth) -> None:
-        """Add a true position."""
-        self.truth = truth
-        if truth.cycle_id:
-            self._cycle_truth = truth
-        if not self.true_path or math.dist(self.true_path[-1], truth.position) > _MIN_STEP_M:
-            self.true_path.append(truth.position)
-
-    def add_estimate(self, estimate: m.PositionEstimate) -> None:
-        """Add an estimate."""
-        self.estimate = estimate
-        self.estimated_path.append(estimate.position)
+    def add(self, message: m.GroundTruth | m.PositionEstimate, now_s: float) -> None:
+        """Add a true position or an estimate that arrived at `now_s` [s]."""
+        self.updated_s = now_s
+        if isinstance(message, m.PositionEstimate):
+            self.estimate = message
+            self.estimated_path.append(message.position)
+            return
+        self.truth = message
+        if message.cycle_id:
+            self._cycle_truth = message
+        if not self.true_path or math.dist(self.true_path[-1], message.position) > _MIN_STEP_M:
+            self.true_path.append(message.position)
 
 
 class SceneState:
@@ -233,10 +196,8 @@ class SceneState:
 
     Attributes
     ----------
-    configuration
-        Configuration that the surface applies; None before the first message.
-    beam
-        Latest beam of a transmission; None before the first.
+    configuration, beam
+        What the surface applies, and the latest beam of a transmission; None before the first.
     users
         Users by id, at most `MAX_USERS`, because the ids come from messages. Further users are
         ignored until others are discarded.
@@ -255,28 +216,13 @@ class SceneState:
                 self.configuration = message
             case m.Beam():
                 self.beam, self._beam_s = message, now_s
-            case m.GroundTruth():
-                self._add_truth(message, now_s)
             case m.GroundTruths():
                 for truth in message.each():
-                    self._add_truth(truth, now_s)
-            case m.PositionEstimate():
-                if state := self._updated_user(message.user, now_s):
-                    state.add_estimate(message)
-
-    def _add_truth(self, truth: m.GroundTruth, now_s: float) -> None:
-        if state := self._updated_user(truth.user, now_s):
-            state.add_truth(truth)
-
-    def _updated_user(self, user: int, now_s: float) -> UserState | None:
-        """Return the state of a user; None if it is new and there are too many."""
-        state = self.users.get(user)
-        if state is None:
-            if len(self.users) >= MAX_USERS:
-                return None
-            state = self.users[user] = UserState(user, now_s)
-        state.updated_s = now_s
-        return state
+                    self.add(truth, now_s)
+            case m.GroundTruth() | m.PositionEstimate():
+                if message.user in self.users or len(self.users) < MAX_USERS:
+                    self.users.setdefault(message.user, UserState(message.user, now_s)).add(
+                        message, now_s)
 
     def discard_stale(self, before_s: float) -> list[int]:
         """Discard users and a beam without a message since `before_s` [s]; return the users.
@@ -307,14 +253,11 @@ class SceneState:
 
     @property
     def shown_user(self) -> UserState | None:
-        """The user of the latest cycle with an estimate and a beam, or else with an estimate.
-
-        None if there is no estimate.
-        """
-        if self.beam is not None:
-            state = self.users.get(self.beam.user)
-            if state and state.estimate and state.estimate.cycle_id == self.beam.cycle_id:
-                return state
+        """The user of the latest cycle with estimate and beam, or else with an estimate."""
+        state = self.users.get(self.beam.user) if self.beam else None
+        if state and state.estimate and self.beam and (
+                state.estimate.cycle_id == self.beam.cycle_id):
+            return state
         cycles = [(state.estimate.cycle_id, user) for user, state in self.users.items()
                   if state.estimate]
         return self.users[max(cycles)[1]] if cycles else None
@@ -322,8 +265,8 @@ class SceneState:
     @property
     def shown_beam(self) -> m.Beam | None:
         """The beam of the cycle in which the shown user was estimated; None if it is unknown."""
-        shown = self.shown_user
-        if shown is None or shown.estimate is None or self.beam is None:
-            return None
-        same = (shown.user, shown.estimate.cycle_id) == (self.beam.user, self.beam.cycle_id)
-        return self.beam if same else None
+        shown, beam = self.shown_user, self.beam
+        if shown and shown.estimate and beam and (
+                (shown.user, shown.estimate.cycle_id) == (beam.user, beam.cycle_id)):
+            return beam
+        return None

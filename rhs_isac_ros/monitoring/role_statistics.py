@@ -29,7 +29,7 @@ class Report:
     fault
         Whether something is missing, or something was dropped or given up since the last report.
     summary
-        One line that describes the fault: what is missing, or the most frequent new faults.
+        One line: what is missing, or the most frequent new faults.
     values
         Settings: ``parameter.<name>`` (in use), ``pending.<name>`` (not in use yet) and
         ``failed.<name>`` (why a change failed). Lasting faults: ``warning.<subject>``. Counts:
@@ -53,19 +53,20 @@ class RoleStatistics:
     """
 
     def __init__(self) -> None:
-        self._received: collections.Counter[str] = collections.Counter()
-        self._sent: collections.Counter[str] = collections.Counter()
+        self.missing: tuple[str, ...] = ()
+        # Messages by section of the report and type, and faults until the last report.
+        self._messages: dict[str, collections.Counter[str]] = {
+            'received': collections.Counter(), 'sent': collections.Counter()}
+        self._faults: collections.Counter[str] = collections.Counter()
         self._served = 0
         self._codebook_id = ''
-        self.missing: tuple[str, ...] = ()
         self._cycle_began_s: float | None = None
         self._durations_s: dict[str, collections.deque[float]] = collections.defaultdict(
             lambda: collections.deque(maxlen=_MAX_DURATIONS))
-        self._faults: collections.Counter[str] = collections.Counter()
 
     def count_received(self, kind: type[m.Message]) -> None:
         """Count a received message, even if it is dropped later."""
-        self._received[kind.__name__] += 1
+        self._messages['received'][kind.__name__] += 1
 
     def record(
             self, event: Event, actions: Sequence[Action], now_s: float,
@@ -74,8 +75,6 @@ class RoleStatistics:
 
         Parameters
         ----------
-        event, actions
-            The event, and the actions that the role returned for it.
         now_s
             Time of the event, on the clock of the role [s].
         handling_s
@@ -83,10 +82,10 @@ class RoleStatistics:
         """
         if isinstance(event, CodebookOffered):
             self._codebook_id = event.codebook.id
-        self._add_duration('handling_ms', handling_s)
+        self._durations_s['handling_ms'].append(handling_s)
         for action in actions:
             if isinstance(action, Send):
-                self._sent[type(action.message).__name__] += 1
+                self._messages['sent'][type(action.message).__name__] += 1
                 self._record_message(action.message, now_s)
 
     def _record_message(self, message: m.Message, now_s: float) -> None:
@@ -94,14 +93,11 @@ class RoleStatistics:
             case m.Beacon():
                 self._cycle_began_s = now_s
             case m.PositionEstimate():
-                self._add_duration('estimate_ms', message.latency_s)
+                self._durations_s['estimate_ms'].append(message.latency_s)
             case m.ProtocolState(outcome='served'):
                 self._served += 1
                 if self._cycle_began_s is not None:
-                    self._add_duration('cycle_ms', now_s - self._cycle_began_s)
-
-    def _add_duration(self, name: str, duration_s: float) -> None:
-        self._durations_s[name].append(duration_s)
+                    self._durations_s['cycle_ms'].append(now_s - self._cycle_began_s)
 
     def report(
             self, phase: str, counters: Mapping[str, int], blocked: bool = False,
@@ -126,22 +122,27 @@ class RoleStatistics:
             values['cycles.served'] = str(self._served)
         for reason, count in sorted(counters.items()):
             values[f'{kind_of(reason).value}.{reason}'] = str(count)
-        for section, counts in (('received', self._received), ('sent', self._sent)):
+        for section, counts in self._messages.items():
             values |= {f'{section}.{name}': str(count) for name, count in sorted(counts.items())}
-        values |= self._percentiles()
+        for name, durations_s in self._durations_s.items():
+            for percent, value_s in zip(
+                    _PERCENTS, np.percentile(durations_s, _PERCENTS), strict=True):
+                values[f'{name}.p{percent}'] = f'{1e3 * value_s:.3f}'
         faults = collections.Counter(
             {reason: count for reason, count in counters.items() if reason not in _NO_FAULTS})
         new_faults, self._faults = faults - self._faults, faults
-        if self.missing:
-            return Report(True, f'waiting for {", ".join(self.missing)}', values)
-        if blocked:
-            return Report(True, f'blocked: {phase}', values)
         warnings = [text for name, text in status.items() if name.startswith('warning.')]
-        if warnings:
-            return Report(True, '; '.join(warnings), values)
-        if new_faults:
-            return Report(True, _summary(new_faults), values)
-        return Report(False, 'paused' if phase == State.PAUSED.value else 'no fault', values)
+        if self.missing:
+            summary = f'waiting for {", ".join(self.missing)}'
+        elif blocked:
+            summary = f'blocked: {phase}'
+        elif warnings:
+            summary = '; '.join(warnings)
+        elif new_faults:
+            summary = _summary(new_faults)
+        else:
+            return Report(False, 'paused' if phase == State.PAUSED.value else 'no fault', values)
+        return Report(True, summary, values)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
         """Return the ids of the codebook in use (at first, the offered one) and a pending one."""
@@ -150,13 +151,6 @@ class RoleStatistics:
         if in_use in ('', self._codebook_id):
             return {'codebook_id': self._codebook_id}
         return {'codebook_id': in_use, 'pending.codebook_id': self._codebook_id}
-
-    def _percentiles(self) -> dict[str, str]:
-        """Return percentiles of the newest durations [ms]."""
-        return {f'{name}.p{percent}': f'{1e3 * value:.3f}'
-                for name, durations_s in self._durations_s.items()
-                for percent, value in zip(
-                    _PERCENTS, np.percentile(durations_s, _PERCENTS), strict=True)}
 
 
 def _summary(faults: collections.Counter[str]) -> str:

@@ -1,12 +1,11 @@
-"""The shapes of a view in space, planes and charts, and those of a network's scene.
+"""The shapes of a network: in space, in planes and in charts.
 
-None depends on the program that draws it.
-
-Lengths are in metres; colours are red, green and blue from 0 to 1.
+Rerun, RViz and Matplotlib show the same shapes; `tools.rerun_stream`, `ros.scene` and
+`tools.pictures` translate them. Lengths are in metres, positions float64 [N, 3], or [N, 2] in a
+plane; colours are red, green and blue from 0 to 1, float64 [N, 3] for N shapes.
 """
 
 import colorsys
-import dataclasses
 import math
 from collections.abc import Iterable
 from typing import NamedTuple, TypeAlias
@@ -21,22 +20,11 @@ from rhs_isac_ros.model.geometry import element_interval_m, element_positions
 from rhs_isac_ros.positioning import WeightedModes
 from rhs_isac_ros.protocol import messages as m
 
+Colour: TypeAlias = tuple[float, float, float]
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Points:
-    """Balls, or discs in a plane.
 
-    Attributes
-    ----------
-    positions
-        Float64 [N, 3] or [N, 2] [m].
-    colours
-        Float64 [N, 3].
-    radii_m
-        Float64 [N] [m].
-    labels
-        Texts, none or one for each ball.
-    """
+class Points(NamedTuple):
+    """Balls, or discs in a plane, with one label each or none."""
 
     positions: np.ndarray
     colours: np.ndarray
@@ -44,20 +32,10 @@ class Points:
     labels: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Ellipsoids:
-    """Outlines of ellipsoids.
+class Ellipsoids(NamedTuple):
+    """Ellipsoids with half the lengths of their axes, float64 [N, 3].
 
-    Attributes
-    ----------
-    centres
-        Float64 [N, 3] [m].
-    half_sizes_m
-        Half the lengths of the axes, float64 [N, 3] [m].
-    quaternions
-        Rotations from the coordinate axes, float64 [N, 4] (x, y, z, w).
-    colours
-        Float64 [N, 3].
+    Unit quaternions, float64 [N, 4] (x, y, z, w), rotate the coordinate axes to theirs.
     """
 
     centres: np.ndarray
@@ -66,9 +44,8 @@ class Ellipsoids:
     colours: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Boxes:
-    """Cuboids along the coordinate axes, solid or as outlines; the arrays are as above."""
+class Boxes(NamedTuple):
+    """Cuboids along the coordinate axes, solid or as outlines."""
 
     centres: np.ndarray
     half_sizes_m: np.ndarray
@@ -76,61 +53,54 @@ class Boxes:
     solid: bool
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Lines:
-    """Polylines of one colour.
-
-    Attributes
-    ----------
-    strips
-        Float64 [n, 3] or [n, 2] [m] each.
-    width
-        Width in points of the screen.
-    """
+class Lines(NamedTuple):
+    """Lines of one colour through the points of each strip; the width is in screen points."""
 
     strips: tuple[np.ndarray, ...]
-    colour: tuple[float, float, float]
+    colour: Colour
     width: float
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Picture:
+class Mesh(NamedTuple):
+    """A surface through a grid of points, float64 [M, N, 3]."""
+
+    points: np.ndarray
+    colour: Colour
+
+
+class Picture(NamedTuple):
     """A picture in shades of grey, uint8 [height, width], the top row first."""
 
     pixels: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Series:
-    """Style of the numbers on a path: a line, or dots if `dots`."""
+class Series(NamedTuple):
+    """The style of the numbers on a path: a line, or dots."""
 
     name: str
-    colour: tuple[float, float, float]
+    colour: Colour
     dots: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A value of a series."""
 
     value: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Text:
-    """A line of the log, as a warning if `warning` is set."""
+class Text(NamedTuple):
+    """A line of the log."""
 
     text: str
     warning: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
 class Clear:
     """Removes the entities of a path and of the paths below it."""
 
 
 Entity: TypeAlias = (
-    Points | Ellipsoids | Boxes | Lines | Picture | Series | Number | Text | Clear)
+    Points | Ellipsoids | Boxes | Lines | Mesh | Picture | Series | Number | Text | Clear)
 
 
 class Entry(NamedTuple):
@@ -146,101 +116,92 @@ class Entry(NamedTuple):
 
 # Level relative to the maximum of a beam at which a lobe has zero length.
 MIN_LEVEL_DB = -20.0
-# Quantile of the squared distance that contains 95 % of a three-dimensional Gaussian.
-_CHI_SQUARE_95 = float(chdtri(3, 0.05))
+# Labels have a ball of this radius, which is invisible.
+INVISIBLE_M = 1e-3
 # The hues of consecutive users differ by the golden ratio.
 _HUE_STEP = 0.618034
-
-
-def user_colour(user: int) -> tuple[float, float, float]:
-    """Return the colour of a user: red, green and blue from 0 to 1."""
-    return colorsys.hsv_to_rgb(_HUE_STEP * user % 1.0, 0.8, 0.9)
-
-
-def ellipsoid_95(covariance_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ellipsoid that contains 95 % of a Gaussian.
-
-    Parameters
-    ----------
-    covariance_m2
-        Covariance of the Gaussian, float64 [3, 3] [m^2].
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Half the lengths of the axes, float64 [3] [m], and the rotation from the coordinate axes
-        to them as a unit quaternion, float64 [4] (x, y, z, w).
-    """
-    variances_m2, axes = np.linalg.eigh(covariance_m2)
-    # The eigenvectors may form a reflection; a quaternion needs a rotation.
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
-    half_m: np.ndarray = np.sqrt(_CHI_SQUARE_95 * np.maximum(variances_m2, 0.0))
-    return half_m, Rotation.from_matrix(axes).as_quat()
-
-
-def lobe_m(pattern: BeamPattern) -> np.ndarray:
-    """Return a beam pattern as a surface whose radius is proportional to the level in decibels.
-
-    Returns
-    -------
-    numpy.ndarray
-        Points of the surface, float64 [n_el, n_az, 3] [m].
-    """
-    floor = 10**(MIN_LEVEL_DB / 10)
-    level_db = 10 * np.log10(np.maximum(pattern.relative, floor))
-    radius_m: np.ndarray = pattern.distance_m * (1 - level_db / MIN_LEVEL_DB)
-    return radius_m[..., None] * pattern.directions
-
-
 _GREY = (0.5, 0.5, 0.5)
-_TRUTH_RADIUS_M = 0.18
-_ESTIMATE_RADIUS_M = 0.12
+_TRUTH_RADIUS_M, _ESTIMATE_RADIUS_M = 0.18, 0.12
 # The volume of the ball of a mode is proportional to its probability.
 _MODE_RADIUS_M = 0.2
 # Modes of a smaller probability are not shown.
 _MIN_PROBABILITY = 0.005
-_THIN, _THICK = 0.6, 2.0
-# Brightness of the beam and of the true paths, behind which other entities remain visible.
+_LINE_WIDTH = 2.0
+# Brightness of true paths, so that other entities in front of them stand out.
 _DIM = 0.45
 # Height of the name above the user; a name on the user hides the estimate.
 _NAME_HEIGHT_M = 1.0
-# Edge of the surface relative to the distance of the region: at its true size, elements would be
-# smaller than a pixel.
+# Edge of the enlarged surface relative to the distance of the region.
 _BOARD_SIZE = 0.2
-# Every line of a lobe of this step is shown; more hide what is behind.
-_LOBE_STEP = 2
-# Thinner bodies are invisible.
+# Viewers do not show bodies without extent.
 _MIN_HALF_SIZE_M = 1e-3
-_INVISIBLE_M = 1e-3
 _MAX_GREY = 255
 
 
+def user_colour(user: int) -> Colour:
+    """Return the colour of a user."""
+    return colorsys.hsv_to_rgb(_HUE_STEP * user % 1.0, 0.8, 0.9)
+
+
+def distance_95(n: int) -> float:
+    """Return the distance, in standard deviations, that contains 95 % of a Gaussian.
+
+    Parameters
+    ----------
+    n
+        Number of dimensions.
+    """
+    return math.sqrt(chdtri(n, 0.05))
+
+
+def axes_95(covariance_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the axes of the ellipse or ellipsoid that contains 95 % of a Gaussian.
+
+    Parameters
+    ----------
+    covariance_m2
+        Covariance of the Gaussian, float64 [n, n] [m^2].
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Half the lengths of the axes, float64 [n] [m], and a rotation, float64 [n, n], whose
+        columns are their directions.
+    """
+    variances_m2, axes = np.linalg.eigh(covariance_m2)
+    # The eigenvectors may form a reflection.
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    return distance_95(len(axes)) * np.sqrt(np.maximum(variances_m2, 0.0)), axes
+
+
 def region(scenario: Scenario) -> Boxes:
-    """Return the region of interest as the outline of a cuboid."""
-    return Boxes(np.array([scenario.roi_center_m]), np.array([scenario.roi_size_m]) / 2,
-                 np.array([_GREY]), solid=False)
+    """Return the region of interest."""
+    return Boxes(np.array([scenario.roi_center_m]), np.maximum(
+        [scenario.roi_size_m], 2 * _MIN_HALF_SIZE_M) / 2, np.array([_GREY]), solid=False)
 
 
-def board(scenario: Scenario, configuration: np.ndarray) -> Boxes:
+def board(scenario: Scenario, configuration: np.ndarray | None, enlarged: bool = False) -> Boxes:
     """Return the surface as one plate for each element, from dark for 0 to bright for 1.
-
-    It is enlarged about its centre, so that single elements are visible from a distance at which
-    the whole region is.
 
     Parameters
     ----------
     configuration
         Applied configuration, float64 [F, N_E] in [0, 1], of which the mean over the frames is
-        shown.
+        shown; None if unknown.
+    enlarged
+        Whether to enlarge the surface about its centre, so that single elements are visible from
+        a distance at which the whole region is.
     """
-    interval_m = (_BOARD_SIZE * math.hypot(*scenario.roi_center_m)
-                  / max(scenario.n_columns, scenario.n_rows))
-    positions = interval_m / element_interval_m(scenario) * element_positions(scenario)
+    positions, interval_m = element_positions(scenario), element_interval_m(scenario)
+    if enlarged:
+        true_interval_m, interval_m = interval_m, _BOARD_SIZE * math.hypot(
+            *scenario.roi_center_m) / max(scenario.n_columns, scenario.n_rows)
+        positions = interval_m / true_interval_m * positions
     half_m = 0.45 * interval_m
-    half_sizes = np.tile([_MIN_HALF_SIZE_M, half_m, half_m], (len(positions), 1))
-    level = np.mean(configuration, axis=0)
-    return Boxes(positions, half_sizes, np.stack([level, level, 0.3 + 0.2 * level], axis=1),
-                 solid=True)
+    level = (np.full(len(positions), 0.5) if configuration is None
+             else np.mean(configuration, axis=0))
+    return Boxes(positions, np.tile([_MIN_HALF_SIZE_M, half_m, half_m], (len(positions), 1)),
+                 np.stack([level, level, 0.3 + 0.2 * level], axis=1), solid=True)
 
 
 def configurations(scenario: Scenario, bands: Iterable[np.ndarray]) -> Picture:
@@ -261,11 +222,11 @@ def configurations(scenario: Scenario, bands: Iterable[np.ndarray]) -> Picture:
 
 
 def truth(message: m.GroundTruth) -> tuple[Points, Points]:
-    """Return the true position of a user as a ball in its colour, and its name above the ball."""
+    """Return the true position of a user as a ball, and the name of the user above the ball."""
     colour = np.array([user_colour(message.user)])
     name = message.position[None] + np.array([0.0, 0.0, _NAME_HEIGHT_M])
     return (Points(message.position[None], colour, np.array([_TRUTH_RADIUS_M])),
-            Points(name, colour, np.array([_INVISIBLE_M]), (f'user {message.user}',)))
+            Points(name, colour, np.array([INVISIBLE_M]), (f'user {message.user}',)))
 
 
 def estimate(message: m.PositionEstimate) -> tuple[Points, Ellipsoids]:
@@ -290,7 +251,9 @@ def modes(user: int, found: WeightedModes) -> tuple[Points, Ellipsoids]:
 
 def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
     """Return positions, float64 [3] [m] each, as a dim line in the colour of a user."""
-    return Lines((np.array(list(positions)).reshape(-1, 3),), _dim(user), _THICK)
+    red, green, blue = user_colour(user)
+    return Lines((np.array(list(positions)).reshape(-1, 3),),
+                 (_DIM * red, _DIM * green, _DIM * blue), _LINE_WIDTH)
 
 
 def track(
@@ -307,31 +270,29 @@ def track(
     """
     places = np.array(list(positions))
     colour = user_colour(user)
-    return (Lines((places, np.stack([places[-1], places[-1] + velocity])), colour, _THICK),
+    return (Lines((places, np.stack([places[-1], places[-1] + velocity])), colour, _LINE_WIDTH),
             _ellipsoids(places[-1:], covariance_m2[None], np.array([colour])))
 
 
-def lobe(scenario: Scenario, message: m.Beam) -> Lines:
-    """Return the pattern of a beam as a grid of dim lines in the colour of its user.
+def pattern(scenario: Scenario, message: m.Beam, step_deg: float = 5.0) -> BeamPattern:
+    """Return the pattern of a beam at the distance of the centre of the region."""
+    return beam_pattern(scenario, Beam(message.analog, message.digital, message.band),
+                        math.hypot(*scenario.roi_center_m), step_deg)
 
-    The radius is the level in decibels, see `lobe_m`.
+
+def lobe(shown: BeamPattern, user: int) -> Mesh:
+    """Return a beam pattern as a surface in the colour of its user.
+
+    The radius is the level in decibels, from 0 at `MIN_LEVEL_DB` to the distance of the pattern.
     """
-    points = lobe_m(beam_pattern(
-        scenario, Beam(message.analog, message.digital, message.band),
-        math.hypot(*scenario.roi_center_m)))
-    strips = [*points[::_LOBE_STEP], *np.swapaxes(points, 0, 1)[::_LOBE_STEP]]
-    # Most lines have no extent.
-    return Lines(tuple(strip for strip in strips if strip.any()), _dim(message.user), _THIN)
-
-
-def _dim(user: int) -> tuple[float, float, float]:
-    red, green, blue = user_colour(user)
-    return _DIM * red, _DIM * green, _DIM * blue
+    level_db = 10 * np.log10(np.maximum(shown.relative, 10**(MIN_LEVEL_DB / 10)))
+    radius_m = shown.distance_m * (1 - level_db / MIN_LEVEL_DB)
+    return Mesh(radius_m[..., None] * shown.directions, user_colour(user))
 
 
 def _ellipsoids(
         centres: np.ndarray, covariances_m2: np.ndarray, colours: np.ndarray) -> Ellipsoids:
-    shapes = [ellipsoid_95(covariance) for covariance in covariances_m2]
-    half_sizes = np.array([half_m for half_m, _ in shapes])
-    return Ellipsoids(centres, np.maximum(half_sizes, _MIN_HALF_SIZE_M),
-                      np.array([quaternion for _, quaternion in shapes]), colours)
+    shapes = [axes_95(covariance) for covariance in covariances_m2]
+    return Ellipsoids(
+        centres, np.maximum([half_m for half_m, _ in shapes], _MIN_HALF_SIZE_M),
+        np.array([Rotation.from_matrix(axes).as_quat() for _, axes in shapes]), colours)

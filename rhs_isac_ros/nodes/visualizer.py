@@ -1,7 +1,6 @@
 """The executable ``visualizer``: shows a network in RViz and Foxglove."""
 
 import copy
-import math
 import time
 from typing import Any
 
@@ -11,7 +10,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from rhs_isac_ros.link import Beam, beam_pattern
+from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, parameters, scene, topics
@@ -79,13 +78,16 @@ class VisualizerNode(Node):
 
     def _show_markers(self, stamp: Time) -> None:
         state = self._scene
-        array = [scene.region(self._scenario, stamp), scene.board(
-            self._scenario, state.configuration.analog if state.configuration else None, stamp)]
-        for user in state.users.values():
+        bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes] = {
+            ('region', 0): shapes.region(self._scenario),
+            ('board', 0): shapes.board(
+                self._scenario, state.configuration.analog if state.configuration else None)}
+        for number, user in state.users.items():
             if user.truth:
-                array.append(scene.truth(user.truth, stamp))
+                bodies['truth', number], _ = shapes.truth(user.truth)
             if user.estimate:
-                array.append(scene.estimate(user.estimate, stamp))
+                _, bodies['estimate', number] = shapes.estimate(user.estimate)
+        array = [scene.marker(*key, body, stamp) for key, body in bodies.items()]
         if state.beam:
             array.append(self._beam_marker(state.beam, stamp))
         array = [scene.place(marker, self._frame) for marker in array]
@@ -95,12 +97,9 @@ class VisualizerNode(Node):
         self._publisher.publish(MarkerArray(markers=array))
 
     def _beam_marker(self, message: m.Beam, stamp: Time) -> Marker:
-        """Return the pattern of a beam at the distance of the centre of the region."""
         if self._drawn is None or self._drawn[0] is not message:
-            pattern = beam_pattern(
-                self._scenario, Beam(message.analog, message.digital, message.band),
-                math.hypot(*self._scenario.roi_center_m))
-            self._drawn = message, scene.beam(pattern, message.user, stamp)
+            lobe = shapes.lobe(shapes.pattern(self._scenario, message), message.user)
+            self._drawn = message, scene.marker('beam', 0, lobe, stamp)
         drawn = copy.copy(self._drawn[1])
         drawn.header = Header(stamp=stamp, frame_id=drawn.header.frame_id)
         return drawn

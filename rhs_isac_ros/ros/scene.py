@@ -22,81 +22,49 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
-from rhs_isac_ros.link import BeamPattern
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_interval_m, element_positions
-from rhs_isac_ros.monitoring.shapes import ellipsoid_95, lobe_m, user_colour
-from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.monitoring.shapes import Boxes, Ellipsoids, Mesh, Points
 from rhs_isac_ros.ros import endpoints
 from rhs_isac_ros.ros.endpoints import create_publisher
 from rhs_isac_ros.ros.frames import Frame, to_ros
 from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
-_USER_SIZE_M = 0.25
-# RViz rejects bodies without extent [m].
-_MIN_EXTENT_M = 1e-3
+# Opacity of bodies through which others remain visible.
+_ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
 
 
-def board(scenario: Scenario, configuration: np.ndarray | None, stamp: Time) -> Marker:
-    """Return the surface as one cube for each element, from dark for 0 to bright for 1.
+def marker(
+        namespace: str, number: int, shape: Points | Ellipsoids | Boxes | Mesh, stamp: Time
+) -> Marker:
+    """Return a ball, an ellipsoid, cuboids or a mesh as a marker.
 
-    It shows the mean over the frames of a configuration, float64 [F, N_E] in [0, 1]; None if
-    unknown.
+    Rerun draws an ellipsoid and a box that is not solid as outlines; here they are translucent.
     """
-    positions = element_positions(scenario)
-    levels = (np.full(len(positions), 0.5) if configuration is None
-              else np.mean(configuration, axis=0))
-    side_m = 0.9 * element_interval_m(scenario)
-    marker = _marker('board', 0, Marker.CUBE_LIST, stamp)
-    marker.scale = Vector3(x=_MIN_EXTENT_M, y=side_m, z=side_m)
-    marker.points = [to_ros(Point, position) for position in positions]
-    marker.colors = [ColorRGBA(r=c, g=c, b=0.3 + 0.2 * c, a=1.0) for c in levels.tolist()]
-    return marker
-
-
-def region(scenario: Scenario, stamp: Time) -> Marker:
-    """Return the region of interest as a translucent cuboid."""
-    marker = _marker('region', 0, Marker.CUBE, stamp)
-    marker.pose.position = to_ros(Point, np.array(scenario.roi_center_m))
-    marker.scale = to_ros(Vector3, np.maximum(scenario.roi_size_m, _MIN_EXTENT_M))
-    marker.color = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.15)
-    return marker
-
-
-def truth(message: m.GroundTruth, stamp: Time) -> Marker:
-    """Return the true position of a user as a small ball in the colour of the user."""
-    marker = _marker('truth', message.user, Marker.SPHERE, stamp)
-    marker.pose.position = to_ros(Point, message.position)
-    marker.scale = to_ros(Vector3, np.full(3, _USER_SIZE_M))
-    marker.color = _colour(message.user, 1.0)
-    return marker
-
-
-def estimate(message: m.PositionEstimate, stamp: Time) -> Marker:
-    """Return the ellipsoid that contains 95 % of an estimate, in the colour of the user."""
-    half_m, quaternion = ellipsoid_95(message.covariance_m2)
-    marker = _marker('estimate', message.user, Marker.SPHERE, stamp)
-    marker.pose.position = to_ros(Point, message.position)
-    marker.pose.orientation = to_ros(Quaternion, quaternion)
-    marker.scale = to_ros(Vector3, np.maximum(2 * half_m, _MIN_EXTENT_M))
-    marker.color = _colour(message.user, 0.35)
-    return marker
-
-
-def beam(pattern: BeamPattern, user: int, stamp: Time) -> Marker:
-    """Return the surface of `lobe_m` as triangles in the colour of the user."""
-    points = lobe_m(pattern)
-    # Two triangles for each cell of the mesh, with their front sides outward.
-    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
-    corners = np.stack([a, b, c, a, c, d], axis=2).reshape(-1, 3, 3)
-    # Triangles without area are invisible and need not be sent.
-    corners = corners[np.linalg.norm(np.cross(
-        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0]
-    marker = _marker('beam', 0, Marker.TRIANGLE_LIST, stamp)
-    marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
-    marker.points = [to_ros(Point, corner) for corner in corners.reshape(-1, 3)]
-    marker.color = _colour(user, 0.25)
-    return marker
+    match shape:
+        case Points():
+            found = _marker(namespace, number, Marker.SPHERE, stamp)
+            found.pose.position = to_ros(Point, shape.positions[0])
+            found.scale = to_ros(Vector3, np.full(3, 2 * shape.radii_m[0]))
+            found.color = _colour(shape.colours[0], 1.0)
+        case Ellipsoids():
+            x, y, z, w = shape.quaternions[0].tolist()
+            found = _marker(namespace, number, Marker.SPHERE, stamp)
+            found.pose = Pose(position=to_ros(Point, shape.centres[0]),
+                              orientation=Quaternion(x=x, y=y, z=z, w=w))
+            found.scale = to_ros(Vector3, 2 * shape.half_sizes_m[0])
+            found.color = _colour(shape.colours[0], _ELLIPSOID)
+        case Boxes():
+            # All cuboids have the size of the first.
+            found = _marker(namespace, number, Marker.CUBE_LIST, stamp)
+            found.scale = to_ros(Vector3, 2 * shape.half_sizes_m[0])
+            found.points = [to_ros(Point, centre) for centre in shape.centres]
+            found.colors = [_colour(colour, 1.0 if shape.solid else _OUTLINE)
+                            for colour in shape.colours]
+        case Mesh():
+            found = _marker(namespace, number, Marker.TRIANGLE_LIST, stamp)
+            found.scale = Vector3(x=1.0, y=1.0, z=1.0)
+            found.points = [to_ros(Point, corner) for corner in _triangles(shape.points)]
+            found.color = _colour(shape.colour, _MESH)
+    return found
 
 
 def deletion(namespace: str, number: int, stamp: Time) -> Marker:
@@ -121,16 +89,26 @@ def path(positions: Iterable[np.ndarray], stamp: Time, frame: Frame) -> Path:
         for position in positions])
 
 
+def _triangles(points: np.ndarray) -> np.ndarray:
+    """Return the corners of the triangles of a mesh, float64 [N, 3], front sides outward."""
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    corners = np.stack([a, b, c, a, c, d], axis=2).reshape(-1, 3, 3)
+    # Triangles without area are invisible and need not be sent.
+    areas = np.linalg.norm(np.cross(
+        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return corners[areas > 0].reshape(-1, 3)
+
+
 def _marker(namespace: str, number: int, kind: int, stamp: Time) -> Marker:
-    marker = Marker(header=Header(stamp=stamp, frame_id=RHS_FRAME), ns=namespace, type=kind,
-                    # Marker ids are signed, user numbers are unsigned.
-                    id=number & 0x7fffffff, action=Marker.ADD)
-    marker.pose.orientation.w = 1.0
-    return marker
+    found = Marker(header=Header(stamp=stamp, frame_id=RHS_FRAME), ns=namespace, type=kind,
+                   # Marker ids are signed, user numbers are unsigned.
+                   id=number & 0x7fffffff, action=Marker.ADD)
+    found.pose.orientation.w = 1.0
+    return found
 
 
-def _colour(user: int, opacity: float) -> ColorRGBA:
-    red, green, blue = user_colour(user)
+def _colour(values: Iterable[float], opacity: float) -> ColorRGBA:
+    red, green, blue = (float(value) for value in values)
     return ColorRGBA(r=red, g=green, b=blue, a=opacity)
 
 

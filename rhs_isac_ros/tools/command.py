@@ -1,13 +1,14 @@
-"""What the commands share: their entry and exit codes, and the node of `topic` and `param`."""
+"""The entry of the commands, and what several of them use: nodes, recordings and tables."""
 
 import argparse
+import contextlib
+import itertools
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
@@ -17,13 +18,18 @@ from rclpy.node import Node
 from rclpy.utilities import try_shutdown
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
+import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import CalibrationError
-from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import discard_stdout, print_error
-from rhs_isac_ros.model import ScenarioError
+from rhs_isac_ros.model import Scenario, ScenarioError
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError
-from rhs_isac_ros.ros.recording import RecordingError
-from rhs_isac_ros.ros.run import check_domain, parse
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
+from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
+from rhs_isac_ros.ros.run import parse, run
 from rhs_isac_ros.ros.startup import (
     WITHOUT_SERVICES,
     SecurityError,
@@ -41,11 +47,12 @@ _POLL_PERIOD_S = 0.02
 # Discovery is complete when the graph has not changed for this time [s]. It pauses while DDS
 # security exchanges keys.
 _SETTLE_S = 1.0 if is_enabled() else 0.4
-
-
 # Errors of arguments and files.
 INVALID = (RecordingError, ScenarioError, CodebookError, CalibrationError, ModelError,
            plugins.PluginError, OSError)
+# End of the error that messages do not match the scenario.
+OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
+_NodeT = TypeVar('_NodeT', bound=Node)
 
 
 class ToolError(RuntimeError):
@@ -86,8 +93,7 @@ def run_command(
     check_distinct(parser, named(inputs), named(outputs))
     try:
         return work(options, [parser.prog, *arguments])
-    except KeyboardInterrupt:
-        # The handlers of signals are not installed yet while libraries are imported.
+    except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except BrokenPipeError:
         discard_stdout()
@@ -100,39 +106,127 @@ def run_command(
         return 2
 
 
-class Session:
+def print_now(*values: object, end: str = '\n') -> None:
+    """Print and flush, so that a pipe receives the text at once."""
+    print(*values, end=end, flush=True)
+
+
+def text_table(heads: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
+    """Return a table, aligned by ``<`` or ``>`` for each column; heads may have several lines."""
+    lines = [*itertools.zip_longest(*(head.split('\n') for head in heads), fillvalue=''), *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return '\n'.join('  '.join(
+        f'{cell:{side}{width}}' for cell, side, width in zip(line, align, widths, strict=True)
+    ).rstrip() for line in lines)
+
+
+def none_within(what: str, timeout_s: float) -> ToolError:
+    """Return the error that a network did not provide something within a time [s]."""
+    return ToolError(f'{what} within {timeout_s:g} s, in the domain '
+                     f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
+
+
+def observe(
+        make: Callable[[], _NodeT], arguments: Sequence[str],
+        done: Callable[[_NodeT], bool] = lambda node: False) -> tuple[int, _NodeT | None]:
+    """Spin a node until a signal arrives or it is done.
+
+    Return the exit code of `rhs_isac_ros.ros.run.run`, and the node, or None if that fails.
+    """
+    nodes: list[_NodeT] = []
+
+    def create() -> list[_NodeT]:
+        nodes.append(make())
+        return nodes
+    code = run(create, arguments, lambda: done(nodes[0]))
+    return code, nodes[0] if nodes else None
+
+
+def subscribe_codebooks(
+        node: Node, scenario: Scenario, on_codebook: Callable[[Codebook], None]) -> None:
+    """Subscribe to the codebooks of a network; those that do not fit the scenario are dropped."""
+    def receive(message: ros.Codebook) -> None:
+        try:
+            codebook = convert.codebook_from_ros(message)
+            codebook.check(scenario)
+        except (m.MessageError, CodebookError) as error:
+            node.get_logger().warning(f'dropped codebook: {error}')
+            return
+        on_codebook(codebook)
+    subscribe(node, ros.Codebook, topics.CODEBOOK, receive, endpoints.LATCHED)
+
+
+def choose_scenario(config: Path | None, recording: Path | None = None) -> Scenario:
+    """Return the scenario of a file, by default that of a recording, or the paper's Table I."""
+    if config:
+        return Scenario.from_yaml(config)
+    return (read_scenario(recording) if recording else None) or Scenario()
+
+
+def topic_prefix(namespace: str) -> str:
+    """Return the prefix of the full names of the topics in a namespace."""
+    return f'/{namespace.strip("/")}/'.replace('//', '/')
+
+
+def recorded(
+        path: Path, namespace: str, scenario: Scenario, kinds: Collection[type]
+) -> Iterator[tuple[Any, float]]:
+    """Yield what a network published, and when [s], in the order in which it was recorded.
+
+    Parameters
+    ----------
+    kinds
+        Messages of the protocol; also `Codebook`, and `Report` for pairs of the name of a node and
+        its report.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a recording, or a message is malformed or does not fit the scenario.
+    """
+    prefix = topic_prefix(namespace)
+    names: dict[type, str] = {**topics.NAMES, Codebook: topics.CODEBOOK}
+    by_topic = {f'{prefix}{names[kind]}': kind for kind in kinds if kind is not Report}
+    if Report in kinds:
+        # Before version 1.0, the topic was in the namespace.
+        reports = topics.DIAGNOSTICS, f'{prefix}{topics.DIAGNOSTICS.lstrip("/")}'
+        by_topic.update(dict.fromkeys(reports, Report))
+    for topic, found, time_s in read(path, by_topic):
+        kind = by_topic[topic]
+        try:
+            if kind is Report:
+                yield from ((pair, time_s) for pair in diagnostics.from_ros(found, namespace))
+            elif kind is Codebook:
+                codebook = convert.codebook_from_ros(found)
+                codebook.check(scenario)
+                yield codebook, time_s
+            else:
+                message: m.Message = convert.from_ros(kind, found)
+                m.check(message, scenario.sizes)
+                yield message, time_s
+        except (m.MessageError, CodebookError) as error:
+            raise RecordingError(f'{path}: {topic}: {error}') from None
+
+
+class Session(contextlib.AbstractContextManager['Session']):
     """A context manager with one node, which the command itself spins."""
 
-    def __init__(self) -> None:
+    def __init__(self, arguments: Sequence[str] = ('',)) -> None:
         use_discovery_profile()
-        rclpy.init(args=prepare(['']))
+        rclpy.init(args=prepare(arguments))
         with one_line():
             self.node = Node(f'_rhs_isac_cli_{os.getpid()}', **WITHOUT_SERVICES)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
 
-    def __enter__(self) -> 'Session':
-        """Return `self`."""
-        return self
-
-    def __exit__(
-            self, kind: type[BaseException] | None, error: BaseException | None,
-            traceback: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         """Destroy the node and shut the context down."""
         self._executor.shutdown()
         self.node.destroy_node()
         try_shutdown()
 
     def spin_until(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Spin until a condition holds; return whether it does.
-
-        Parameters
-        ----------
-        condition
-            Evaluated after every callback and poll.
-        timeout_s
-            Maximum duration [s]; None: unlimited.
-        """
+        """Spin until a condition holds, or for a time [s] if given; return whether it holds."""
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not condition():
             if end_s is not None and time.monotonic() >= end_s:
@@ -141,35 +235,24 @@ class Session:
         return True
 
     def discover(self, timeout_s: float) -> None:
-        """Spin until other nodes have been discovered and the graph no longer changes.
-
-        Parameters
-        ----------
-        timeout_s
-            Maximum duration [s].
-        """
-        end_s = time.monotonic() + timeout_s
+        """Spin until the graph has other nodes and no longer changes, or for a time [s]."""
         graph, changed_s = self._graph(), time.monotonic()
-        while (now_s := time.monotonic()) < end_s:
-            self._executor.spin_once(timeout_sec=_POLL_PERIOD_S)
+
+        def settled() -> bool:
+            nonlocal graph, changed_s
             previous, graph = graph, self._graph()
             if graph != previous:
-                changed_s = now_s
-            if len(self.node.get_node_names()) > 1 and now_s - changed_s > _SETTLE_S:
-                return
+                changed_s = time.monotonic()
+            return (len(self.node.get_node_names()) > 1
+                    and time.monotonic() - changed_s > _SETTLE_S)
+        self.spin_until(settled, timeout_s)
 
     def _graph(self) -> list[Any]:
         return sorted([*self.node.get_topic_names_and_types(),
                        *self.node.get_node_names_and_namespaces()], key=repr)
 
     def full_name(self, topic: str) -> str:
-        """Return the full name of a topic whose name may be relative.
-
-        Raises
-        ------
-        ToolError
-            If it is not a valid name of a topic.
-        """
+        """Return the full name of a topic whose name may be relative, or raise `ToolError`."""
         try:
             name = expand_topic_name(topic, self.node.get_name(), self.node.get_namespace())
             validate_full_topic_name(name)
@@ -179,37 +262,15 @@ class Session:
         return name
 
 
-def print_now(*values: object, end: str = '\n') -> None:
-    """Print and flush, so that a pipe receives the text at once."""
-    print(*values, end=end, flush=True)
+def run_verb(options: argparse.Namespace, arguments: list[str]) -> int:
+    """Call ``options.verb`` with a session and the options, and return the exit code.
 
-
-def run_tool(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
-    """Run the command of a command line.
-
-    Parameters
-    ----------
-    parser
-        Its subparsers set ``verb``, a callable that takes session and options.
-    arguments
-        Command line; by default that of the process.
-
-    Returns
-    -------
-    int
-        Exit code: 0, including after a signal or when the reader closes the output; 1 after an
-        error.
+    Errors have no name of a program in front, as those of ``ros2``.
     """
-    check_domain(parser)
-    options = parser.parse_args(arguments)
     try:
-        with Session() as session, one_line():
+        with Session(arguments) as session, one_line():
             options.verb(session, options)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
     except (ToolError, SecurityError) as error:
         print(error, file=sys.stderr)
         return 1
-    except BrokenPipeError:
-        discard_stdout()
     return 0

@@ -2,32 +2,32 @@
 
 import argparse
 import contextlib
+import dataclasses
 import math
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
 
-from rhs_isac_ros.codebook import CodebookError
+from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.executables import STARTED_S, exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
 from rhs_isac_ros.protocol.messages import Phase
-from rhs_isac_ros.protocol.settings import PRIORS, REGION
+from rhs_isac_ros.protocol.settings import PRIORS, REGION, Impairments
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.ros.processes import (
-    MAX_USER_NODES,
-    Processes,
-    private_domain,
-)
+from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros.processes import MAX_USER_NODES, Processes, max_processes, private_domain
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, RecordingError
+from rhs_isac_ros.ros.roster import ROSTER, UNIQUE
 from rhs_isac_ros.ros.run import check_domain
 from rhs_isac_ros.ros.startup import (
     WITHOUT_SERVICES,
@@ -39,44 +39,162 @@ from rhs_isac_ros.ros.startup import (
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
+    input_file,
     integer,
     output_file,
     picture_file,
     positive_int,
+    seed,
 )
-from rhs_isac_ros.tools.pictures import draw_cycles, prepare_drawing
-from rhs_isac_ros.tools.process_network import (
-    add_network_options,
-    load_files,
-    max_user_processes,
-    positioner_parameters,
-    start_network,
-    watch,
-)
+from rhs_isac_ros.support.pictures import write_picture
+from rhs_isac_ros.tools.command import choose_scenario, text_table
+from rhs_isac_ros.tools.pictures import compose_cycles, prepare_drawing
 
+# Maximum time between two complete cycles [s].
+_CYCLE_TIMEOUT_S = 60.0
+# Time between two looks at the nodes that have been discovered, and at the others [s].
+_DISCOVERY_PERIOD_S, _PERIOD_S = 0.02, 0.5
 _PHASES = (Phase.BEACONING, Phase.POSITIONING, Phase.ESTIMATING, Phase.TRANSMITTING)
+_HEADS = ('cycle', 'user', 'true position [m]', 'estimate [m]', 'error\n[m]', '√CRLB\n[m]',
+          'beacon\n[ms]', 'sound\n[ms]', 'locate\n[ms]', 'data\n[ms]', 'capacity\n[Mbit/s]',
+          'loss\n[%]')
+_STAT_FILE = Path('/proc/self/stat')
+# Index of the time of the start among the fields that follow the name of the program.
+_START_FIELD = 19
+
+
+def add_network_options(parser: argparse.ArgumentParser) -> None:
+    """Add the seed and the files of a network to the options of a command."""
+    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
+    parser.add_argument('--config', '--scenario', type=input_file, metavar='FILE',
+                        help="scenario file; by default the paper's Table I")
+    parser.add_argument('--codebook', type=input_file, metavar='FILE',
+                        help='codebook file; by default that of the package')
+
+
+def check_users(parser: argparse.ArgumentParser, users: int) -> None:
+    """Exit with a usage error if a process for each user would overload this machine."""
+    limit = max_user_processes()
+    if users > limit:
+        parser.error(f'argument --users: {users}, expected at most {limit} on this machine, '
+                     'because each user is a process')
+
+
+def max_user_processes() -> int:
+    """Return the number of users that this machine can run as processes of their own."""
+    return max_processes() - len(UNIQUE)
+
+
+def load_files(config: Path | None, codebook: Path | None) -> tuple[Scenario, Path]:
+    """Return a scenario, and the absolute path of a codebook file that matches it.
+
+    Raises
+    ------
+    ScenarioError, CodebookError
+        If a file is invalid, or the codebook does not match the scenario.
+    """
+    scenario = choose_scenario(config)
+    codebook_file = Path(codebook or default_codebook_file()).resolve()
+    Codebook.load(codebook_file).check(scenario)
+    return scenario, codebook_file
+
+
+def start_network(
+        processes: Processes, users: int, seed: int, scenario_file: Path | None,
+        codebook_file: Path, scenario: Scenario, rest_s: float = 0.1, first_cycle: int = 1,
+        impairments: Impairments | None = None, together: bool = False,
+        positioner: Mapping[str, Any] | None = None) -> None:
+    """Start each node of a network in a process of its own.
+
+    Parameters
+    ----------
+    users
+        Number of users; they walk at random at the scenario's maximum speed.
+    scenario_file
+        File of ``scenario``; None for the paper's Table I.
+    rest_s
+        Pause between cycles [s].
+    first_cycle
+        Number of the first cycle. With 1, cycles are reproducible for a seed; with 0, cycle
+        numbers are derived from the clock, so that the base station can be restarted.
+    impairments
+        Impairments of signals and packets; by default none.
+    together
+        Whether the users share one node, named ``users``, instead of a node for each.
+    positioner
+        Further parameters of the positioner.
+    """
+    given: dict[str, Any] = {
+        'seed': seed, 'codebook_file': codebook_file, 'rest_s': rest_s,
+        'first_cycle': first_cycle, **dataclasses.asdict(impairments or Impairments())}
+    if scenario_file:
+        given['scenario_file'] = Path(scenario_file).resolve()
+    for role in ROSTER:
+        known = {parameter.name for parameter in parameters.NODES[role]}
+        values = {name: value for name, value in given.items() if name in known}
+        if role == 'positioner':
+            values |= positioner or {}
+        if ROSTER[role].is_unique:
+            processes.start(role, **values)
+            continue
+        for name, first, count in [('users', 1, users)] if together else [
+                (f'user_{user}', user, 1) for user in range(1, users + 1)]:
+            processes.start(
+                role, name, **values, user_id=first, user_count=count, mobility='random_walk',
+                speed_mps=scenario.max_user_speed_mps)
+
+
+def watch(
+        observer: CycleObserver, processes: Processes, cycles: int,
+        on_progress: Callable[[int, int], None],
+        on_discovered: Callable[[], None] | None = None) -> str:
+    """Spin an observer until it has received a number of complete cycles.
+
+    Parameters
+    ----------
+    on_progress
+        Called with the number of complete cycles and `cycles` when the former changes.
+    on_discovered
+        Called when the observer has discovered all nodes.
+
+    Returns
+    -------
+    str
+        The error that ended the wait; empty if there was none.
+    """
+    seen, changed_s = -1, time.monotonic()
+    while seen < cycles:
+        rclpy.spin_once(
+            observer, timeout_sec=_DISCOVERY_PERIOD_S if on_discovered else _PERIOD_S)
+        if on_discovered and set(processes.names) <= set(observer.get_node_names()):
+            on_discovered()
+            on_discovered = None
+        complete = len(observer.log.complete)
+        if complete != seen:
+            seen, changed_s = complete, time.monotonic()
+            on_progress(complete, cycles)
+        for name, code in processes.ended().items():
+            return f'{name} ended with exit code {code}:\n{processes.log(name)}'
+        if time.monotonic() - changed_s > _CYCLE_TIMEOUT_S:
+            return (f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station:\n'
+                    f'{processes.log("bs")}')
+    return ''
 
 
 def table(cycles: Sequence[CompleteCycle]) -> str:
     """Return a table with one line for each cycle."""
-    head = ('cycle user  true position [m]      estimate [m]           error  '
-            '√CRLB   beacon   sound  locate    data   capacity     loss\n'
-            '                                                            [m]    '
-            '[m]     [ms]    [ms]    [ms]    [ms]   [Mbit/s]      [%]')
-    return '\n'.join([head, *(_row(cycle) for cycle in cycles)])
+    return text_table(_HEADS, map(_row, cycles), '>' * len(_HEADS))
 
 
-def _row(cycle: CompleteCycle) -> str:
+def _row(cycle: CompleteCycle) -> list[str]:
     durations = cycle.durations_s()
-    times = ''.join(f'{1e3 * durations.get(phase, math.nan):8.1f}' for phase in _PHASES)
-    return (f'{cycle.cycle_id:5d} {cycle.user:4d}  {_coordinates(cycle.truth.position):22s}'
-            f' {_coordinates(cycle.estimate.position):22s}{cycle.error_m:6.2f} '
-            f'{math.sqrt(cycle.estimate.crlb_m2):6.2f} {times}'
-            f' {cycle.capacity.actual_bps / 1e6:10.3f} {cycle.capacity.loss_percent:8.3f}')
-
-
-def _coordinates(position: np.ndarray) -> str:
-    return ' '.join(f'{coordinate:6.2f}' for coordinate in position)
+    return [
+        str(cycle.cycle_id), str(cycle.user),
+        *(' '.join(f'{coordinate:6.2f}' for coordinate in position)
+          for position in (cycle.truth.position, cycle.estimate.position)),
+        f'{cycle.error_m:.2f}', f'{math.sqrt(cycle.estimate.crlb_m2):.2f}',
+        *(f'{1e3 * durations.get(phase, math.nan):.1f}' for phase in _PHASES),
+        f'{cycle.capacity.actual_bps / 1e6:.3f}', f'{cycle.capacity.loss_percent:.3f}']
 
 
 def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) -> str:
@@ -86,22 +204,16 @@ def summary(cycles: Sequence[CompleteCycle], given_up: Sequence[CycleRecord]) ->
     lengths = np.array([cycle.duration_s for cycle in cycles])
     losses = np.array([cycle.capacity.loss_percent for cycle in cycles])
     users = len({cycle.user for cycle in cycles})
-    lines = [
+    return '\n'.join([
         f'{len(cycles)} cycles of {users} users served, {len(given_up)} given up',
         f'position error: median {np.median(errors):.2f} m, root mean square '
         f'{np.sqrt(np.mean(errors**2)):.2f} m; median √CRLB {np.median(bounds):.2f} m',
         f'cycle: median {1e3 * np.nanmedian(lengths):.1f} ms; estimator: median '
         f'{1e3 * np.median([cycle.estimate.latency_s for cycle in cycles]):.1f} ms',
         f'capacity: median {np.median([c.capacity.actual_bps for c in cycles]) / 1e6:.2f} '
-        f'Mbit/s; loss: median {np.median(losses):.3f} %, worst {losses.max():.3f} %']
-    lines += [f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
-              for record in given_up]
-    return '\n'.join(lines)
-
-
-_STAT_FILE = Path('/proc/self/stat')
-# Index of the time of the start among the fields that follow the name of the program.
-_START_FIELD = 19
+        f'Mbit/s; loss: median {np.median(losses):.3f} %, worst {losses.max():.3f} %',
+        *(f'cycle {record.cycle_id} of user {record.user} given up: {record.outcome}'
+          for record in given_up)])
 
 
 def process_age_s() -> float | None:
@@ -118,31 +230,24 @@ def process_age_s() -> float | None:
         return None
 
 
-class Parts:
-    """Consecutive parts of a duration; times are those of `time.monotonic` [s]."""
+def parts_text(begin_s: float, parts: Sequence[tuple[str, float]]) -> str:
+    """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.40, ...)``.
 
-    def __init__(self, begin_s: float) -> None:
-        self._begin_s = self._last_s = begin_s
-        self._parts: list[tuple[str, float]] = []
-
-    def end(self, part: str, now_s: float) -> None:
-        """End a part, which began at the end of the previous one."""
-        self._parts.append((part, now_s - self._last_s))
-        self._last_s = now_s
-
-    def text(self) -> str:
-        """Return a line with the total and the parts, such as ``time: 2.1 s (first 0.4, ...)``."""
-        parts = ', '.join(f'{name} {duration_s:.2f}' for name, duration_s in self._parts)
-        return f'time: {self._last_s - self._begin_s:.2f} s ({parts})'
+    Parameters
+    ----------
+    begin_s
+        Time at which the first part began [s].
+    parts
+        Name of each part, and the time at which it ended [s].
+    """
+    times_s = [begin_s, *(end_s for _, end_s in parts)]
+    texts = [f'{name} {end_s - start_s:.2f}' for (name, end_s), start_s in zip(
+        parts, times_s, strict=False)]
+    return f'time: {times_s[-1] - begin_s:.2f} s ({", ".join(texts)})'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demonstration.
-
-    Parameters
-    ----------
-    arguments
-        Command line; by default that of the process.
 
     Returns
     -------
@@ -153,35 +258,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     check_domain(parser)
-    together = options.users > min(MAX_USER_NODES, max_user_processes())
-    if together:
-        print(f'the {options.users} users share one process', file=sys.stderr)
     check_distinct(parser, {'--config': options.config, '--codebook': options.codebook},
                    {'--record': options.record, '--picture': options.picture})
     try:
         scenario, codebook_file = load_files(options.config, options.codebook)
         recorder = Recorder(options.record, scenario) if options.record else None
+        os.environ.update(private_domain())
+        use_discovery_profile()
+        return _run(scenario, codebook_file, recorder, options)
     except CodebookError as error:
         print_error(f'{error}; to create a codebook for a scenario: python3 -m '
                     'rhs_isac_ros.codebook --scenario FILE --output FILE', parser.prog)
-        return 2
-    except (ScenarioError, RecordingError) as error:
+    except (ScenarioError, RecordingError, SecurityError) as error:
         print_error(error, parser.prog)
-        return 2
-    os.environ.update(private_domain())
-    use_discovery_profile()
-    try:
-        return _run(scenario, codebook_file, recorder, options, together, _parts())
-    except SecurityError as error:
-        print_error(error, parser.prog)
-        return 2
+    return 2
 
 
 def _run(
         scenario: Scenario, codebook_file: Path, recorder: Recorder | None,
-        options: argparse.Namespace, together: bool, parts: Parts) -> int:
+        options: argparse.Namespace) -> int:
     """Run the network until its cycles are complete, and report on them; return the exit code."""
     log, code = CycleLog(), 0
+    now_s, age_s = time.monotonic(), process_age_s()
+    parts = [('imports', now_s)]
+    if age_s is not None:
+        parts.insert(0, ('environment', STARTED_S))
+    together = options.users > min(MAX_USER_NODES, max_user_processes())
+    if together:
+        print(f'the {options.users} users share one process', file=sys.stderr)
+    # The parameter does not admit 0.
+    positioner = {} if options.prior == REGION else {
+        'prior': options.prior, 'track_speed_mps': max(scenario.max_user_speed_mps, 0.01)}
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
         # The log of the cycles is complete when the processes are about to end.
         with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
@@ -190,8 +297,7 @@ def _run(
                 with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
                     start_network(
                         processes, options.users, options.seed, options.config, codebook_file,
-                        scenario, together=together,
-                        positioner=positioner_parameters(options.prior, scenario))
+                        scenario, together=together, positioner=positioner)
                     problem = _observe(log, processes, recorder, options.cycles, parts)
             finally:
                 # Also if a signal arrives before the observer exists.
@@ -201,26 +307,14 @@ def _run(
             with contextlib.suppress(KeyboardInterrupt):
                 code = _report(log, scenario, options, problem)
     if log.complete:
-        parts.end('end', time.monotonic())
-        print(parts.text())
+        parts.append(('end', time.monotonic()))
+        print(parts_text(STARTED_S if age_s is None else now_s - age_s, parts))
     return code
-
-
-def _parts() -> Parts:
-    """Return the parts of the run so far: the scripts, and the imports of this process."""
-    now_s, age_s = time.monotonic(), process_age_s()
-    if age_s is None:
-        parts = Parts(STARTED_S)
-    else:
-        parts = Parts(now_s - age_s)
-        parts.end('environment', STARTED_S)
-    parts.end('imports', now_s)
-    return parts
 
 
 def _observe(
         log: CycleLog, processes: Processes, recorder: Recorder | None, cycles: int,
-        parts: Parts) -> str:
+        parts: list[tuple[str, float]]) -> str:
     """Observe a number of cycles, and return the error that ended them; empty if none did."""
     # The network needs a moment to start.
     prepare_drawing()
@@ -235,27 +329,11 @@ def _observe(
         if log.complete:
             begin_s = log.complete[0].began_s
             # On a busy machine, a cycle may end before this process has discovered all nodes.
-            parts.end('start and discovery of the nodes', min([*discovered_s, begin_s]))
-            parts.end('codebook and tables', begin_s)
-            parts.end('cycles', log.complete[-1].ended_s)
+            parts += [('start and discovery of the nodes', min([*discovered_s, begin_s])),
+                      ('codebook and tables', begin_s),
+                      ('cycles', log.complete[-1].ended_s)]
         observer.destroy_node()  # type: ignore[no-untyped-call]
         try_shutdown()
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = ArgumentParser(
-        prog='demo', description='Start a network, every node as a process, and report on its '
-        'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
-    parser.add_argument('--cycles', type=positive_int, default=20, help='cycles to wait for')
-    add_network_options(parser)
-    parser.add_argument('--prior', choices=PRIORS, default=REGION,
-                        help='prior of the positions: the region, or the track of each user')
-    parser.add_argument('--record', type=output_file, metavar='FILE',
-                        help='recording to write (MCAP)')
-    parser.add_argument('--picture', type=picture_file, default='demo.png', metavar='FILE',
-                        help='file to draw: PNG, PDF or SVG')
-    return parser
 
 
 def _show_progress(complete: int, goal: int) -> None:
@@ -275,13 +353,29 @@ def _report(
     if complete:
         print(table(complete))
         print(summary(complete, given_up))
-        draw_cycles(complete, scenario, options.picture)
+        write_picture(options.picture, compose_cycles(complete, scenario))
         print(f'picture: {options.picture}')
     if options.record:
         print(f'recording: {options.record}')
     if problem:
         print_error(problem, 'demo')
     return 1 if problem or log.failed else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = ArgumentParser(
+        prog='demo', description='Start a network, every node as a process, and report on its '
+        'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    add = parser.add_argument
+    add('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
+    add('--cycles', type=positive_int, default=20, help='cycles to wait for')
+    add_network_options(parser)
+    add('--prior', choices=PRIORS, default=REGION,
+        help='prior of the positions: the region, or the track of each user')
+    add('--record', type=output_file, metavar='FILE', help='recording to write (MCAP)')
+    add('--picture', type=picture_file, default='demo.png', metavar='FILE',
+        help='file to draw: PNG, PDF or SVG')
+    return parser
 
 
 if __name__ == '__main__':

@@ -166,6 +166,7 @@ def policy(
     users, robots, is_simulated
         As for `permissions`.
     """
+    add = ElementTree.SubElement
     root = ElementTree.Element('policy', version=_VERSION)
     enclaves = ElementTree.SubElement(root, 'enclaves')
     for node, allowed in permissions(users, robots, is_simulated).items():
@@ -176,9 +177,9 @@ def policy(
         for right, names in allowed._asdict().items():
             kind = 'topic' if right in ('publish', 'subscribe') else 'service'
             if names:
-                rules = ElementTree.SubElement(profile, f'{kind}s', {right: 'ALLOW'})
+                rules = add(profile, f'{kind}s', {right: 'ALLOW'})
                 for name in names:
-                    ElementTree.SubElement(rules, kind).text = name
+                    add(rules, kind).text = name
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding='unicode')
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'

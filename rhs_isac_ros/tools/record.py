@@ -3,25 +3,21 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from rclpy.node import Node
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.ros.recording import Recorder
-from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file
-from rhs_isac_ros.tools.command import ToolError, run_command
+from rhs_isac_ros.tools.command import ToolError, choose_scenario, observe, run_command
 
 
 class RecorderNode(Node):
-    """Records the topics of its namespace until it is destroyed."""
+    """Records the topics of its namespace until it is destroyed; the caller closes the file."""
 
     def __init__(self, recorder: Recorder) -> None:
         super().__init__('recorder', **WITHOUT_SERVICES)
-        self._recorder = recorder
         self._topics: set[str] = set()
         recorder.record_topics(self, self._log_topic)
         self._log = self.get_logger()  # type: ignore[no-untyped-call]
@@ -32,11 +28,6 @@ class RecorderNode(Node):
             self._topics.add(name)
             self._log.info(f'first message of {name}')
 
-    def destroy_node(self) -> None:
-        """Destroy the node and close the file."""
-        super().destroy_node()  # type: ignore[no-untyped-call]
-        self._recorder.close()
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Record until a signal arrives, see `run_command`; 1 if the file cannot be completed."""
@@ -44,11 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _record(options: argparse.Namespace, arguments: list[str]) -> int:
-    scenario = Scenario.from_yaml(options.config) if options.config else Scenario()
-    recorder = Recorder(options.file, scenario)
+    recorder = Recorder(options.file, choose_scenario(options.config))
     try:
-        code = run(lambda: [RecorderNode(recorder)], arguments,
-                   done=lambda: bool(recorder.failure))
+        code, _ = observe(
+            lambda: RecorderNode(recorder), arguments, lambda _: bool(recorder.failure))
     finally:
         recorder.close()
     if recorder.failure:
@@ -63,14 +53,10 @@ def _parser() -> argparse.ArgumentParser:
         'the namespace: --ros-args -r __ns:=/lab')
     parser.add_argument('file', type=output_file, help='recording to write')
     # Launch files pass an empty name by default.
-    parser.add_argument('--config', type=_optional_file, metavar='FILE',
+    parser.add_argument('--config', metavar='FILE',
+                        type=lambda text: input_file(text) if text else None,
                         help="scenario file of the network; the paper's Table I if empty")
     return parser
-
-
-def _optional_file(text: str) -> Path | None:
-    """Parse the path of a file, or an empty one, for argparse."""
-    return input_file(text) if text else None
 
 
 if __name__ == '__main__':

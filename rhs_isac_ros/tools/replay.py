@@ -1,11 +1,11 @@
 """``scripts/replay FILE``: feeds the received signals of a recording to estimators.
 
-With ``--publish``, they are published again to running nodes; see
-`rhs_isac_ros.tools.replay`.
+With ``--publish``, it publishes them to running nodes instead.
 """
 
 import argparse
 import dataclasses
+import math
 import sys
 import tempfile
 import time
@@ -20,7 +20,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
-import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.executables import exit_code_of
@@ -40,12 +39,13 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
-from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
+from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
 from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
-from rhs_isac_ros.tools.command import ToolError, run_command
+from rhs_isac_ros.tools import command
+from rhs_isac_ros.tools.command import ToolError
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
@@ -56,6 +56,12 @@ _DISCOVERY_TIMEOUT_S = 2.0
 # complete [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
 _ACK_TIMEOUT = Duration(seconds=5)
+# Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
+# and announcements of nodes would contradict those of the running nodes.
+_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
+# Defaults of the options for running nodes.
+_RATE = 1.0
+_TIMEOUT_S = 60.0
 
 
 class RepublisherNode(Node):
@@ -64,10 +70,9 @@ class RepublisherNode(Node):
     Parameters
     ----------
     messages
-        Relative name of the topic, message and time [s], sorted by time; codebooks are passed to
-        the optimizer instead.
+        Relative name of the topic, message and time [s], sorted by time.
     names
-        Relative names of the topics.
+        Relative names of the topics; codebooks are passed to the optimizer instead.
     rate
         Speed relative to the recording.
 
@@ -89,10 +94,7 @@ class RepublisherNode(Node):
         super().__init__('replay', **WITHOUT_SERVICES)
         self.optimizer: OptimizerNode | None = None
         self.count, self.finished, self.waits_for = 0, False, next(iter(names))
-        self._messages, self._rate = iter(messages), rate
-        self._next: tuple[str, Any, float] | None = None
-        # Time on the steady clock at the recorded time 0 [s]; None before the first message.
-        self._origin_s: float | None = None
+        self._waits_s = self._publish(messages, rate)
         # Endpoints at the last poll, and the time since when they are the same [s].
         self._endpoints: list[tuple[int, int]] = []
         self._unchanged_since_s = time.monotonic()
@@ -106,9 +108,8 @@ class RepublisherNode(Node):
             (name for name in self._message_publishers if not self._has_subscribers(name)), '')
         if self._endpoints_settled() and not self.waits_for:
             self._timer.cancel()
-            self._next = next(self._messages, None)
-            self._timer = steady_timer(self, _POLL_PERIOD_S, self._publish_due)
-            self._publish_due()
+            self._timer = steady_timer(self, _POLL_PERIOD_S, self._continue)
+            self._continue()
 
     def _endpoints_settled(self) -> bool:
         """Return whether no endpoint of the topics has appeared or gone for some time."""
@@ -126,71 +127,57 @@ class RepublisherNode(Node):
         if name == _SIGNALS:
             # Observers may subscribe to the signals as well. Wait for the nodes that publish
             # estimates, which subscribe to the signals only once their tables are complete.
-            estimators = {_full_name(endpoint) for endpoint in self.get_publishers_info_by_topic(
-                self.resolve_topic_name(_ESTIMATES))} - {self.get_fully_qualified_name()}
-            subscribers = {_full_name(endpoint) for endpoint in
-                           self.get_subscriptions_info_by_topic(publisher.topic_name)}
+            estimators = _nodes_of(self.get_publishers_info_by_topic(
+                self.resolve_topic_name(_ESTIMATES))) - {self.get_fully_qualified_name()}
+            subscribers = _nodes_of(self.get_subscriptions_info_by_topic(publisher.topic_name))
             if not estimators or not estimators <= subscribers:
                 return False
             n_expected = len(subscribers)
         return publisher.get_subscription_count() >= n_expected
 
-    def _publish_due(self) -> None:
+    def _continue(self) -> None:
         """Publish the messages that are due, and set the timer for the next one."""
-        while self._next:
-            name, message, time_s = self._next
-            now_s = time.monotonic()
-            if self._origin_s is None and name != topics.CODEBOOK:
-                self._origin_s = now_s - time_s / self._rate
-            due_s = now_s if self._origin_s is None else self._origin_s + time_s / self._rate
-            if (wait_s := due_s - now_s) > 0:
-                self._timer.timer_period_ns = max(int(wait_s * 1e9), 1)
-                self._timer.reset()
-                return
+        if (wait_s := next(self._waits_s, None)) is not None:
+            self._timer.timer_period_ns = max(int(wait_s * 1e9), 1)
+            self._timer.reset()
+            return
+        self._timer.cancel()
+        for publisher in self._message_publishers.values():
+            publisher.wait_for_all_acked(_ACK_TIMEOUT)
+        self.finished = True
+
+    def _publish(
+            self, messages: Iterable[tuple[str, Any, float]], rate: float) -> Iterator[float]:
+        """Publish messages; yield the time until the next one is due, whenever it is not [s]."""
+        # Time on the steady clock at the recorded time 0 [s]. Codebooks before the first message
+        # are due at once.
+        origin_s = -math.inf
+        for name, message, time_s in messages:
+            if origin_s == -math.inf and name != topics.CODEBOOK:
+                origin_s = time.monotonic() - time_s / rate
+            while (wait_s := origin_s + time_s / rate - time.monotonic()) > 0:
+                yield wait_s
             if name != topics.CODEBOOK:
                 self._message_publishers[name].publish(message)
                 self.count += 1
             elif self.optimizer:
                 self.optimizer.set_parameters_atomically(
                     _parameters(convert.codebook_from_ros(message)))
-            self._next = next(self._messages, None)
-        self._timer.cancel()
-        for publisher in self._message_publishers.values():
-            publisher.wait_for_all_acked(_ACK_TIMEOUT)
-        self.finished = True
 
-    def conflicts(self) -> list[str]:
-        """Return the relative names of the topics that another node publishes as well."""
-        return [name for name, publisher in self._message_publishers.items()
-                if self.count_publishers(publisher.topic_name) > 1]
+    def check(self, end_s: float, timeout_s: float) -> None:
+        """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
+        for name, publisher in self._message_publishers.items():
+            if self.count_publishers(publisher.topic_name) > 1:
+                raise ToolError(f'{name}: already published by another node')
+        if self.waits_for and time.monotonic() > end_s:
+            raise ToolError(f'{self.waits_for}: no subscriber within {timeout_s:g} s')
 
 
-def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
-    """Publish a recording to running nodes.
-
-    Parameters
-    ----------
-    options
-        ``file``, ``namespace``, ``topic``, ``rate``, ``codebook``, ``config``, ``timeout``.
-    arguments
-        Name of the program and command line with the ROS arguments.
-
-    Returns
-    -------
-    int
-        Exit code: 0, including after a signal; 2 if a ROS argument is invalid.
-
-    Raises
-    ------
-    ToolError
-        If a topic has no subscribers, or another node publishes it as well.
-    RecordingError, ScenarioError, CodebookError
-        If a file is invalid.
-    """
+def _republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Publish a recording to running nodes; return the exit code of `run`."""
     names = options.topic or [_SIGNALS]
-    scenario = (Scenario.from_yaml(options.config) if options.config
-                else read_scenario(options.file) or Scenario())
-    first_codebook = _first_codebook(options, names)
+    scenario = command.choose_scenario(options.config, options.file)
+    first_codebook = _first_codebook(options) if _SIGNALS in names else None
     if first_codebook:
         first_codebook.check(scenario)
     nodes: list[RepublisherNode] = []
@@ -199,12 +186,17 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     def create() -> list[Node]:
         node = RepublisherNode(_messages(options, [*names, topics.CODEBOOK]), names, options.rate)
         nodes.append(node)
-        if first_codebook and not _optimizer_present(node):
-            node.optimizer = _optimizer(scenario, first_codebook)
-        return [node, *filter(None, [node.optimizer])]
+        if first_codebook is None:
+            return [node]
+        if _optimizer_present(node):
+            print(f'using the codebook of the {topics.OPTIMIZER_NODE} in the namespace',
+                  file=sys.stderr)
+            return [node]
+        node.optimizer = _optimizer(scenario, first_codebook)
+        return [node, node.optimizer]
 
     def done() -> bool:
-        _check(nodes[0], end_s, options.timeout)
+        nodes[0].check(end_s, options.timeout)
         return nodes[0].finished
     code = run(create, arguments, done)
     if nodes:
@@ -212,52 +204,37 @@ def republish(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     return code
 
 
-def topic_prefix(namespace: str) -> str:
-    """Return the prefix of the full names of the topics in a namespace."""
-    return f'/{namespace.strip("/")}/'.replace('//', '/')
-
-
 def _messages(
         options: argparse.Namespace, names: Iterable[str]) -> Iterator[tuple[str, Any, float]]:
     """Yield messages of a recording with the relative names of their topics."""
-    full_names = {f'{topic_prefix(options.namespace)}{name}': name for name in names}
+    full_names = {f'{command.topic_prefix(options.namespace)}{name}': name for name in names}
     for topic, message, time_s in read(options.file, full_names):
         yield full_names[topic], message, time_s
 
 
-def _first_codebook(options: argparse.Namespace, names: Collection[str]) -> Codebook | None:
-    """Return the codebook of the first signals; None if no signals are to be published."""
-    used: list[str] = []
+def _first_codebook(options: argparse.Namespace) -> Codebook:
+    """Return the codebook with which the first signals were received."""
+    used = ''
     codebooks: dict[str, Any] = {}
     for name, message, _ in _messages(options, [_SIGNALS, topics.CODEBOOK]):
         if name == topics.CODEBOOK:
             codebooks.setdefault(message.codebook_id, message)
         else:
-            used.append(message.codebook_id)
-    if _SIGNALS not in names:
-        return None
+            used = used or message.codebook_id
     if not used:
         raise RecordingError(f'{options.file}: no {_SIGNALS} in the namespace '
                              f'{options.namespace}')
     if options.codebook:
         codebook = Codebook.load(options.codebook)
-        if codebook.id != used[0]:
+        if codebook.id != used:
             raise RecordingError(
                 f'{options.codebook}: codebook {codebook.id}, but the signals were received with '
-                f'{used[0]}: running nodes would drop them')
+                f'{used}: running nodes would drop them')
         return codebook
-    if used[0] not in codebooks:
-        raise RecordingError(f'codebook {used[0]}: not in the recording, expected its file: '
+    if used not in codebooks:
+        raise RecordingError(f'codebook {used}: not in the recording, expected its file: '
                              '--codebook FILE')
-    return convert.codebook_from_ros(codebooks[used[0]])
-
-
-def _check(node: RepublisherNode, end_s: float, timeout_s: float) -> None:
-    """Raise a ToolError if the messages cannot be published, or not until `end_s` [s]."""
-    if conflicts := node.conflicts():
-        raise ToolError(f'{conflicts[0]}: already published by another node')
-    if node.waits_for and time.monotonic() > end_s:
-        raise ToolError(f'{node.waits_for}: no subscriber within {timeout_s:g} s')
+    return convert.codebook_from_ros(codebooks[used])
 
 
 def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
@@ -270,29 +247,17 @@ def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
 
 
 def _optimizer_present(node: Node) -> bool:
-    present = AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
+    return AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
         _DISCOVERY_TIMEOUT_S)
-    if present:
-        print(f'using the codebook of the {topics.OPTIMIZER_NODE} in the namespace',
-              file=sys.stderr)
-    return present
 
 
 def _parameters(codebook: Codebook) -> list[Parameter]:
     return [Parameter(name, value=value) for name, value in codebook.to_parameters().items()]
 
 
-def _full_name(endpoint: Any) -> str:
-    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
-
-
-# Topics that can be published again. The codebook is sent as a parameter instead, and diagnostics
-# and announcements of nodes would contradict those of the running nodes.
-_TOPICS = sorted(set(recorded_topics()) - {topics.CODEBOOK, topics.DIAGNOSTICS, topics.PRESENCE})
-
-# Defaults of the options for running nodes.
-_RATE = 1.0
-_TIMEOUT_S = 60.0
+def _nodes_of(endpoints: Iterable[Any]) -> set[str]:
+    return {f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+            for endpoint in endpoints}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,45 +269,35 @@ class Recording:
     codebooks: dict[str, Codebook]
 
 
-def load(path: str | Path, namespace: str = '/', scenario: Scenario | None = None) -> Recording:
-    """Load the cycles of a recording.
+def load(path: Path, namespace: str = '/', config: Path | None = None) -> Recording:
+    """Load the complete cycles of a network from a recording.
 
     Parameters
     ----------
-    namespace
-        Namespace of the network.
-    scenario
-        Scenario to use instead of the recorded one.
+    config
+        File of the scenario to use instead of the recorded one.
 
     Raises
     ------
-    RecordingError
-        If the file is not a recording, has no complete cycle in the namespace, or contains a
-        malformed message.
-    ScenarioError, CodebookError
-        If the scenario or a recorded codebook is invalid.
+    RecordingError, ScenarioError
+        If a file is invalid, as for `recorded`, or there is no complete cycle in the namespace.
     """
-    scenario = scenario or read_scenario(path) or Scenario()
-    prefix = topic_prefix(namespace)
-    kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
+    scenario = command.choose_scenario(config, path)
     log = CycleLog()
     codebooks: dict[str, Codebook] = {}
-    for topic, ros_message, time_s in read(path):
-        try:
-            if topic in kinds:
-                message = convert.from_ros(kinds[topic], ros_message)
-                m.check(message, scenario.sizes)
-                log.add(message, time_s)
-            elif topic == f'{prefix}{topics.CODEBOOK}' and isinstance(ros_message, ros.Codebook):
-                codebooks[ros_message.codebook_id] = convert.codebook_from_ros(ros_message)
-        except m.MessageError as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
+    for found, time_s in command.recorded(path, namespace, scenario, [*RECEIVES, Codebook]):
+        if isinstance(found, Codebook):
+            codebooks[found.id] = found
+        else:
+            log.add(found, time_s)
     if not log.complete:
         raise RecordingError(f'{path}: no complete cycle in the namespace {namespace}')
     return Recording(scenario, log.complete, codebooks)
 
 
-def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator]) -> np.ndarray:
+def errors_m(
+        cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
+        track_speed_mps: float | None = None) -> np.ndarray:
     """Estimate the position of every cycle again, and return the errors.
 
     Parameters
@@ -351,37 +306,23 @@ def errors_m(cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator
         Complete cycles, with their received signals and true positions.
     estimators
         Estimators by the id of the codebook with which the signals were received.
+    track_speed_mps
+        Typical speed of the users [m/s], to track them over the cycles; None: no tracks.
 
     Returns
     -------
     numpy.ndarray
         Distances from the true positions, float64 [len(cycles)] [m]; NaN without a fix.
     """
-    errors = []
-    for cycle in cycles:
-        signals = cycle.signals.signals
-        estimate = estimators[cycle.signals.codebook_id].estimate(
-            signals.reshape(len(signals), -1))
-        errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
-                      if estimate.fix else np.nan)
-    return np.array(errors)
-
-
-def tracked_errors_m(
-        cycles: Sequence[CompleteCycle], estimators: Mapping[str, Estimator],
-        speed_mps: float = Motion.speed_mps) -> np.ndarray:
-    """Track the users over the cycles, and return the errors; see `errors_m`.
-
-    Parameters
-    ----------
-    speed_mps
-        Typical speed of the users [m/s].
-    """
     tracks, errors = Tracks(), []
     for cycle in cycles:
-        estimate = tracks.locate(
-            cycle.signals, estimators[cycle.signals.codebook_id], speed_mps,
-            cycle.phase_s.get(m.Phase.ESTIMATING, cycle.ended_s))
+        signals, estimator = cycle.signals.signals, estimators[cycle.signals.codebook_id]
+        if track_speed_mps is None:
+            estimate = estimator.estimate(signals.reshape(len(signals), -1))
+        else:
+            estimate = tracks.locate(
+                cycle.signals, estimator, track_speed_mps,
+                cycle.phase_s.get(m.Phase.ESTIMATING, cycle.ended_s))
         errors.append(np.linalg.norm(estimate.mean - cycle.truth.position)
                       if estimate.fix else np.nan)
     return np.array(errors)
@@ -389,7 +330,7 @@ def tracked_errors_m(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the recorded position errors and those of estimators applied to the same signals."""
-    return run_command(_replay, _parser(), arguments, conflict=_conflict)
+    return command.run_command(_replay, _parser(), arguments, conflict=_conflict)
 
 
 def _conflict(options: argparse.Namespace) -> str:
@@ -414,34 +355,34 @@ def _conflict(options: argparse.Namespace) -> str:
 def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     """Publish a recording, or print a table of its errors and of those of estimators."""
     if options.publish:
-        return republish(options, arguments)
-    scenario = Scenario.from_yaml(options.config) if options.config else None
-    recording = load(options.file, options.namespace, scenario)
+        return _republish(options, arguments)
+    recording = load(options.file, options.namespace, options.config)
     codebooks = _codebooks(recording, options.codebook)
-    live = np.array([cycle.error_m for cycle in recording.cycles])
     names = sorted({cycle.estimate.estimator for cycle in recording.cycles})
-    print(f'{len(live)} cycles\n{"":12s} median error  root mean square  no fix')
-    print(_row(f'live {", ".join(names)}', live))
+    live = np.array([cycle.error_m for cycle in recording.cycles])
+    command.print_now(f'{len(live)} cycles')
+    rows = [_row(f'live {", ".join(names)}', live)]
     known = {}
     if options.calibration:
         known['surface'] = load_surface(str(options.calibration), recording.scenario)
-    for name in options.estimator or ['bayes']:
+    for name in options.estimator or [BayesEstimator.name]:
         estimators = {codebook_id: make_estimator(
             name, recording.scenario, codebook,
             **file_options(name, default_folder(), options.model or ''), **known)
             for codebook_id, codebook in codebooks.items()}
-        print(_row(name, errors_m(recording.cycles, estimators)))
+        rows.append(_row(name, errors_m(recording.cycles, estimators)))
         if options.track and name == BayesEstimator.name:
-            print(_row('track', tracked_errors_m(
+            rows.append(_row('track', errors_m(
                 recording.cycles, estimators, options.track_speed)))
+    print(command.text_table(['', 'median error', 'root mean square', 'no fix'], rows, '<>>>'))
     return 0
 
 
-def _row(name: str, errors: np.ndarray) -> str:
+def _row(name: str, errors: np.ndarray) -> list[str]:
     fixes = errors[~np.isnan(errors)]
     median, rms = ((np.median(fixes), np.sqrt(np.mean(fixes**2))) if len(fixes)
                    else (np.nan, np.nan))
-    return f'{name:12s} {median:10.6f} m {rms:15.6f} m {len(errors) - len(fixes):7d}'
+    return [name, f'{median:.6f} m', f'{rms:.6f} m', str(len(errors) - len(fixes))]
 
 
 def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
@@ -449,56 +390,50 @@ def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
     used = sorted({cycle.signals.codebook_id for cycle in recording.cycles})
     if file:
         codebook = Codebook.load(file)
+        codebook.check(recording.scenario)
         for codebook_id in used:
             if codebook_id != codebook.id:
                 print(f'signals received with codebook {codebook_id} are evaluated with '
                       f'{codebook.id}', file=sys.stderr)
-        assumed = dict.fromkeys(used, codebook)
-    else:
-        missing = [codebook_id for codebook_id in used if codebook_id not in recording.codebooks]
-        if missing:
-            raise RecordingError(f'codebook {missing[0]}: not in the recording; give its file '
+        return dict.fromkeys(used, codebook)
+    for codebook_id in used:
+        if codebook_id not in recording.codebooks:
+            raise RecordingError(f'codebook {codebook_id}: not in the recording; give its file '
                                  'with --codebook FILE')
-        assumed = {codebook_id: recording.codebooks[codebook_id] for codebook_id in used}
-    for codebook in assumed.values():
-        codebook.check(recording.scenario)
-    return assumed
+    return {codebook_id: recording.codebooks[codebook_id] for codebook_id in used}
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='replay', description='Feed the received signals of a recording to estimators, and '
         'compare their errors with those of the recorded network.')
-    parser.add_argument('file', type=input_file, help='recording')
-    parser.add_argument('--estimator', action='append',
-                        choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
-                        help='may be repeated (default: bayes)')
-    parser.add_argument('--track', action='store_true',
-                        help='also track the users with the estimator bayes')
-    parser.add_argument('--track-speed', type=positive_float, default=Motion.speed_mps,
-                        metavar='MPS', help='typical speed of the users (default: 1 m/s)')
-    parser.add_argument('--codebook', type=input_file, metavar='FILE',
-                        help='codebook to assume; by default the recorded one')
-    parser.add_argument('--config', type=input_file, metavar='FILE',
-                        help='scenario file; by default the recorded scenario')
-    parser.add_argument('--calibration', type=input_file, metavar='FILE',
-                        help='calibration of the surface; by default that of the scenario')
-    parser.add_argument('--model', type=input_file, metavar='FILE',
-                        help='model of the estimator neural')
-    parser.add_argument('--namespace', default='/',
-                        help='namespace of the recorded network (default: /)')
-    live = parser.add_argument_group(
+    add = parser.add_argument
+    add('file', type=input_file, help='recording')
+    add('--estimator', action='append',
+        choices=(*ESTIMATORS, *plugins.names(plugins.ESTIMATORS)),
+        help='may be repeated (default: bayes)')
+    add('--track', action='store_true', help='also track the users with the estimator bayes')
+    add('--track-speed', type=positive_float, default=Motion.speed_mps, metavar='MPS',
+        help='typical speed of the users (default: 1 m/s)')
+    add('--codebook', type=input_file, metavar='FILE',
+        help='codebook to assume; by default the recorded one')
+    add('--config', type=input_file, metavar='FILE',
+        help='scenario file; by default the recorded scenario')
+    add('--calibration', type=input_file, metavar='FILE',
+        help='calibration of the surface; by default that of the scenario')
+    add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')
+    add('--namespace', default='/', help='namespace of the recorded network (default: /)')
+    add = parser.add_argument_group(
         'running nodes', 'Publish the recorded signals again, with their timing, in the namespace '
         'of --ros-args -r __ns:=... If the namespace has no optimizer, the replay provides the '
-        'recorded codebook instead.')
-    live.add_argument('--publish', action='store_true', help='publish instead of estimating')
-    live.add_argument('--rate', type=positive_float, default=_RATE, metavar='R',
-                      help='speed relative to the recording (default: 1)')
-    live.add_argument('--topic', action='append', choices=_TOPICS, metavar='NAME',
-                      help='relative name; may be repeated (default: '
-                      f'{topics.NAMES[m.ReceivedSignals]})')
-    live.add_argument('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
-                      help='maximum time to wait for subscribers (default: 60 s)')
+        'recorded codebook instead.').add_argument
+    add('--publish', action='store_true', help='publish instead of estimating')
+    add('--rate', type=positive_float, default=_RATE, metavar='R',
+        help='speed relative to the recording (default: 1)')
+    add('--topic', action='append', choices=_TOPICS, metavar='NAME',
+        help=f'relative name; may be repeated (default: {_SIGNALS})')
+    add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
+        help='maximum time to wait for subscribers (default: 60 s)')
     return parser
 
 

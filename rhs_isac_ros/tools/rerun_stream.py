@@ -10,50 +10,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rhs_isac_ros.monitoring import network_view
-from rhs_isac_ros.monitoring.shapes import (
-    Boxes,
-    Ellipsoids,
-    Entity,
-    Entry,
-    Lines,
-    Number,
-    Picture,
-    Points,
-    Series,
-    Text,
-)
+from rhs_isac_ros.monitoring import network_view, shapes
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 if TYPE_CHECKING:
     import rerun.blueprint
 
 _VERSION = '0.22'
-_APPLICATION = 'rhs_isac_ros'
 # The time line of the viewer.
 _TIMELINE = 'cycle'
-_MAX_COLOUR = 255
 # Number of coordinates in a plane.
 _PLANE = 2
-_DOT_SIZE = 4.0
-_LINE_WIDTH = 2.0
-# Width of outlines in points of the screen.
-_OUTLINE_WIDTH = 1.2
+# Sizes in points of the screen.
+_DOT_SIZE, _LINE_WIDTH, _OUTLINE_WIDTH = 4.0, 2.0, 1.2
+# A mesh is a grid of thin dim lines, of which only every second is drawn, so that entities behind
+# it remain visible.
+_MESH_WIDTH, _MESH_STEP, _MESH_DIM = 0.6, 2, 0.45
 _BACKGROUND = (16, 18, 22)
-
-
 # Maximum time until the server of the viewer listens, and the period of the attempts [s].
 _START_S, _POLL_S = 20.0, 0.05
 
 
 class RerunStream:
-    """Writes the entries of a view.
-
-    Raises
-    ------
-    MissingLibraryError
-        If rerun-sdk 0.22 is not installed.
-    """
+    """Writes the entries of a view, or raises MissingLibraryError without rerun-sdk 0.22."""
 
     def __init__(self) -> None:
         with optional_import('view', extra='view'):
@@ -64,22 +43,18 @@ class RerunStream:
                 "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/setup view)")
         self._rerun = rerun
         rerun.set_strict_mode(True)
-        self._stream = rerun.new_recording(_APPLICATION)
-        self._path: Path | None = None
+        self._stream = rerun.new_recording('rhs_isac_ros')
+        # The file until it is complete, and its final path.
+        self._files: tuple[Path, Path] | None = None
         self._server: subprocess.Popen[bytes] | None = None
 
     def save(self, path: Path) -> None:
-        """Write to a file, which is ``<name>.part`` until `close`.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
-        self._path = path
+        """Write to a file, which is ``<name>.part`` until `close`; raise OSError if this fails."""
+        partial = path.with_name(f'{path.name}.part')
+        self._files = partial, path
         # Rerun reports an unwritable file without its reason.
-        self._partial.open('wb').close()
-        self._rerun.save(self._partial, default_blueprint=blueprint(), recording=self._stream)
+        partial.open('wb').close()
+        self._rerun.save(partial, default_blueprint=blueprint(), recording=self._stream)
         self._begin()
 
     def serve(self, port: int, bind: str) -> str:
@@ -127,7 +102,11 @@ class RerunStream:
         self._begin()
         return f'http://{host}:{port}/?url=ws://{host}:{port + 1}'
 
-    def write(self, entries: Iterable[Entry]) -> None:
+    def _begin(self) -> None:
+        self._rerun.log(network_view.WORLD, self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP,
+                        static=True, recording=self._stream)
+
+    def write(self, entries: Iterable[shapes.Entry]) -> None:
         """Write entries of a view."""
         for cycle, path, entity in entries:
             if cycle:
@@ -138,29 +117,20 @@ class RerunStream:
     def close(self) -> None:
         """Complete the file, or end the service."""
         self._disconnect()
-        if self._path is not None:
-            os.replace(self._partial, self._path)
+        if self._files:
+            os.replace(*self._files)
 
     def discard(self) -> None:
         """Remove the incomplete file, or end the service."""
         self._disconnect()
-        if self._path is not None:
-            self._partial.unlink(missing_ok=True)
+        if self._files:
+            self._files[0].unlink(missing_ok=True)
 
     def _disconnect(self) -> None:
         self._rerun.disconnect(recording=self._stream)
         if self._server is not None:
             self._server.terminate()
             self._server.wait()
-
-    @property
-    def _partial(self) -> Path:
-        assert self._path is not None
-        return self._path.with_name(f'{self._path.name}.part')
-
-    def _begin(self) -> None:
-        self._rerun.log(network_view.WORLD, self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP,
-                        static=True, recording=self._stream)
 
 
 def _is_listening(host: str, port: int) -> bool:
@@ -183,10 +153,8 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
         name='Modes: probability over range error [m]',
         visual_bounds=rrb.VisualBounds2D(
             x_range=[-1.25 * reach, 1.1 * reach], y_range=[-1.1 * height, 0.2 * height]))
-    positioning = rrb.Spatial2DView(
-        origin=network_view.POSITIONING, name='Surface: pilots')
-    transmission = rrb.Spatial2DView(
-        origin=network_view.TRANSMISSION, name='Surface: data')
+    positioning = rrb.Spatial2DView(origin=network_view.POSITIONING, name='Surface: pilots')
+    transmission = rrb.Spatial2DView(origin=network_view.TRANSMISSION, name='Surface: data')
     # New values appear on the right, where a legend would hide them; a single series needs none.
     error, *others = (
         rrb.TimeSeriesView(origin=path, name=title, plot_legend=rrb.PlotLegend(
@@ -205,44 +173,47 @@ def blueprint() -> 'rerun.blueprint.Blueprint':
         rrb.BlueprintPanel(state='hidden'))
 
 
-def _archetype(entity: Entity) -> Any:
+def _archetype(entity: shapes.Entity) -> Any:
     """Convert an entity to an archetype of Rerun."""
     import rerun as rr
 
+    mode = rr.components.FillMode
     match entity:
-        case Points():
-            points = rr.Points2D if entity.positions.shape[1] == _PLANE else rr.Points3D
-            return points(entity.positions, colors=_colours(entity.colours),
-                          radii=entity.radii_m, labels=entity.labels or None,
-                          show_labels=bool(entity.labels))
-        case Ellipsoids():
+        case shapes.Points(positions, colours, radii_m, labels):
+            points = rr.Points2D if positions.shape[1] == _PLANE else rr.Points3D
+            return points(positions, colors=_colours(colours), radii=radii_m,
+                          labels=labels or None, show_labels=bool(labels))
+        case shapes.Ellipsoids(centres, half_sizes_m, quaternions, colours):
             return rr.Ellipsoids3D(
-                centers=entity.centres, half_sizes=entity.half_sizes_m,
-                quaternions=entity.quaternions, colors=_colours(entity.colours),
-                line_radii=_radius(_OUTLINE_WIDTH),
-                fill_mode=rr.components.FillMode.MajorWireframe)
-        case Boxes():
-            mode = rr.components.FillMode
+                centers=centres, half_sizes=half_sizes_m, quaternions=quaternions,
+                colors=_colours(colours), line_radii=_radius(_OUTLINE_WIDTH),
+                fill_mode=mode.MajorWireframe)
+        case shapes.Boxes(centres, half_sizes_m, colours, solid):
             return rr.Boxes3D(
-                centers=entity.centres, half_sizes=entity.half_sizes_m,
-                colors=_colours(entity.colours), radii=_radius(_OUTLINE_WIDTH),
-                fill_mode=mode.Solid if entity.solid else mode.MajorWireframe)
-        case Lines():
-            is_plane = bool(entity.strips) and entity.strips[0].shape[1] == _PLANE
-            strips = rr.LineStrips2D if is_plane else rr.LineStrips3D
-            return strips(entity.strips, colors=_colours(np.array([entity.colour])),
-                          radii=_radius(entity.width))
-        case Picture():
-            return rr.Image(entity.pixels, color_model='L')
-        case Series(name, colour, dots):
-            red, green, blue = _colours(np.array(colour)).tolist()
+                centers=centres, half_sizes=half_sizes_m, colors=_colours(colours),
+                radii=_radius(_OUTLINE_WIDTH),
+                fill_mode=mode.Solid if solid else mode.MajorWireframe)
+        case shapes.Lines(strips, colour, width):
+            is_plane = bool(strips) and strips[0].shape[1] == _PLANE
+            lines = rr.LineStrips2D if is_plane else rr.LineStrips3D
+            return lines(strips, colors=_colours([colour]), radii=_radius(width))
+        case shapes.Mesh(points, colour):
+            grid = [*points[::_MESH_STEP], *np.swapaxes(points, 0, 1)[::_MESH_STEP]]
+            # Most lines of a lobe have no extent.
+            return rr.LineStrips3D(
+                [line for line in grid if line.any()], radii=_radius(_MESH_WIDTH),
+                colors=_colours(_MESH_DIM * np.array([colour])))
+        case shapes.Picture(pixels):
+            return rr.Image(pixels, color_model='L')
+        case shapes.Series(name, colour, dots):
+            shown = _colours(colour).tolist()
             if dots:
-                return rr.SeriesPoint(color=[red, green, blue], name=name,
-                                      marker='circle', marker_size=_DOT_SIZE)
-            return rr.SeriesLine(color=[red, green, blue], name=name, width=_LINE_WIDTH)
-        case Number(value):
+                return rr.SeriesPoint(color=shown, name=name, marker='circle',
+                                      marker_size=_DOT_SIZE)
+            return rr.SeriesLine(color=shown, name=name, width=_LINE_WIDTH)
+        case shapes.Number(value):
             return rr.Scalar(value)
-        case Text(text, warning):
+        case shapes.Text(text, warning):
             return rr.TextLog(text, level='WARN' if warning else 'INFO')
         case _:
             return rr.Clear(recursive=True)
@@ -253,6 +224,6 @@ def _radius(width: float) -> float:
     return -width / 2
 
 
-def _colours(values: np.ndarray) -> np.ndarray:
+def _colours(values: Any) -> np.ndarray:
     """Convert colours from 0 to 1 to uint8."""
-    return np.rint(_MAX_COLOUR * values).astype(np.uint8)
+    return np.rint(255 * np.array(values)).astype(np.uint8)

@@ -1,6 +1,7 @@
 """``scripts/view``: shows a running network or a recording in the browser."""
 
 import argparse
+import contextlib
 import functools
 import itertools
 import math
@@ -8,26 +9,24 @@ import os
 import signal
 import sys
 import time
-import webbrowser
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 
-import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.calibration import load_surface
-from rhs_isac_ros.codebook import Codebook, CodebookError
+from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.monitoring.network_view import RECEIVES, NetworkView, TrackPoint
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.monitoring.shapes import Entry
 from rhs_isac_ros.positioning import (
     BayesEstimator,
-    Estimate,
     Motion,
     SignalError,
     TrackEstimate,
@@ -38,19 +37,15 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.protocol.role import NewestDict
-from rhs_isac_ros.ros import convert, diagnostics, topics
+from rhs_isac_ros.ros import endpoints, topics
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.endpoints import (
-    EXCHANGE,
-    LATCHED,
-    OBSERVATION,
     BackgroundWorker,
     steady_timer,
     subscribe,
     subscribe_messages,
 )
-from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
-from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
@@ -60,14 +55,24 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.tools.command import ToolError, print_now, run_command
-from rhs_isac_ros.tools.replay import topic_prefix
+from rhs_isac_ros.tools import command
+from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.rerun_stream import RerunStream
 
 # Number of codebooks, each with tables of some megabytes; more are unusual even in a recording.
 _MAX_CODEBOOKS = 32
 # With Table I, the bound on the root mean squared error then has a standard error of 2.4 %.
 _N_PHASES = 256
+# If no cycle is observed for this time, the reason is logged.
+_SILENCE_S = 5.0
+# Maximum number of users whose tracks are followed, because their numbers come from messages.
+_MAX_TRACKS = 64
+# Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
+_BEAM_PERIOD_S = 0.2
+_PROGRAM = 'view'
+_PORT = 9090
+_POLL_S = 0.2
+_SWITCH_INTERVAL_S = 5e-4
 
 
 class Posteriors:
@@ -81,92 +86,54 @@ class Posteriors:
         What is known of the surface, as in `make_estimator`.
     """
 
-    def __init__(
-            self, scenario: Scenario, surface: Surface | None = None,
-            table_folder: Path | None = None) -> None:
+    def __init__(self, scenario: Scenario, surface: Surface | None = None) -> None:
         self._scenario, self._surface = scenario, surface
-        self._table_folder = table_folder or default_folder()
         self._estimators: NewestDict[str, BayesEstimator] = NewestDict(_MAX_CODEBOOKS)
         self._tracks = Tracks()
 
-    @property
-    def codebooks(self) -> Mapping[str, object]:
-        """The codebooks that were added, by id, up to 32."""
-        return self._estimators
+    def __contains__(self, codebook_id: str) -> bool:
+        """Return whether a codebook was added, as one of the latest 32."""
+        return codebook_id in self._estimators
 
     def add(self, codebook: Codebook) -> None:
-        """Prepare for signals received with a codebook.
-
-        Raises
-        ------
-        CodebookError
-            If the codebook does not fit the scenario.
-        """
-        codebook.check(self._scenario)
+        """Prepare for signals received with a codebook, which fits the scenario."""
         self._estimators.put(codebook.id, BayesEstimator(
-            self._scenario, codebook, self._table_folder, surface=self._surface))
+            self._scenario, codebook, default_folder(), surface=self._surface))
 
     def bound_m2(self, codebook: Codebook) -> float:
-        """Compute the global bound on the mean squared error with a codebook [m^2].
-
-        This takes some seconds.
-        """
+        """Compute the global bound on the mean squared error [m^2], which takes some seconds."""
         return global_bound(
             self._scenario, codebook, np.random.default_rng(0), _N_PHASES).value
 
     def modes(self, received: m.ReceivedSignals) -> WeightedModes | None:
         """Return the modes of the posterior; None without a position or a known codebook."""
         estimator = self._estimators.get(received.codebook_id)
-        if estimator is None:
-            return None
-        try:
-            return weighted_modes(estimator, received.signals)
-        except SignalError:
-            return None
+        with contextlib.suppress(SignalError):
+            return weighted_modes(estimator, received.signals) if estimator else None
+        return None
 
     def track(
-            self, received: m.ReceivedSignals, now_s: float, speed_mps: float) -> Estimate | None:
-        """Continue the track of a user.
+            self, received: m.ReceivedSignals, now_s: float, speed_mps: float
+    ) -> TrackPoint | None:
+        """Continue the track of a user whose signals arrived at `now_s` [s].
 
-        Parameters
-        ----------
-        now_s
-            Time at which the signals arrived [s].
-        speed_mps
-            Typical speed of the users [m/s].
-
-        Returns
-        -------
-        Estimate or None
-            A `TrackEstimate` from the second position on; None without a known codebook.
+        Return None before the second position, or without a known codebook. Users move at
+        `speed_mps` [m/s], typically.
         """
         estimator = self._estimators.get(received.codebook_id)
-        if estimator is None:
-            return None
-        try:
-            return self._tracks.locate(received, estimator, speed_mps, now_s)
-        except SignalError:
-            return None
-
-
-# If no cycle is observed for this time, the reason is logged.
-_SILENCE_S = 5.0
-# Maximum number of users whose tracks are followed, because their numbers come from messages.
-_MAX_TRACKS = 64
-# Beam patterns take most of the time of a view, so that of a fast network shows fewer of them.
-_BEAM_PERIOD_S = 0.2
+        with contextlib.suppress(SignalError):
+            estimate = estimator and self._tracks.locate(received, estimator, speed_mps, now_s)
+            if isinstance(estimate, TrackEstimate) and estimate.fix:
+                return TrackPoint(
+                    received.user, estimate.mean, estimate.covariance, estimate.velocity)
+        return None
 
 
 class ViewNode(Node):
-    """Converts the messages of its namespace to entries.
+    """Converts the messages of its namespace to entries, with which it calls `write`.
 
     Modes and bounds are computed in the background. If cycles are faster, the modes and the beam
     of some are left out.
-
-    Parameters
-    ----------
-    write
-        Called with the entries.
 
     Attributes
     ----------
@@ -192,11 +159,11 @@ class ViewNode(Node):
         self._users: set[int] = set()
         self._beam_s = -math.inf
         write(self.view.begin())
-        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, LATCHED)
+        command.subscribe_codebooks(self, scenario, self._on_codebook)
         subscribe_reports(self, lambda node, report: self._write(
             self.view.add_report(node, report)))
         subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
-                           exchange=OBSERVATION)
+                           exchange=endpoints.OBSERVATION)
         self._silence_timer = steady_timer(self, _SILENCE_S, self._log_silence)
 
     @property
@@ -209,8 +176,10 @@ class ViewNode(Node):
     def _log_silence(self) -> None:
         self._silence_timer.cancel()
         if not self.view.n_cycles:
-            self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'{self.silence}; still waiting')
+            self._warn(f'{self.silence}; still waiting')
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)  # type: ignore[no-untyped-call]
 
     def _on_message(self, message: m.Message) -> None:
         now_s = time.monotonic()
@@ -233,46 +202,26 @@ class ViewNode(Node):
 
     def _on_mismatch(self, error: m.MessageError) -> None:
         if not self.mismatch:
-            self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'{error}; if the network uses another scenario, pass it with --config FILE')
+            self._warn(f'{error}{command.OTHER_SCENARIO}')
         self.mismatch = str(error)
 
-    def _on_codebook(self, message: ros.Codebook) -> None:
-        try:
-            codebook = convert.codebook_from_ros(message)
-        except (m.MessageError, CodebookError) as error:
-            self._no_modes(error)
-            return
-        if codebook.id not in self._requested | self._posteriors.codebooks.keys():
+    def _on_codebook(self, codebook: Codebook) -> None:
+        if codebook.id not in self._requested and codebook.id not in self._posteriors:
             self._requested.add(codebook.id)
-            self._worker.run(functools.partial(self._add, codebook),
-                             functools.partial(self._on_added, codebook))
+            self._worker.run(functools.partial(self._posteriors.add, codebook),
+                             lambda _: self._on_added(codebook))
 
-    def _add(self, codebook: Codebook) -> CodebookError | None:
-        try:
-            self._posteriors.add(codebook)
-        except CodebookError as error:
-            return error
-        return None
-
-    def _on_added(self, codebook: Codebook, error: CodebookError | None) -> None:
+    def _on_added(self, codebook: Codebook) -> None:
         self._requested.discard(codebook.id)
-        if error:
-            self._no_modes(error)
-            return
         self._bounds.run(functools.partial(self._posteriors.bound_m2, codebook),
                          functools.partial(self.view.set_bound, codebook.id))
         self._search()
 
-    def _no_modes(self, error: Exception) -> None:
-        self.get_logger().warning(  # type: ignore[no-untyped-call]
-            f'no modes: {error}')
-
     def _search(self) -> None:
         """Start the search for the modes of the latest signals, unless one is running."""
         received = self._waiting
-        if received is None or self._is_searching or (
-                received.codebook_id not in self._posteriors.codebooks):
+        if (received is None or self._is_searching
+                or received.codebook_id not in self._posteriors):
             return
         self._waiting, self._is_searching = None, True
         self._worker.run(functools.partial(self._posteriors.modes, received),
@@ -289,7 +238,7 @@ class ViewNode(Node):
             return
         self._users.add(user)
         subscribe(self, Odometry, topics.ODOMETRY.format(user=user),
-                  functools.partial(self._on_track, user), EXCHANGE)
+                  functools.partial(self._on_track, user), endpoints.EXCHANGE)
 
     def _on_track(self, user: int, message: Odometry) -> None:
         position, velocity = message.pose.pose.position, message.twist.twist.linear
@@ -315,8 +264,6 @@ def entries(
 
     Parameters
     ----------
-    namespace
-        Namespace of the network.
     posteriors
         Receives the recorded codebooks.
     track_speed_mps
@@ -327,71 +274,36 @@ def entries(
     Raises
     ------
     RecordingError
-        If the file is not a recording, has no messages in the namespace, or contains a message
-        that is malformed or does not fit the scenario.
+        If the file is invalid, as for `recorded`, or there is no cycle in the namespace.
     """
-    prefix = topic_prefix(namespace)
     view = NetworkView(scenario)
-    for topic, found, _ in read(path, [f'{prefix}{topics.CODEBOOK}']):
-        try:
-            codebook = convert.codebook_from_ros(found)
-            if codebook.id in posteriors.codebooks:
-                continue
+    for codebook, _ in command.recorded(path, namespace, scenario, [Codebook]):
+        if codebook.id not in posteriors:
             posteriors.add(codebook)
-        except (m.MessageError, CodebookError) as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
-        view.set_bound(codebook.id, posteriors.bound_m2(codebook))
+            view.set_bound(codebook.id, posteriors.bound_m2(codebook))
     yield from view.begin()
-    kinds = {f'{prefix}{topics.NAMES[kind]}': kind for kind in RECEIVES}
-    # Before version 1.0, the topic was in the namespace.
-    reports = {topics.DIAGNOSTICS, f'{prefix}{topics.DIAGNOSTICS.lstrip("/")}'}
-    for topic, found, time_s in read(path, [*kinds, *reports]):
-        if topic in reports:
-            for node, report in diagnostics.from_ros(found, namespace):
-                yield from view.add_report(node, report)
+    for found, time_s in command.recorded(path, namespace, scenario, [*RECEIVES, Report]):
+        if isinstance(found, tuple):
+            yield from view.add_report(*found)
             continue
-        try:
-            message = convert.from_ros(kinds[topic], found)
-            _check_scenario(message, scenario)
-            m.check(message, scenario.sizes)
-        except m.MessageError as error:
-            raise RecordingError(f'{path}: {topic}: {error}') from None
-        yield from view.add(message, time_s)
-        if isinstance(message, m.ReceivedSignals):
-            yield from view.add_modes(message, posteriors.modes(message))
-            if track_speed_mps is not None:
-                yield from _track(view, message, posteriors.track(
-                    message, time_s, track_speed_mps))
+        if found.scenario_id not in ('', scenario.id):
+            raise RecordingError(
+                f'{path}: recorded with scenario {found.scenario_id}, expected {scenario.id}')
+        yield from view.add(found, time_s)
+        if isinstance(found, m.ReceivedSignals):
+            yield from view.add_modes(found, posteriors.modes(found))
+            if track_speed_mps is not None and (
+                    point := posteriors.track(found, time_s, track_speed_mps)):
+                yield from view.add_track(found.cycle_id, point)
         if max_cycles and view.n_ended >= max_cycles:
             break
     if not view.n_cycles:
         raise RecordingError(f'{path}: no cycle in the namespace {namespace}')
 
 
-def _check_scenario(message: m.Message, scenario: Scenario) -> None:
-    if message.scenario_id not in ('', scenario.id):
-        raise m.MessageError(
-            f'recorded with scenario {message.scenario_id}, expected {scenario.id}')
-
-
-def _track(
-        view: NetworkView, received: m.ReceivedSignals,
-        estimate: Estimate | None) -> list[Entry]:
-    if not isinstance(estimate, TrackEstimate) or not estimate.fix:
-        return []
-    return view.add_track(received.cycle_id, TrackPoint(
-        received.user, estimate.mean, estimate.covariance, estimate.velocity))
-
-
-_PROGRAM = 'view'
-_PORT = 9090
-_POLL_S = 0.2
-_SWITCH_INTERVAL_S = 5e-4
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Show a network or a recording until a signal arrives, or write a file."""
-    return run_command(
+    return command.run_command(
         _view, _parser(), arguments, ['file', '--config', '--calibration'], ['--save'],
         _conflict)
 
@@ -408,23 +320,21 @@ def _conflict(options: argparse.Namespace) -> str:
 def _view(options: argparse.Namespace, arguments: list[str]) -> int:
     stream = RerunStream()
     try:
-        scenario = _scenario(options)
-        surface = (load_surface(str(options.calibration), scenario) if options.calibration
-                   else None)
-        posteriors = Posteriors(scenario, surface)
+        scenario = command.choose_scenario(options.config, options.file)
+        posteriors = Posteriors(scenario, load_surface(str(options.calibration or ''), scenario))
         _open(stream, options)
-        if options.file is None:
-            return _show_live(stream, scenario, posteriors, options, arguments)
-        return _show_recording(stream, scenario, posteriors, options)
+        if options.file:
+            code = _show_recording(stream, scenario, posteriors, options)
+        else:
+            code = _show_live(stream, scenario, posteriors, options, arguments)
+        if not code:
+            stream.close()
+            if options.save:
+                print(options.save)
+        return code
     finally:
         # After `close`, there is nothing left to discard.
         stream.discard()
-
-
-def _scenario(options: argparse.Namespace) -> Scenario:
-    if options.config:
-        return Scenario.from_yaml(options.config)
-    return (options.file and read_scenario(options.file)) or Scenario()
 
 
 def _open(stream: RerunStream, options: argparse.Namespace) -> None:
@@ -437,9 +347,7 @@ def _open(stream: RerunStream, options: argparse.Namespace) -> None:
     except (OSError, RuntimeError) as error:
         raise ToolError(f'{options.bind}, ports {options.port} to {options.port + 2}: {error}; '
                          'choose others with --port') from None
-    print_now(address)
-    if options.open:
-        webbrowser.open(address)
+    command.print_now(address)
 
 
 def _show_live(
@@ -447,19 +355,11 @@ def _show_live(
         options: argparse.Namespace, arguments: Sequence[str]) -> int:
     # With many messages, the background threads would otherwise wait 5 ms for each step.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    nodes: list[ViewNode] = []
-
-    def create() -> list[ViewNode]:
-        nodes.append(ViewNode(scenario, posteriors, stream.write))
-        return nodes
-
-    def done() -> bool:
-        return bool(options.cycles) and nodes[0].view.n_ended >= options.cycles
-    code = run(create, arguments, done)
-    if options.save and nodes and not nodes[0].view.n_cycles:
-        raise ToolError(f'{options.save} is not written: {nodes[0].silence}')
-    if not code:
-        _finish(stream, options)
+    code, node = command.observe(
+        lambda: ViewNode(scenario, posteriors, stream.write), arguments,
+        lambda node: bool(options.cycles) and node.view.n_ended >= options.cycles)
+    if options.save and node and not node.view.n_cycles:
+        raise ToolError(f'{options.save} is not written: {node.silence}')
     return code
 
 
@@ -476,15 +376,7 @@ def _show_recording(
         options.cycles)))
     while not (signals or options.save):
         time.sleep(_POLL_S)
-    _finish(stream, options)
     return 0
-
-
-def _finish(stream: RerunStream, options: argparse.Namespace) -> None:
-    """End the service, or complete the file and print its name."""
-    stream.close()
-    if options.save:
-        print(options.save)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -492,32 +384,29 @@ def _parser() -> argparse.ArgumentParser:
         prog=_PROGRAM, description='Show a running network, or a recording, in three dimensions '
         'and in charts over the cycles: in the browser until Ctrl-C, or as a file for Rerun. ROS '
         'arguments select the namespace of a running network: --ros-args -r __ns:=/lab')
-    parser.add_argument('file', nargs='?', type=input_file,
-                        help='recording; by default the running network')
-    parser.add_argument('--save', type=_recording_file, metavar='FILE',
-                        help='write a file for Rerun, *.rrd, instead of serving the viewer')
-    parser.add_argument('--cycles', type=positive_int, default=0, metavar='N',
-                        help='show N cycles; the view of a running network then ends')
-    parser.add_argument('--config', type=input_file, metavar='FILE',
-                        help="scenario file; by default that of the recording, or the paper's "
-                        'Table I')
-    parser.add_argument('--calibration', type=input_file, metavar='FILE',
-                        help='calibration of the surface, for the modes of the posterior; by '
-                        'default that of the scenario')
-    server = parser.add_argument_group('browser')
-    server.add_argument('--port', type=integer(1, 65533), default=_PORT, metavar='P',
-                        help=f'port of the viewer; its data use the next two (default: {_PORT})')
-    server.add_argument('--bind', default='127.0.0.1', metavar='ADDRESS',
-                        help='address that the viewer listens on; by default only this machine '
-                        'can connect, with 0.0.0.0 any other')
-    server.add_argument('--open', action='store_true', help='open the browser')
-    recording = parser.add_argument_group('recording')
-    recording.add_argument('--namespace', help='namespace of the recorded network (default: /)')
-    recording.add_argument('--track', action='store_true',
-                           help='track the users, as positioner does with prior:=track')
-    recording.add_argument('--track-speed', type=positive_float, metavar='MPS',
-                           help='typical speed of the users for --track (default: '
-                           f'{Motion.speed_mps:g} m/s)')
+    add = parser.add_argument
+    add('file', nargs='?', type=input_file, help='recording; by default the running network')
+    add('--save', type=_recording_file, metavar='FILE',
+        help='write a file for Rerun, *.rrd, instead of serving the viewer')
+    add('--cycles', type=positive_int, default=0, metavar='N',
+        help='show N cycles; the view of a running network then ends')
+    add('--config', type=input_file, metavar='FILE',
+        help="scenario file; by default that of the recording, or the paper's Table I")
+    add('--calibration', type=input_file, metavar='FILE',
+        help='calibration of the surface, for the modes of the posterior; by default that of '
+        'the scenario')
+    add = parser.add_argument_group('browser').add_argument
+    add('--port', type=integer(1, 65533), default=_PORT, metavar='P',
+        help=f'port of the viewer; its data use the next two (default: {_PORT})')
+    add('--bind', default='127.0.0.1', metavar='ADDRESS',
+        help='address that the viewer listens on; by default only this machine can connect, '
+        'with 0.0.0.0 any other')
+    add = parser.add_argument_group('recording').add_argument
+    add('--namespace', help='namespace of the recorded network (default: /)')
+    add('--track', action='store_true',
+        help='track the users, as positioner does with prior:=track')
+    add('--track-speed', type=positive_float, metavar='MPS',
+        help=f'typical speed of the users for --track (default: {Motion.speed_mps:g} m/s)')
     return parser
 
 

@@ -2,45 +2,41 @@
 
 import argparse
 import contextlib
-import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from rclpy.node import Node
 
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.monitoring.cycle_log import RECEIVES
-from rhs_isac_ros.monitoring.network_state import Fix, NodeStatus, Overview
+from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle
+from rhs_isac_ros.monitoring.network_state import Overview
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
 from rhs_isac_ros.ros.endpoints import subscribe_messages
-from rhs_isac_ros.ros.run import run
 from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.support.optional import optional_import
-from rhs_isac_ros.tools.command import ToolError, print_now, run_command
+from rhs_isac_ros.tools.command import none_within, observe, print_now, run_command
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-
 # Further users are counted, not shown.
 _MAX_USERS = 20
-_Justify = Literal['left', 'right']
+_PROGRAM = 'watch'
+_REFRESH_PERIOD_S = 0.25
+# Refresh period when the output is not a terminal [s].
+_PRINT_PERIOD_S = 1.0
+# Every node has reported its diagnostics after this time: they are published once a second.
+_DIAGNOSTICS_TIMEOUT_S = 1.3
 
 
 def render(overview: Overview, now_s: float) -> 'RenderableType':
-    """Return the view at a time [s], on the clock of the overview, for a console of rich.
-
-    Raises
-    ------
-    ImportError
-        If rich is not installed.
-    """
+    """Return the view at a time [s], on the clock of the overview, for a console of rich."""
     from rich.console import Group
 
     return Group(_header(overview, now_s), _users(overview, now_s), _nodes(overview, now_s))
@@ -63,37 +59,34 @@ def _header(overview: Overview, now_s: float) -> 'RenderableType':
     return text
 
 
-def _table(title: str, *columns: tuple[str, _Justify]) -> 'Table':
+def _table(title: str, justify: Literal['left', 'right'], *heads: str) -> 'Table':
     from rich import box
     from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=title, title_justify='left', title_style='bold', box=box.SIMPLE_HEAD,
                   pad_edge=False)
-    for name, justify in columns:
-        table.add_column(escape(name), justify=justify, no_wrap=justify == 'right')
+    for head in heads:
+        table.add_column(escape(head), justify=justify, no_wrap=justify == 'right')
     return table
 
 
 def _users(overview: Overview, now_s: float) -> 'RenderableType':
-    table = _table(
-        'Users', ('user', 'right'), ('position\n[m]', 'right'), ('error\n[m]', 'right'),
-        ('sigma\n[m]', 'right'), ('capacity\n[Mbit/s]', 'right'), ('loss\n[%]', 'right'),
-        ('age\n[s]', 'right'))
+    table = _table('Users', 'right', 'user', 'position\n[m]', 'error\n[m]', 'sigma\n[m]',
+                   'capacity\n[Mbit/s]', 'loss\n[%]', 'age\n[s]')
     # In order of their numbers, so that each user keeps its row.
-    for user, fix in sorted(overview.users.items())[:_MAX_USERS]:
-        table.add_row(*(_user_row(fix, now_s) if fix else (str(user), 'no fix yet', *[''] * 5)))
+    for user, cycle in sorted(overview.users.items())[:_MAX_USERS]:
+        table.add_row(str(user), *(_results(cycle, now_s) if cycle else ['no fix yet']))
     if len(overview.users) > _MAX_USERS:
         table.caption = f'and {len(overview.users) - _MAX_USERS} more'
     return table
 
 
-def _user_row(fix: Fix, now_s: float) -> list[str]:
-    cycle = fix.cycle
+def _results(cycle: CompleteCycle, now_s: float) -> list[str]:
     position = ' '.join(f'{x:6.2f}' for x in cycle.estimate.position)
-    return [str(cycle.user), position, f'{cycle.error_m:.2f}', f'{fix.sigma_m:.2f}',
+    return [position, f'{cycle.error_m:.2f}', f'{cycle.sigma_m:.2f}',
             _number(cycle.capacity.actual_bps / 1e6, 2),
-            _number(cycle.capacity.loss_percent, 3), f'{now_s - fix.received_s:.1f}']
+            _number(cycle.capacity.loss_percent, 3), f'{now_s - cycle.ended_s:.1f}']
 
 
 def _number(value: float, digits: int) -> str:
@@ -101,25 +94,20 @@ def _number(value: float, digits: int) -> str:
 
 
 def _nodes(overview: Overview, now_s: float) -> 'RenderableType':
-    table = _table('Nodes', ('node', 'left'), ('phase', 'left'), ('state', 'left'),
-                   ('given up', 'left'), ('dropped', 'left'))
-    for name, status in sorted(overview.nodes.items()):
-        table.add_row(*_node_row(name, status, now_s))
-    return table
-
-
-def _node_row(name: str, status: NodeStatus, now_s: float) -> list['RenderableType']:
     from rich.text import Text
 
-    state = Text(_printable(status.report.summary),
-                 style='yellow' if status.report.fault else 'green')
-    if status.silent(now_s):
-        state = Text(f'silent for {now_s - status.received_s:.0f} s', style='red')
-    given_up = {reason: n for reason, n in status.counts('cycles').items() if reason != 'served'}
-    # Received strings are not markup, so they are wrapped in Text.
-    phase = Text(_printable(status.report.values.get('phase', '')))
-    return [Text(_printable(name)), phase, state, Text(_counts(given_up)),
-            Text(_counts(status.counts('dropped')))]
+    table = _table('Nodes', 'left', 'node', 'phase', 'state', 'given up', 'dropped')
+    for name, status in sorted(overview.nodes.items()):
+        report, given_up = status.report, status.counts('cycles')
+        given_up.pop('served', None)
+        state = Text(_printable(report.summary), style='yellow' if report.fault else 'green')
+        if status.silent(now_s):
+            state = Text(f'silent for {now_s - status.received_s:.0f} s', style='red')
+        # Received strings are not markup, so they are wrapped in Text.
+        table.add_row(
+            Text(_printable(name)), Text(_printable(report.values.get('phase', ''))), state,
+            Text(_counts(given_up)), Text(_counts(status.counts('dropped'))))
+    return table
 
 
 def _counts(counts: dict[str, int]) -> str:
@@ -131,22 +119,8 @@ def _printable(text: str) -> str:
     return ''.join(char if char.isprintable() else '?' for char in text)
 
 
-_PROGRAM = 'watch'
-_REFRESH_PERIOD_S = 0.25
-# Refresh period when the output is not a terminal [s].
-_PRINT_PERIOD_S = 1.0
-# Every node has reported its diagnostics after this time: they are published once a second.
-_DIAGNOSTICS_TIMEOUT_S = 1.3
-
-
 class WatchNode(Node):
-    """Maintains an overview of its namespace.
-
-    Attributes
-    ----------
-    overview
-        The overview, with times of `time.monotonic`.
-    """
+    """Maintains an overview of its namespace, with times of `time.monotonic`."""
 
     def __init__(self) -> None:
         super().__init__('watch', **WITHOUT_SERVICES)
@@ -171,66 +145,49 @@ def _watch(options: argparse.Namespace, arguments: list[str]) -> int:
 
 
 def _show_live(arguments: Sequence[str]) -> int:
-    nodes: list[WatchNode] = []
-    drawn_s = 0.0
-    with contextlib.ExitStack() as stack:
-        draw, period_s = _renderer(stack)
+    """Replace the view on a terminal; print the views one after the other elsewhere."""
+    from rich.console import Console
+    from rich.live import Live
 
-        def refresh() -> bool:
+    console, drawn_s = Console(), 0.0
+    on_terminal = Live(console=console, screen=True, auto_refresh=False)
+    with on_terminal if console.is_terminal else contextlib.nullcontext() as live:
+        period_s = _REFRESH_PERIOD_S if live else _PRINT_PERIOD_S
+
+        def refresh(node: WatchNode) -> bool:
             """Draw between two executor iterations; an exception here ends the program."""
             nonlocal drawn_s
             now_s = time.monotonic()
             if now_s > drawn_s + period_s:
                 drawn_s = now_s
-                draw(render(nodes[0].overview, now_s))
+                view = render(node.overview, now_s)
+                if live:
+                    live.update(view, refresh=True)
+                else:
+                    with console.capture() as text:
+                        console.print(view)
+                    print_now(text.get())
             return False
-        return run(lambda: _create(nodes), arguments, refresh)
-
-
-def _renderer(
-        stack: contextlib.ExitStack) -> tuple[Callable[['RenderableType'], None], float]:
-    """Return a function that shows a view, and the period of its calls [s].
-
-    On a terminal, each view replaces the previous one until the stack is closed; otherwise the
-    views are printed one after the other.
-    """
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console()
-    if console.is_terminal:
-        live = stack.enter_context(Live(console=console, screen=True, auto_refresh=False))
-        return lambda view: live.update(view, refresh=True), _REFRESH_PERIOD_S
-
-    def print_view(view: 'RenderableType') -> None:
-        with console.capture() as text:
-            console.print(view)
-        print_now(text.get())
-    return print_view, _PRINT_PERIOD_S
+        code, _ = observe(WatchNode, arguments, refresh)
+        return code
 
 
 def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
     from rich.console import Console
 
-    nodes: list[WatchNode] = []
-    began_s = time.monotonic()
+    end_s = time.monotonic() + timeout_s
 
-    def done() -> bool:
-        overview, now_s = nodes[0].overview, time.monotonic()
-        return now_s > began_s + timeout_s or bool(
-            overview.fixes and now_s > overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
-    code = run(lambda: _create(nodes), arguments, done)
-    if nodes and nodes[0].overview.fixes:
-        Console().print(render(nodes[0].overview, time.monotonic()))
-    elif time.monotonic() - began_s > timeout_s:
-        raise ToolError(f'no complete cycle within {timeout_s:g} s, in the domain '
-                        f'{os.environ.get("ROS_DOMAIN_ID", "0")} and this namespace')
+    def done(node: WatchNode) -> bool:
+        now_s = time.monotonic()
+        return now_s > end_s or bool(
+            any(node.overview.users.values())
+            and now_s > node.overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
+    code, node = observe(WatchNode, arguments, done)
+    if node and any(node.overview.users.values()):
+        Console().print(render(node.overview, time.monotonic()))
+    elif time.monotonic() > end_s:
+        raise none_within('no complete cycle', timeout_s)
     return code
-
-
-def _create(nodes: list[WatchNode]) -> list[WatchNode]:
-    nodes.append(WatchNode())
-    return nodes
 
 
 def _parser() -> argparse.ArgumentParser:

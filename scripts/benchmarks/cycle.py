@@ -34,7 +34,7 @@ from rhs_isac_ros.ros.processes import private_domain
 from rhs_isac_ros.ros.run import check_domain
 from rhs_isac_ros.ros.startup import use_discovery_profile
 from rhs_isac_ros.support.arguments import positive_int
-from rhs_isac_ros.tools.process_network import check_users, start_network
+from rhs_isac_ros.tools.demo import check_users, start_network
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05

@@ -25,7 +25,7 @@ from rhs_isac_ros.ros.processes import private_domain
 from rhs_isac_ros.ros.run import check_domain
 from rhs_isac_ros.ros.startup import use_discovery_profile
 from rhs_isac_ros.support.arguments import positive_int
-from rhs_isac_ros.tools.process_network import max_user_processes, start_network
+from rhs_isac_ros.tools.demo import max_user_processes, start_network
 
 TIMEOUT_S = 600.0
 # Minimum number of measured cycles.

@@ -26,7 +26,7 @@ def overview_of(net, until_s=np.inf):
 
 def test_the_overview_is_empty_before_the_first_message():
     overview = Overview()
-    assert (overview.phase, overview.users, overview.fixes, overview.nodes) == ('', {}, [], {})
+    assert (overview.phase, overview.users, overview.nodes) == ('', {}, {})
     assert overview.rate_hz(5.0) == 0
 
 
@@ -34,13 +34,11 @@ def test_users_have_the_results_of_their_latest_cycle(network, codebooks):
     net = network(users=2, rest_s=0.5)
     net.run_cycles(4)
     overview = overview_of(net)
-    assert set(overview.users) == {1, 2}
-    assert [fix.cycle.cycle_id for fix in overview.fixes] == [4, 3]
-    assert {fix.cycle.user for fix in overview.fixes} == {1, 2}
-    for fix in overview.fixes:
-        cycle = fix.cycle
+    assert {user: cycle.user for user, cycle in overview.users.items()} == {1: 1, 2: 2}
+    assert {cycle.cycle_id for cycle in overview.users.values()} == {3, 4}
+    for cycle in overview.users.values():
         assert cycle.error_m == np.linalg.norm(cycle.estimate.position - cycle.truth.position)
-        assert fix.sigma_m == pytest.approx(np.sqrt(np.trace(cycle.estimate.covariance_m2)))
+        assert cycle.sigma_m == pytest.approx(np.sqrt(np.trace(cycle.estimate.covariance_m2)))
     assert (overview.served, overview.given_up, overview.last_failure) == (4, 0, '')
     assert overview.codebook_id == codebooks[0].id
     assert (overview.phase, overview.cycle_id) == (RESTING, 4)

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker
 
 from rhs_isac_ros.link import beam_pattern, steer
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, scene, topics
@@ -22,94 +22,75 @@ from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED
 from rhs_isac_ros.ros.frames import Frame
 
 STAMP = Time(sec=3)
-# From a table of the chi-square distribution with three degrees of freedom.
-CHI_SQUARE_95 = 7.815
 
 
 def of(vector):
     return np.array([vector.x, vector.y, vector.z])
 
 
-def rotation(q):
-    """Return the rotation matrix of a unit quaternion."""
-    return np.array([
-        [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w), 2 * (q.x * q.z + q.y * q.w)],
-        [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2), 2 * (q.y * q.z - q.x * q.w)],
-        [2 * (q.x * q.z - q.y * q.w), 2 * (q.y * q.z + q.x * q.w), 1 - 2 * (q.x**2 + q.y**2)]])
+def rgb(colour):
+    return (colour.r, colour.g, colour.b)
 
 
 def an_estimate(covariance_m2, user=1):
-    return m.PositionEstimate(
+    """The ellipsoid of an estimate as a marker, and as a shape."""
+    _, shape = shapes.estimate(m.PositionEstimate(
         cycle_id=5, user=user, codebook_id='cb', position=np.array([9.0, -1.0, 0.5]),
-        covariance_m2=covariance_m2, crlb_m2=0.1, estimator='bayes', latency_s=0.01)
+        covariance_m2=covariance_m2, crlb_m2=0.1, estimator='bayes', latency_s=0.01))
+    return scene.marker('estimate', user, shape, STAMP), shape
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_the_ellipsoid_is_that_of_the_covariance(seed):
-    root = np.random.default_rng(seed).normal(size=(3, 3))
-    marker = scene.estimate(an_estimate(root @ root.T), STAMP)
+def test_an_ellipsoid_keeps_its_axes():
+    marker, shape = an_estimate(np.diag([4.0, 1.0, 0.25]))
     assert marker.type == Marker.SPHERE
-    assert of(marker.pose.position) == pytest.approx([9.0, -1.0, 0.5])
-    turn = rotation(marker.pose.orientation)
-    assert np.linalg.det(turn) == pytest.approx(1)
-    radii = of(marker.scale) / 2
-    assert turn @ np.diag(radii**2) @ turn.T == pytest.approx(
-        CHI_SQUARE_95 * root @ root.T, rel=1e-3, abs=1e-3)
-
-
-def test_a_position_without_variance_is_visible():
-    marker = scene.estimate(an_estimate(np.zeros((3, 3))), STAMP)
-    assert of(marker.scale).min() > 0
+    assert of(marker.pose.position) == pytest.approx(shape.centres[0])
+    assert of(marker.scale) == pytest.approx(2 * shape.half_sizes_m[0])
+    turn = marker.pose.orientation
+    assert [turn.x, turn.y, turn.z, turn.w] == pytest.approx(shape.quaternions[0])
+    assert of(an_estimate(np.zeros((3, 3)))[0].scale).min() > 0
 
 
 def test_each_user_has_one_hue_for_truth_and_estimate():
-    hues = {}
+    hues = set()
     for user in (1, 2, 2**32 - 1):
         position = np.array([user % 7, 0.0, 0.0], float)
-        one = scene.truth(m.GroundTruth(
-            cycle_id=0, user=user, position=position, velocity=np.zeros(3)), STAMP)
-        other = scene.estimate(an_estimate(np.eye(3), user), STAMP)
+        ball, _ = shapes.truth(m.GroundTruth(
+            cycle_id=0, user=user, position=position, velocity=np.zeros(3)))
+        one = scene.marker('truth', user, ball, STAMP)
+        other, _ = an_estimate(np.eye(3), user)
         assert of(one.pose.position) == pytest.approx(position)
         assert (one.ns, one.id) != (other.ns, other.id)
-        assert (one.color.r, one.color.g, one.color.b) == (
-            other.color.r, other.color.g, other.color.b)
+        assert rgb(one.color) == rgb(other.color)
         assert one.color.a == 1 > other.color.a > 0
-        hues[one.color.r, one.color.g, one.color.b] = one
+        hues.add(rgb(one.color))
     assert len(hues) == 3
 
 
-def test_the_board_shows_its_configuration(small):
-    configuration = np.linspace(0, 1, 2 * small.scenario.n_elements).reshape(2, -1)
-    marker = scene.board(small.scenario, configuration, STAMP)
-    assert np.array([of(point) for point in marker.points]) == pytest.approx(
-        element_positions(small.scenario))
-    assert [color.r for color in marker.colors] == pytest.approx(configuration.mean(axis=0))
-    places = np.unique(element_positions(small.scenario)[:, 1])
-    assert 0 < marker.scale.y == marker.scale.z < np.diff(places).min()
-    unknown = scene.board(small.scenario, None, STAMP)
-    assert len({color.r for color in unknown.colors}) == 1
+def test_the_plates_of_the_board_keep_places_and_colours(small):
+    board = shapes.board(small.scenario, np.linspace(0, 1, small.scenario.n_elements)[None])
+    marker = scene.marker('board', 0, board, STAMP)
+    assert np.array([of(point) for point in marker.points]) == pytest.approx(board.centres)
+    assert np.array([rgb(colour) for colour in marker.colors]) == pytest.approx(board.colours)
+    assert of(marker.scale) == pytest.approx(2 * board.half_sizes_m[0])
 
 
-def test_a_flat_region_is_visible(small):
+def test_the_region_is_translucent_and_visible_even_if_it_is_flat(small):
     flat = dataclasses.replace(small.scenario, roi_size_m=(4.0, 3.0, 0.0))
-    scale = of(scene.region(flat, STAMP).scale)
-    assert scale[:2].tolist() == [4.0, 3.0]
-    assert 0 < scale[2] < 0.01
-
-
-def test_the_region_has_the_bounds_of_the_scenario(small):
-    marker = scene.region(small.scenario, STAMP)
-    low, high = small.scenario.roi_bounds_m
-    assert of(marker.pose.position) - of(marker.scale) / 2 == pytest.approx(low)
-    assert of(marker.pose.position) + of(marker.scale) / 2 == pytest.approx(high)
-    assert (marker.header.frame_id, marker.header.stamp) == ('rhs_link', STAMP)
-    assert marker.pose.orientation.w == 1
+    for scenario in (small.scenario, flat):
+        marker = scene.marker('region', 0, shapes.region(scenario), STAMP)
+        low, high = scenario.roi_bounds_m
+        (centre,), size = map(of, marker.points), of(marker.scale)
+        assert centre == pytest.approx((low + high) / 2)
+        assert size == pytest.approx(high - low, abs=0.01)
+        assert size.min() > 0 and 0 < marker.colors[0].a < 1
+        assert (marker.header.frame_id, marker.header.stamp) == ('rhs_link', STAMP)
+        assert marker.pose.orientation.w == 1
 
 
 def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     scenario, place = Scenario(), np.array([9.0, 3.0, 0.3])
     found = beam_pattern(scenario, steer(scenario, place), 10.0)
-    marker = scene.beam(found, 3, STAMP)
+    marker = scene.marker('beam', 0, shapes.lobe(found, 3), STAMP)
     corners = np.array([of(point) for point in marker.points]).reshape(-1, 3, 3)
     assert (marker.type, marker.header.frame_id) == (Marker.TRIANGLE_LIST, 'rhs_link')
     lengths = np.linalg.norm(corners, axis=-1)
@@ -120,7 +101,7 @@ def test_the_beam_points_to_its_user_and_its_triangles_look_outward():
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum('nu,nu->n', normals, corners.mean(axis=1)) >= -1e-9).all()
     assert 0 < marker.color.a < 1
-    assert marker.color.r == scene.estimate(an_estimate(np.eye(3), 3), STAMP).color.r
+    assert rgb(marker.color) == pytest.approx(shapes.user_colour(3))
 
 
 def test_a_path_contains_its_positions_in_order():

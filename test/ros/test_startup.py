@@ -98,7 +98,7 @@ def test_a_program_that_cannot_use_its_keys_ends_with_one_line(keystore, executa
 
 
 @pytest.mark.parametrize(('main', 'arguments'), [
-    (topic.main, ('echo', 'ack', 'rhs_isac_msgs/msg/Ack')), (topic.main, ('hz', 'ack')),
+    (topic.main, ('echo', 'ack')), (topic.main, ('hz', 'ack')),
     (param.main, ('get', 'bs', 'rest_s'))])
 def test_a_tool_that_is_refused_a_topic_or_a_service_ends_with_one_line(
         monkeypatch, capsys, main, arguments):
@@ -118,6 +118,6 @@ def test_a_tool_that_is_refused_a_topic_or_a_service_ends_with_one_line(
         return condition()
     session = SimpleNamespace(node=node, full_name='/{}'.format, spin_until=spin_until)
     monkeypatch.setattr(
-        'rhs_isac_ros.tools.command.Session', lambda: contextlib.nullcontext(session))
+        'rhs_isac_ros.tools.command.Session', lambda arguments: contextlib.nullcontext(session))
     assert main(arguments) == 1
     assert capsys.readouterr().err == 'DDS security: Failed to create: not allowed\n'

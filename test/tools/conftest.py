@@ -41,7 +41,8 @@ def shared_session(network):
 def call(shared_session, capsys, monkeypatch):
     """Function that calls a tool's main function and returns output, errors and exit code."""
     monkeypatch.setattr(
-        'rhs_isac_ros.tools.command.Session', lambda: contextlib.nullcontext(shared_session))
+        'rhs_isac_ros.tools.command.Session',
+        lambda arguments: contextlib.nullcontext(shared_session))
 
     def result(main, *arguments):
         code = main(arguments)

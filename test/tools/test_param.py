@@ -9,7 +9,7 @@ def test_get_prints_the_type(output_of):
     assert output_of(main, 'get', '/optimizer', 'codebook.shape') == (
         'Integer values are: [2, 4, 3, 2, 36]\n')
     assert output_of(main, 'get', 'bs', 'policy') == 'String value is: round_robin\n'
-    assert output_of(main, 'get', 'bs', 'receiver_noise', '--hide-type') == 'True\n'
+    assert output_of(main, 'get', 'bs', 'receiver_noise') == 'Boolean value is: True\n'
 
 
 def test_the_script_runs_from_the_root(run_script):
@@ -17,10 +17,8 @@ def test_the_script_runs_from_the_root(run_script):
 
 
 def test_list_of_one_node_and_of_all_nodes(output_of):
-    assert output_of(main, 'list', '/transmission', '--filter', 'b') == '  band\n'
-    assert '  rest_s (type: double)\n' in output_of(main, 'list', 'bs', '--param-type')
-    codebook = output_of(main, 'list', 'optimizer', '--param-prefixes', 'codebook').split()
-    assert codebook[0] == 'codebook.analog' and len(codebook) == 7
+    names = output_of(main, 'list', '/transmission').splitlines()
+    assert names == sorted(names) and '  band' in names
     lines = output_of(main, 'list').splitlines()
     nodes = [line for line in lines if line.startswith('/')]
     assert nodes == sorted(nodes)

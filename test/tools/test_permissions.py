@@ -1,5 +1,6 @@
 """The policy allows exactly what the nodes of a network use."""
 
+import contextlib
 import importlib.util
 import re
 import xml.etree.ElementTree as ElementTree
@@ -115,12 +116,13 @@ def test_a_replay_may_publish_every_recorded_topic_and_be_an_optimizer():
 def test_the_tools_use_no_more_than_the_permissions_of_the_operator(tmp_path):
     allowed = rules(permissions.policy(users=2))
     scenario = Scenario()
-    with Session() as session:
+    recorder = Recorder(tmp_path / 'a.mcap', scenario)
+    with Session() as session, contextlib.closing(recorder):
         view = ViewNode(scenario, Posteriors(scenario), lambda entries: None)
         # Only tracks have odometry.
         view._follow_track(1)
-        nodes = [session.node, view, CalibratorNode(PilotLog(scenario), scenario), WatchNode(),
-                 SnapshotNode(scenario), RecorderNode(Recorder(tmp_path / 'a.mcap', scenario)),
+        nodes = [session.node, view, CalibratorNode(PilotLog(), scenario), WatchNode(),
+                 SnapshotNode(scenario), RecorderNode(recorder),
                  RepublisherNode([], [*recorded_topics()], 1.0),
                  replay._optimizer(scenario, Codebook.load(default_codebook_file()))]
         # It creates the clients.

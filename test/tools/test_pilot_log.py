@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.tools.calibrate import PilotLog
@@ -18,8 +17,8 @@ def codebook(random_beams):
 
 @pytest.fixture
 def log(codebook):
-    log = PilotLog(SCENARIO)
-    log.add_codebook(codebook)
+    log = PilotLog()
+    log.add(codebook)
     return log
 
 
@@ -39,6 +38,7 @@ def test_signals_are_paired_with_the_position_of_their_cycle(log, codebook):
         log.add(message)
     (pilots,) = log.pilots()
     assert (log.n_pilots, pilots.beams) == (2, codebook)
+    assert log.has_pilots(2) and not log.has_pilots(3)
     np.testing.assert_array_equal(pilots.positions[:, 1], [2, 1])
     np.testing.assert_array_equal(pilots.received[:, 0, 0], [2 + 1j, 1 + 1j])
 
@@ -48,7 +48,8 @@ def test_signals_are_paired_with_the_position_of_their_cycle(log, codebook):
 def test_positions_of_others_do_not_count(log, codebook, message):
     log.add(message)
     log.add(signals(3, codebook.id))
-    assert (log.n_signals, log.n_pilots, log.pilots()) == (1, 0, [])
+    assert (log.n_pilots, log.pilots()) == (0, [])
+    assert not log.has_pilots(1)
 
 
 def test_repeated_signals_count_once(log, codebook):
@@ -58,8 +59,8 @@ def test_repeated_signals_count_once(log, codebook):
 
 
 def test_signals_of_one_user_may_be_selected(codebook):
-    log = PilotLog(SCENARIO, user=2)
-    log.add_codebook(codebook)
+    log = PilotLog(user=2)
+    log.add(codebook)
     for user in (1, 2):
         log.add(truth(user, user))
         log.add(signals(user, codebook.id, user))
@@ -71,10 +72,5 @@ def test_signals_of_an_unknown_codebook_wait_for_it(log, random_beams, codebook)
     for message in (truth(1), signals(1, other.id), truth(2), signals(2, codebook.id)):
         log.add(message)
     assert (log.missing_codebooks, log.n_pilots) == ([other.id], 1)
-    log.add_codebook(codebook, other.id)
+    log.codebooks[other.id] = codebook
     assert (log.missing_codebooks, log.n_pilots, len(log.pilots())) == ([], 2, 2)
-
-
-def test_a_codebook_of_another_scenario_is_refused(log, shipped):
-    with pytest.raises(CodebookError, match='analog: shape'):
-        log.add_codebook(shipped)

@@ -1,6 +1,7 @@
 """``scripts/record`` and ``scripts/replay`` on a network in another process."""
 
 import os
+import re
 import signal
 import subprocess
 import types
@@ -21,7 +22,7 @@ from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, read
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.tools.replay import errors_m, load, main, tracked_errors_m
+from rhs_isac_ros.tools.replay import errors_m, load, main
 
 pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -52,7 +53,8 @@ def rows(text):
     """Return median, root mean square and number of missing fixes by row."""
     number, _, *lines = text.splitlines()
     assert number == f'{CYCLES} cycles'
-    return {line[:12].strip(): line[12:].split() for line in lines}
+    pairs = (re.split('  +', line, maxsplit=1) for line in lines)
+    return {name: cells.split() for name, cells in pairs}
 
 
 def test_the_recorded_cycles_match_those_observed_live(run):
@@ -93,7 +95,7 @@ def test_users_are_tracked_beside_single_cycles(run, run_script):
     estimators = {key: make_estimator('bayes', recording.scenario, codebook)
                   for key, codebook in recording.codebooks.items()}
     alone = errors_m(recording.cycles, estimators)
-    tracked = tracked_errors_m(recording.cycles, estimators)
+    tracked = errors_m(recording.cycles, estimators, 1.0)
     users = [cycle.user for cycle in recording.cycles]
     first = [users.index(user) for user in set(users)]
     assert len(first) < CYCLES
@@ -131,7 +133,7 @@ def test_another_codebook_is_assumed_with_a_warning(run, random_beams, tmp_path,
 @pytest.mark.parametrize('arguments, error', [
     (['--namespace', '/lab'], 'no complete cycle in the namespace /lab'),
     (['--codebook', CONFIG / 'codebook.yaml'], 'analog: shape'),
-    (['--config', CONFIG / 'table1.yaml'], 'signals'),
+    (['--config', CONFIG / 'table1.yaml'], 'shape'),
     (['--estimator', 'neural'], 'model'),
 ])
 def test_a_mismatch_is_named(run, capsys, arguments, error):

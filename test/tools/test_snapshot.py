@@ -3,7 +3,6 @@
 import struct
 import subprocess
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.network_state import SceneState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.tools.snapshot import SnapshotNode, write_picture
+from rhs_isac_ros.tools.snapshot import SnapshotNode, draw
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / 'scripts' / 'snapshot'
@@ -42,13 +41,11 @@ def test_a_network_of_another_scenario_is_named(shared_session, snapshot, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_without_a_network_it_is_an_error(capsys):
-    options = SimpleNamespace(timeout=0.5, output=Path('never.png'))
-    assert write_picture(SceneState(), '', Scenario(), options) == 1
-    out, err = capsys.readouterr()
-    assert out == ''
-    assert err.startswith('snapshot: error: no user found within 0.5 s, in the domain ')
-    assert not options.output.exists()
+def test_without_a_network_it_is_an_error(snapshot, tmp_path):
+    done = snapshot('--timeout', '0.5', '--ros-args', '-r', '__ns:=/nobody')
+    assert (done.returncode, done.stdout) == (1, '')
+    assert done.stderr.startswith('snapshot: error: no user found within 0.5 s, in the domain ')
+    assert not list(tmp_path.iterdir())
 
 
 def test_of_many_users_without_an_estimate_few_are_named(tmp_path, capsys):
@@ -56,8 +53,7 @@ def test_of_many_users_without_an_estimate_few_are_named(tmp_path, capsys):
     scene.add(m.GroundTruths(
         cycle_id=0, users=np.arange(1, 21), position=np.full((20, 3), (9.0, 1.0, 0.3)),
         velocity=np.zeros((20, 3))), 0.0)
-    options = SimpleNamespace(timeout=1.0, output=tmp_path / 'now.png')
-    assert write_picture(scene, '', Scenario(), options) == 0
+    draw(scene, Scenario(), tmp_path / 'now.png')
     assert capsys.readouterr().err == (
         'snapshot: not in the picture: the configuration of the surface; a data beam; '
         'estimates of 20 of 20 users: 1, 2, 3, 4, 5, 6, 7, 8 and 12 others\n')

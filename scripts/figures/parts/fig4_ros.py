@@ -24,7 +24,7 @@ from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.ros.processes import Processes, private_domain
 from rhs_isac_ros.ros.recording import CycleObserver
 from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.tools.process_network import watch
+from rhs_isac_ros.tools.demo import watch
 
 # Users of a network, each at its own position, and cycles for each.
 USERS, CYCLES_PER_USER = 25, 4

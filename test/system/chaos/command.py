@@ -28,7 +28,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
 )
 from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.tools.process_network import add_network_options, load_files, start_network
+from rhs_isac_ros.tools.demo import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.chaos.trial import ChaosError, Trial
 from system.invariants import CHECK_DELAY_S

@@ -23,7 +23,7 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
 )
 from rhs_isac_ros.support.files import write_whole
-from rhs_isac_ros.tools.process_network import (
+from rhs_isac_ros.tools.demo import (
     add_network_options,
     check_users,
     load_files,

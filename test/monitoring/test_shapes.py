@@ -1,0 +1,67 @@
+"""Shapes of a scene, compared with their geometry."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rhs_isac_ros.link import BeamPattern
+from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.monitoring.shapes import axes_95, board, estimate, lobe, user_colour
+from rhs_isac_ros.protocol import messages as m
+
+# From tables of the chi-square distribution with two and three degrees of freedom.
+CHI_SQUARE_95 = {2: 5.991, 3: 7.815}
+
+
+@pytest.mark.parametrize('n', CHI_SQUARE_95)
+@pytest.mark.parametrize('seed', range(4))
+def test_the_axes_are_those_of_the_covariance(n, seed):
+    root = np.random.default_rng(seed).normal(size=(n, n))
+    half_m, axes = axes_95(root @ root.T)
+    assert axes @ np.diag(half_m**2) @ axes.T == pytest.approx(
+        CHI_SQUARE_95[n] * root @ root.T, rel=1e-3, abs=1e-3)
+    assert np.linalg.det(axes) == pytest.approx(1)
+
+
+def test_the_ellipsoid_of_an_estimate_has_the_axes_of_its_covariance():
+    root = np.random.default_rng(0).normal(size=(3, 3))
+    ball, shown = estimate(m.PositionEstimate(
+        cycle_id=1, user=1, codebook_id='cb', position=np.array([9.0, -1.0, 0.5]),
+        covariance_m2=root @ root.T, crlb_m2=0.1, estimator='bayes', latency_s=0.01))
+    assert ball.positions.tolist() == shown.centres.tolist() == [[9.0, -1.0, 0.5]]
+    turn = Rotation.from_quat(shown.quaternions[0]).as_matrix()
+    assert turn @ np.diag(shown.half_sizes_m[0]**2) @ turn.T == pytest.approx(
+        CHI_SQUARE_95[3] * root @ root.T, rel=1e-3, abs=1e-3)
+
+
+def test_a_covariance_that_is_negative_by_rounding_gives_no_extent():
+    half_m, _ = axes_95(np.diag([1.0, 0.0, -1e-18]))
+    assert sorted(half_m) == pytest.approx([0, 0, np.sqrt(CHI_SQUARE_95[3])], rel=1e-3)
+
+
+def test_the_radius_of_a_lobe_is_the_level_in_decibels():
+    """0 dB is at the distance of the pattern, -20 dB at the centre."""
+    directions = np.array([[[1.0, 0, 0], [0, 1, 0]], [[0, 0, 1], [0.6, 0.8, 0]]])
+    relative = np.array([[1.0, 0.1], [0.01, 0.0]])
+    shown = lobe(BeamPattern(directions, relative, 8.0), 1)
+    assert shown.points == pytest.approx(
+        np.array([[[8, 0, 0], [0, 4, 0]], [[0, 0, 0], [0, 0, 0]]]))
+
+
+def test_the_board_is_to_scale_or_enlarged(small):
+    configuration = np.linspace(0, 1, 2 * small.scenario.n_elements).reshape(2, -1)
+    true, large = (board(small.scenario, configuration, enlarged) for enlarged in (False, True))
+    assert true.centres == pytest.approx(element_positions(small.scenario))
+    factor = large.half_sizes_m[0, 1] / true.half_sizes_m[0, 1]
+    assert factor > 1
+    assert large.centres == pytest.approx(factor * true.centres)
+    for shown in (true, large):
+        assert shown.colours[:, 0] == pytest.approx(configuration.mean(axis=0))
+        assert 0 < 2 * shown.half_sizes_m[0, 1] < np.diff(np.unique(shown.centres[:, 1])).min()
+    assert len(np.unique(board(small.scenario, None).colours[:, 0])) == 1
+
+
+def test_users_have_different_colours():
+    colours = {user_colour(user) for user in (1, 2, 3, 2**32 - 1)}
+    assert len(colours) == 4
+    assert all(0 <= part <= 1 for colour in colours for part in colour)
