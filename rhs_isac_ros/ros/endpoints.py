@@ -25,12 +25,6 @@ from rclpy.timer import Timer
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, qos, topics
 
-
-def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
-    """Create a running timer on the steady clock, which the deadlines of the roles refer to."""
-    return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-
 _CreatedT = TypeVar('_CreatedT')
 # By node: descriptions of what was refused, by kind and name.
 _refusals: weakref.WeakKeyDictionary[Node, dict[str, str]] = weakref.WeakKeyDictionary()
@@ -52,6 +46,35 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
             node.get_logger().error(text)
         known[what] = text
         return None
+
+
+class _NoTimer(Timer):
+    """Takes the place of a timer that was refused, and never expires."""
+
+    timer_period_ns = 0
+
+    def __init__(self) -> None:
+        return
+
+    def cancel(self) -> None:
+        return
+
+    def reset(self) -> None:
+        return
+
+
+def create_timer(
+        node: Node, period_s: float, callback: Callable[[], None], clock: Clock | None = None
+) -> Timer:
+    """Create a running timer, by default on the clock of ROS; if refused, it never expires."""
+    timer = create_or_refuse(node, f'timer of {period_s:g} s', lambda: node.create_timer(
+        period_s, callback, clock=clock))
+    return timer or _NoTimer()
+
+
+def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
+    """Create a running timer on the steady clock, which the deadlines of the roles refer to."""
+    return create_timer(node, period_s, callback, Clock(clock_type=ClockType.STEADY_TIME))
 
 
 class _NoPublisher(Publisher):
