@@ -1,6 +1,7 @@
 """A node with declared parameters, some of which may change while it runs."""
 
 import dataclasses
+import functools
 import types
 from collections.abc import Iterable
 from typing import Any
@@ -10,7 +11,8 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros import parameters, topics
+from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
 from rhs_isac_ros.ros.parameters import ParameterError
 
 _FLOATING = (Parameter.Type.DOUBLE, Parameter.Type.DOUBLE_ARRAY)
@@ -96,7 +98,14 @@ class ParameterizedNode(Node):
             self._check_each(parameter_list)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        return super().set_parameters_atomically(parameter_list)
+        # With use_sim_time, rclpy subscribes to the time of the simulation.
+        result = create_or_refuse(self, f'subscription to {topics.CLOCK}', functools.partial(
+            super().set_parameters_atomically, parameter_list))
+        if result:
+            return result
+        self._time_source.ros_time_is_active = False
+        return SetParametersResult(
+            successful=False, reason=refusals(self)[f'subscription to {topics.CLOCK}'])
 
     def _is_kept(self, parameter: Parameter) -> bool:
         """Return whether a parameter is read-only and keeps its value."""

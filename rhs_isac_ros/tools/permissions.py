@@ -4,12 +4,14 @@
 """
 
 import argparse
+import itertools
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from rclpy.exceptions import InvalidNamespaceException
+from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
+from rclpy.validate_full_topic_name import validate_full_topic_name
 from rclpy.validate_namespace import validate_namespace
 
 from rhs_isac_ros.executables import exit_code_of
@@ -53,13 +55,15 @@ class Permissions(NamedTuple):
     request: tuple[str, ...] = ()
 
 
-def permissions(users: int) -> dict[str, Permissions]:
+def permissions(users: int, robots: Mapping[int, str] | None = None) -> dict[str, Permissions]:
     """Return the permissions that the nodes of a network may need, and no others.
 
     Parameters
     ----------
     users
         Number of users; they are numbered from 1.
+    robots
+        Topic with the positions of each user that is a robot, by number: its odometry or ``/tf``.
 
     Returns
     -------
@@ -75,18 +79,23 @@ def permissions(users: int) -> dict[str, Permissions]:
             name, numbers if member.is_unique else [number])
         for name, member in sorted(ROSTER.items())
         for number in ((1,) if member.is_unique else numbers)}
+    sources = {f'user_{number}': (topic, topics.TF_STATIC) if topic == topics.TF else (topic,)
+               for number, topic in (robots or {}).items()}
+    for name, source in sources.items():
+        nodes[name] = nodes[name]._replace(subscribe=(*nodes[name].subscribe, *source))
     nodes['users'] = _of_member('user', numbers)
     nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
     nodes['visualizer'] = Permissions(
         publish=(*sorted((topics.MARKERS, topics.TF, topics.TF_STATIC,
                           *_of_users(numbers, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
-        subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
+        subscribe=(*sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES), topics.CLOCK))
     optimizer = topics.OPTIMIZER_NODE
     # It provides the recorded codebook, as an optimizer or to the one that is present.
     replay = _together({optimizer: nodes[optimizer], 'replay': Permissions(
         publish=tuple(recorded_topics()), reply=(),
         request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
-    return {**nodes, 'operator': _operator(nodes, numbers), 'replay': replay}
+    operator = _operator(nodes, numbers, *sources.values())
+    return {**nodes, 'operator': operator, 'replay': replay}
 
 
 def _together(nodes: Mapping[str, Permissions]) -> Permissions:
@@ -103,7 +112,7 @@ def _of_member(name: str, users: Iterable[int]) -> Permissions:
         _of_users(users, topic) if '{user}' in topic else (topic,))}
     return Permissions(
         publish=(*sorted(sent), *_RCLPY_TOPICS, *(_LOCATE_TOPICS if name == 'bs' else ())),
-        subscribe=tuple(sorted(member.received)),
+        subscribe=(*sorted(member.received), topics.CLOCK),
         reply=(*_OFFERED_SERVICES,
                *((*_CYCLE_SERVICES, *_LOCATE_SERVICES) if name == 'bs' else ())),
         request=(_GET_CODEBOOK,) if member.has_codebook else ())
@@ -114,12 +123,14 @@ def _of_users(users: Iterable[int], *names: str) -> tuple[str, ...]:
     return tuple(name.format(user=number) for number in users for name in names)
 
 
-def _operator(nodes: Iterable[str], users: Iterable[int]) -> Permissions:
+def _operator(
+        nodes: Iterable[str], users: Iterable[int], *sources: Iterable[str]) -> Permissions:
     """Return the permissions to subscribe to all topics and to set the parameters of all nodes.
 
     The nodes of ``ros2``, whose names end in a number or a type, offer services.
     """
-    readable = {*recorded_topics(), topics.MARKERS, topics.TF, topics.TF_STATIC,
+    readable = {*recorded_topics(), *itertools.chain(*sources), topics.MARKERS, topics.TF,
+                topics.TF_STATIC, topics.CLOCK,
                 *_of_users(users, topics.POSE, topics.ODOMETRY, topics.PATH, topics.TRUE_PATH,
                            topics.TRUE_ODOMETRY)}
     return Permissions(
@@ -130,19 +141,20 @@ def _operator(nodes: Iterable[str], users: Iterable[int]) -> Permissions:
                  *_LOCATE_SERVICES))
 
 
-def policy(namespace: str = '/', users: int = 2) -> str:
+def policy(
+        namespace: str = '/', users: int = 2, robots: Mapping[int, str] | None = None) -> str:
     """Return the policy of a network in the XML format of SROS2, with one enclave for each node.
 
     Parameters
     ----------
     namespace
         Namespace of the network and of its enclaves.
-    users
-        Number of users.
+    users, robots
+        See `permissions`.
     """
     root = ElementTree.Element('policy', version=_VERSION)
     enclaves = ElementTree.SubElement(root, 'enclaves')
-    for node, allowed in permissions(users).items():
+    for node, allowed in permissions(users, robots).items():
         enclave = ElementTree.SubElement(
             enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
         profiles = ElementTree.SubElement(enclave, 'profiles')
@@ -167,9 +179,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')
+    parser.add_argument(
+        '--robot', type=_robot, action='append', default=[], metavar='USER=TOPIC',
+        help='topic with the positions of a user that is a robot, such as 2=odom or 2=/tf; '
+        'may be repeated')
     options = parser.parse_args(arguments)
-    print(policy(options.namespace, options.users), end='')
+    robots = dict(options.robot)
+    if unknown := [user for user in robots if user > options.users]:
+        parser.error(f'argument --robot: user {unknown[0]}, expected 1 to {options.users}')
+    print(policy(options.namespace, options.users, robots), end='')
     return 0
+
+
+def _robot(text: str) -> tuple[int, str]:
+    user, _, topic = text.partition('=')
+    try:
+        validate_full_topic_name(f'/{topic.removeprefix("/")}')
+    except InvalidTopicNameException as error:
+        raise argparse.ArgumentTypeError(str(error).partition(':\n')[0]) from None
+    return integer(1, 1000)(user), topic
 
 
 def _namespace(text: str) -> str:

@@ -43,15 +43,18 @@ from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.security import is_enabled
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.tools.command import ToolError, run_command
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
-# Period of looking for subscribers; maximum time to discover an optimizer [s].
+# Period of looking for subscribers; maximum time to discover an optimizer, also while DDS security
+# exchanges keys [s].
 _POLL_PERIOD_S = 0.05
 _DISCOVERY_TIMEOUT_S = 2.0
+_SECURE_DISCOVERY_TIMEOUT_S = 8.0
 # Time without a new endpoint after which the publishers and subscribers of a network are taken as
 # complete [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
@@ -271,7 +274,7 @@ def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
 
 def _optimizer_present(node: Node) -> bool:
     present = AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
-        _DISCOVERY_TIMEOUT_S)
+        _SECURE_DISCOVERY_TIMEOUT_S if is_enabled() else _DISCOVERY_TIMEOUT_S)
     if present:
         print(f'using the codebook of the {topics.OPTIMIZER_NODE} in the namespace',
               file=sys.stderr)
