@@ -40,7 +40,8 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
     try:
         return create()
     except rclpy_implementation.RCLError as error:
-        text = f'{what} was refused: {str(error).splitlines()[0]}'
+        # The end of the text is a position in the sources of ROS.
+        text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
         known = _refusals.setdefault(node, {})
         if what not in known:
             node.get_logger().error(text)
