@@ -115,7 +115,11 @@ def one_line() -> Iterator[None]:
     except rclpy_implementation.RCLError as error:
         if not is_enabled():
             raise
-        text = str(error).splitlines()[0]
+        # The end of the text is a position in the sources of ROS.
+        text = str(error).partition(', at ')[0].splitlines()[0]
+        if 'failed to create participant' in text:
+            text = ('Fast DDS rejects the files of the enclave, which may be damaged, expired or '
+                    'signed by another authority')
         if 'security libraries' in text:
             text = ('Fast DDS was built without security, as in the wheels; install the packages '
                     f'of ROS 2 Jazzy, or unset {_ENABLE}')

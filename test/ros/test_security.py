@@ -84,6 +84,18 @@ def test_an_error_has_one_line_that_names_the_variable(monkeypatch, capsys, name
             f'WITHOUT security, because ROS_SECURITY_STRATEGY is not Enforce: {error.value}\n')
 
 
+@pytest.mark.parametrize(('error', 'text'), [
+    ('__create_participant failed to create participant, at a.cpp:107, at b.c:2',
+     'DDS security: Fast DDS rejects the files of the enclave, which'),
+    ('could not create data writer, at a.cpp:275, at b.c:1',
+     'DDS security: could not create data writer')])
+def test_an_error_omits_the_sources_of_ros(error, text):
+    with pytest.raises(SecurityError) as found, security.one_line():
+        raise rclpy_implementation.RCLError(error)
+    assert str(found.value).startswith(text)
+    assert ', at ' not in str(found.value)
+
+
 @pytest.mark.parametrize('executable', ['bs', 'optimizer'])
 def test_a_program_that_cannot_use_its_keys_ends_with_one_line(keystore, executable):
     program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
