@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from rhs_isac_ros.ros.security import one_line, prepare
+from rhs_isac_ros.ros.security import is_enabled, one_line, prepare
 
 # Environment variable with the profile file of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -27,8 +27,9 @@ _holders: list[Node] = []
 
 
 def discovery_profile_file() -> Path:
-    """Return the path of the Fast DDS discovery profile, ``config/discovery.xml``."""
-    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'discovery.xml'
+    """Return the path of the Fast DDS discovery profile, which depends on DDS security."""
+    name = 'discovery_security.xml' if is_enabled() else 'discovery.xml'
+    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / name
 
 
 def use_discovery_profile() -> None:
