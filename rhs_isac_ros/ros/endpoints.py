@@ -39,7 +39,8 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
     """Return what `create` returns; None, with one log line, if the middleware refuses it."""
     try:
         return create()
-    except rclpy_implementation.RCLError as error:
+    # Of an action, rclpy raises a ValueError.
+    except (rclpy_implementation.RCLError, ValueError) as error:
         # The end of the text is a position in the sources of ROS.
         text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
         known = _refusals.setdefault(node, {})

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import endpoints, topics
+from rhs_isac_ros.ros import endpoints, locate, topics
 from rhs_isac_ros.ros.roster import ROSTER
 
 ESTIMATE = m.PositionEstimate(
@@ -35,6 +35,11 @@ def refused(monkeypatch):
         monkeypatch.setattr(Node, method, attempt)
     for method in ('create_publisher', 'create_subscription', 'create_client', 'create_service'):
         refuse(method)
+
+    def refuse_action(node, kind, name, *_, **__):
+        names.append(name)
+        raise ValueError(f'{name} not found in allow rule, at a.cpp:1')
+    monkeypatch.setattr(locate, 'ActionServer', refuse_action)
     return names
 
 
