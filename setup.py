@@ -1,5 +1,7 @@
 """The ament_python package rhs_isac_ros; without ROS, pip installs the library alone."""
 
+import os
+import sys
 from glob import glob
 from pathlib import Path
 
@@ -10,9 +12,16 @@ NODES = sorted(path.stem for path in Path(__file__).parent.glob(f'{NAME}/nodes/[
 # The demonstration, and the terminal tools that have no counterpart in `ros2`.
 TOOLS = ('calibrate', 'demo', 'record', 'replay', 'snapshot', 'view', 'watch')
 
+# colcon does not search for packages inside a package, and installs this one without its messages.
+if 'COLCON' in os.environ and not any(
+        (Path(prefix) / 'share' / 'rhs_isac_msgs').is_dir()
+        for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)):
+    print(f'{NAME}: the package rhs_isac_msgs is missing: in the src folder of the workspace, run '
+          '`ln -s rhs_isac_ros/msg_defs rhs_isac_msgs`, then repeat colcon build', file=sys.stderr)
+
 setup(
     name=NAME,
-    version='0.1.0',
+    version='1.0.0',
     description='Multi-band integrated sensing and communication with a holographic surface',
     author='rhs_isac_ros authors',
     author_email='maintainers@rhs-isac-ros.org',
@@ -32,7 +41,7 @@ setup(
     ],
     python_requires='>=3.10',
     # The library requires nothing else. The nodes also require ROS 2, which pip cannot install:
-    # rosdep reads package.xml, and scripts/setup reads requirements.txt.
+    # rosdep reads package.xml, and scripts/setup reads requirements*.txt.
     install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6', 'threadpoolctl>=3.1'],
     # Tests and the documentation read this table as a literal.
     extras_require={

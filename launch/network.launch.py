@@ -117,7 +117,7 @@ def _node(given: dict[str, str], executable: str, name: str | None, **values: in
     # JSON quotes a string so that YAML does not read it as another type.
     pairs = [f'{key}:={json.dumps(value, ensure_ascii=False)}'
              for key, value in {**values, 'scenario_file': given['config'],
-        'use_sim_time': given['use_sim_time'] == 'true'}.items()]
+                                'use_sim_time': given['use_sim_time'] == 'true'}.items()]
     return _process(
         given, name or executable, given['respawn'] == 'true',
         [word for pair in pairs for word in ('-p', pair)],

@@ -82,7 +82,7 @@ def _join_network(name: str) -> None:
     # Before NumPy, which ROS imports, so that the limits of its threads apply.
     importlib.import_module('rhs_isac_ros.nodes')
     try:
-        importlib.import_module('rhs_isac_ros.ros.early').join([name, *arguments])
+        importlib.import_module('rhs_isac_ros.ros.startup').join([name, *arguments])
     except RuntimeError:
         # Invalid ROS arguments, which the executable reports.
         return

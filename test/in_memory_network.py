@@ -14,8 +14,8 @@ import pytest
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.measurement import receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import complex_normal, draw_multipath
-from rhs_isac_ros.model.receive import receive_feeds, received_signal
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning import Estimate, ModelError
 from rhs_isac_ros.protocol import messages as m
@@ -403,8 +403,8 @@ class Network:
                 return BaseStation(scenario, self.settings, rng, self._receive, first)
             case 'user':
                 return user_role.User(
-                    self._mobilities[name],
-                    user_role.timeouts(step_s, self._beacon_timeout_s), self.instances[name])
+                    self._mobilities[name], step_s, self._beacon_timeout_s,
+                    self.instances[name])
             case 'rhs_controller':
                 return RhsController()
             case 'channel':
@@ -503,14 +503,14 @@ def example(scenario):
             elif field.type is str:
                 values[field.name] = ''
             elif field.type in (int, float):
-                low = meta.get('low', 0)
+                low = meta['declared'].low if 'declared' in meta else 0
                 values[field.name] = field.type(low if rng is None else rng.integers(1, 4))
         values |= given
         sizes |= kind.own_sizes(types.SimpleNamespace(**values), sizes)
         for field in fields:
             if 'dims' in field.metadata and field.name not in given:
                 shape = [sizes[d] if d in sizes else int(d) for d in field.metadata['dims']]
-                values[field.name] = np.zeros(shape, field.metadata['kind'])
+                values[field.name] = np.zeros(shape, field.metadata['declared'].kind)
                 if rng is not None:
                     values[field.name] += rng.random(shape)
         return kind(**values)

@@ -27,7 +27,8 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.processes import claim_domain
 
 # Set before rclpy reads them; the child processes inherit them.
@@ -137,9 +138,9 @@ class Watch:
         for kind, name in topics.NAMES.items():
             self.node.create_subscription(
                 convert.ros_type(kind), name,
-                lambda message, kind=kind: self._receive(kind, message), qos.EXCHANGE, raw=True)
+                lambda message, kind=kind: self._receive(kind, message), EXCHANGE, raw=True)
         self.node.create_subscription(
-            PoseWithCovarianceStamped, topics.POSITION, self.poses.append, qos.EXCHANGE)
+            PoseWithCovarianceStamped, topics.POSITION, self.poses.append, EXCHANGE)
 
     def _receive(self, kind, serialized):
         plain = convert.from_bytes(kind, serialized)
@@ -190,7 +191,7 @@ class Watch:
     def publisher(self, kind, n_others=1):
         """Return a publisher of a message once it has other subscribers than this observer."""
         publisher = self.node.create_publisher(
-            convert.ros_type(kind), topics.NAMES[kind], qos.EXCHANGE)
+            convert.ros_type(kind), topics.NAMES[kind], EXCHANGE)
         self.until(lambda: publisher.get_subscription_count() > n_others, 'the subscribers')
         return publisher
 

@@ -14,11 +14,11 @@ CONFIG = Path(__file__).parents[1] / 'config'
 SCENARIOS = ('table1', 'quick', 'wideband', 'bandplan', 'hall')
 FILES = ('multipath', 'channel')
 CODEBOOKS = {path.stem for path in CONFIG.glob('codebook*.yaml')}
-FIELDS = {field.name: field.metadata['unit'] for field in dataclasses.fields(Scenario)}
+FIELDS = {field.name: field.metadata['declared'].unit for field in dataclasses.fields(Scenario)}
 
 
-def test_every_file_is_a_scenario_or_a_codebook():
-    assert {path.stem for path in CONFIG.glob('*.yaml')} == {*SCENARIOS, *CODEBOOKS}
+def test_every_file_is_a_scenario_a_codebook_or_one_of_parameters():
+    assert {path.stem for path in CONFIG.glob('*.yaml')} == {*SCENARIOS, *CODEBOOKS, 'parameters'}
 
 
 def test_table1_equals_the_default_and_has_every_field():

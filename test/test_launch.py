@@ -128,7 +128,7 @@ def test_parameters_are_declared(composed):
         words = [''.join(part.text for part in word if hasattr(part, 'text')) for word in node.cmd]
         names = {word.partition(':=')[0] for flag, word in itertools.pairwise(words)
                  if flag == '-p'}
-        assert 'scenario_file' in names and names <= declared
+        assert {'scenario_file', 'use_sim_time'} <= names <= declared | {'use_sim_time'}
 
 
 @needs_launch
@@ -141,15 +141,18 @@ def test_an_invalid_argument_is_named(name, value):
 
 
 @needs_launch
-@pytest.mark.parametrize(('respawn', 'code', 'ends'), [
-    (False, 0, False), (False, 1, True), (False, -9, True), (True, -9, False), (True, 2, True)])
-def test_a_failure_ends_the_launch_unless_the_process_is_restarted(respawn, code, ends):
+@pytest.mark.parametrize(('respawn', 'is_optional', 'code', 'ends'), [
+    (False, False, 0, False), (False, False, 1, True), (False, False, -9, True),
+    (True, False, -9, False), (True, False, 2, True), (False, True, 1, False)])
+def test_a_failure_ends_the_launch_unless_the_process_is_restarted_or_optional(
+        respawn, is_optional, code, ends):
     from launch.events.process import ProcessExited
 
     from launch import LaunchContext
     event = ProcessExited(action=None, name='bs-8', cmd=[], cwd=None, env=None, pid=1,
                           returncode=code)
-    check = functools.partial(load_python_file()._end_if_failed, respawn, event, LaunchContext())
+    check = functools.partial(
+        load_python_file()._end_if_failed, respawn, is_optional, event, LaunchContext())
     if ends:
         with pytest.raises(RuntimeError, match=f'^bs-8 ended with exit code {code}$'):
             check()
@@ -196,7 +199,7 @@ def observer(monkeypatch):
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    from rhs_isac_ros.ros.observer import CycleObserver
+    from rhs_isac_ros.ros.recording import CycleObserver
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     node, executor = CycleObserver(context=context, namespace='/launched'), (

@@ -1,12 +1,17 @@
-"""package.xml lists every imported package, so that rosdep can install them."""
+"""package.xml lists every imported package, and all files state one version."""
 
 import ast
 import functools
+import os
+import re
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+
+import rhs_isac_ros
 
 ROOT = Path(__file__).parents[1]
 TREE = ElementTree.parse(ROOT / 'package.xml').getroot()
@@ -14,7 +19,8 @@ TREE = ElementTree.parse(ROOT / 'package.xml').getroot()
 # threadpoolctl has no key: the system's scikit-learn depends on it.
 KEYS = {
     'docutils': 'python3-sphinx', 'hypothesis': 'python3-hypothesis', 'joblib': 'python3-joblib',
-    'matplotlib': 'python3-matplotlib', 'numpy': 'python3-numpy', 'psutil': 'python3-psutil',
+    'matplotlib': 'python3-matplotlib', 'numpy': 'python3-numpy',
+    'packaging': 'python3-packaging', 'psutil': 'python3-psutil',
     'pytest': 'python3-pytest', 'rich': 'python3-rich', 'scipy': 'python3-scipy',
     'sklearn': 'python3-sklearn', 'sphinx': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn',
     'tqdm': 'python3-tqdm', 'yaml': 'python3-yaml',
@@ -89,3 +95,25 @@ def test_libraries_have_keys_that_rosdep_knows():
     libraries = {key for key in keys(*RUN, 'test_depend', 'doc_depend')
                  if key.startswith('python3-')}
     assert libraries <= set(KEYS.values())
+
+
+@pytest.mark.parametrize(('path', 'pattern'), [
+    ('package.xml', '<version>(.*)</version>'),
+    ('msg_defs/package.xml', '<version>(.*)</version>'), ('setup.py', "version='(.*)'"),
+    ('CITATION.cff', '^version: (.*)$'),
+    ('CHANGELOG.rst', r'^(\d[^ ]*) \(.*\)$'), ('msg_defs/CHANGELOG.rst', r'^(\d[^ ]*) \(.*\)$')])
+def test_all_files_state_one_version(path, pattern):
+    text = (ROOT / path).read_text(encoding='utf-8')
+    assert re.findall(pattern, text, re.MULTILINE)[0] == rhs_isac_ros.__version__
+
+
+@pytest.mark.parametrize(('variables', 'is_reported'), [
+    ({'COLCON': '1', 'AMENT_PREFIX_PATH': ''}, True),
+    ({'COLCON': '1', 'AMENT_PREFIX_PATH': '{}'}, False), ({}, False)])
+def test_a_build_without_the_messages_prints_the_missing_link(variables, is_reported, tmp_path):
+    (tmp_path / 'share' / 'rhs_isac_msgs').mkdir(parents=True)
+    environment = {name: value for name, value in os.environ.items() if name != 'COLCON'} | {
+        name: value.format(tmp_path) for name, value in variables.items()}
+    done = subprocess.run([sys.executable, 'setup.py', '--version'], cwd=ROOT, env=environment,
+                          capture_output=True, text=True, check=True)
+    assert ('ln -s rhs_isac_ros/msg_defs rhs_isac_msgs' in done.stderr) == is_reported

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from rhs_isac_ros.codebook import Codebook
 
@@ -27,10 +28,11 @@ def test_the_library_example_runs(monkeypatch, capsys, tmp_path):
     assert np.isfinite(variables['fix'].mean).all()
 
 
-def test_links_lead_to_files():
-    targets = re.findall(r'\]\(([^)#]+)\)', README)
+@pytest.mark.parametrize('page', ['README.md', 'QUALITY_DECLARATION.md'])
+def test_links_lead_to_files(page):
+    targets = re.findall(r'\]\(([^)#:]+)[^):]*\)', (ROOT / page).read_text(encoding='utf-8'))
     assert len(targets) > 10
-    assert not [target for target in targets if not (ROOT / target).is_file()]
+    assert not [target for target in targets if not (ROOT / target).exists()]
 
 
 def test_commands_exist():

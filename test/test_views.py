@@ -24,11 +24,12 @@ def published():
     from nav_msgs.msg import Path as PathMessage
     from visualization_msgs.msg import MarkerArray
 
-    from rhs_isac_ros.ros import qos, topics
+    from rhs_isac_ros.ros import topics
+    from rhs_isac_ros.ros.endpoints import EXCHANGE
     from rhs_isac_ros.ros.recording import recorded_topics, type_name
-    found = recorded_topics() | {topics.MARKERS: (MarkerArray, qos.EXCHANGE)}
+    found = recorded_topics() | {topics.MARKERS: (MarkerArray, EXCHANGE)}
     for name in (topics.PATH, topics.TRUE_PATH):
-        found |= {name.format(user=user): (PathMessage, qos.EXCHANGE) for user in range(1, 5)}
+        found |= {name.format(user=user): (PathMessage, EXCHANGE) for user in range(1, 5)}
     found = {name.lstrip('/'): entry for name, entry in found.items()}
     return lambda name: (found[name][0], type_name(found[name][0]), found[name][1])
 
@@ -66,21 +67,21 @@ def test_rviz_lists_the_namespaces_of_all_markers(rviz, small):
 
     from rhs_isac_ros.link import beam_pattern, steer
     from rhs_isac_ros.protocol import messages as m
-    from rhs_isac_ros.ros import markers
+    from rhs_isac_ros.ros import scene
     scenario, position, stamp = small.scenario, np.array([9.0, 1.0, 0.0]), Time()
-    scene = [
-        markers.board(scenario, None, stamp), markers.region(scenario, stamp),
-        markers.truth(m.GroundTruth(cycle_id=0, user=1, position=position, velocity=np.zeros(3)),
+    shown = [
+        scene.board(scenario, None, stamp), scene.region(scenario, stamp),
+        scene.truth(m.GroundTruth(cycle_id=0, user=1, position=position, velocity=np.zeros(3)),
             stamp),
-        markers.estimate(m.PositionEstimate(
+        scene.estimate(m.PositionEstimate(
             cycle_id=1, user=1, codebook_id='cb', position=position, covariance_m2=np.eye(3),
-                crlb_m2=0.1, estimator='bayes', latency_s=0.01), stamp),
-        markers.beam(beam_pattern(scenario, steer(scenario, position), 10.0), 1, stamp)]
+            crlb_m2=0.1, estimator='bayes', latency_s=0.01), stamp),
+        scene.beam(beam_pattern(scenario, steer(scenario, position), 10.0), 1, stamp)]
     (display,) = [one for one in rviz['Displays'] if one['Class'].endswith('/MarkerArray')]
-    assert set(display['Namespaces']) == {marker.ns for marker in scene}
+    assert set(display['Namespaces']) == {marker.ns for marker in shown}
     # The list of the scene is complete: no other function of the module makes a marker.
-    makers = {name for name, function in vars(markers).items() if not name.startswith('_')
-              and getattr(function, '__annotations__', {}).get('return') is markers.Marker}
+    makers = {name for name, function in vars(scene).items() if not name.startswith('_')
+              and getattr(function, '__annotations__', {}).get('return') is scene.Marker}
     assert makers == {'board', 'region', 'truth', 'estimate', 'beam', 'deletion', 'place'}
 
 

@@ -6,7 +6,7 @@ import sys
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Send
-from rhs_isac_ros.protocol.role import NewestDict, PlainRole
+from rhs_isac_ros.protocol.role import NewestDict, Role
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -14,7 +14,7 @@ from rhs_isac_ros.ros.run import entry
 _MAX_PENDING = 256
 
 
-class Radio(PlainRole):
+class Radio(Role):
     """Answers the pilots of a band with the signals that the receivers at the feeds measure.
 
     `measure` takes a band, its configurations [F, N_E] and the pilots. In each frame, it

@@ -146,7 +146,7 @@ def _text(x: float, y: float, text: str, anchor: str = 'start', kind: str = '') 
             '</text>')
 
 
-ROLES: Mapping[str, type[StateMachine[Any]]] = {
+ROLES: Mapping[str, type[StateMachine]] = {
     name: member.role for name, member in ROSTER.items() if hasattr(member.role, 'TABLE')}
 HEAD = ('state', 'event', 'guard', 'next state', 'actions', 'counts')
 
@@ -169,12 +169,12 @@ def rows(role: str) -> list[tuple[str, ...]]:
     """Return the table of a role as text, with the columns of `HEAD`; empty cells mean none."""
     return [(_source(row, ROLES[role].STATES), row.event.__name__, _guard(row),
              'the same' if row.target is SAME else row.target.value,
-             ', '.join(action.__name__ for action in row.actions),
+             ', '.join(action.__name__.lstrip('_') for action in row.actions),
              row.outcome.value if row.outcome else '')
             for row in ROLES[role].TABLE]
 
 
-def _source(row: Transition[Any, Any, Any], states: type[enum.Enum]) -> str:
+def _source(row: Transition[Any, Any], states: type[enum.Enum]) -> str:
     if row.source is ANY:
         return 'any'
     others = [state for state in states if state not in row.source]
@@ -183,11 +183,11 @@ def _source(row: Transition[Any, Any, Any], states: type[enum.Enum]) -> str:
     return ', '.join(state.value for state in row.source)
 
 
-def _guard(row: Transition[Any, Any, Any]) -> str:
-    return '' if row.guard is always else row.guard.__name__
+def _guard(row: Transition[Any, Any]) -> str:
+    return '' if row.guard is always else row.guard.__name__.lstrip('_')
 
 
-def _label(row: Transition[Any, Any, Any]) -> str:
+def _label(row: Transition[Any, Any]) -> str:
     guard = _guard(row)
     return f'{row.event.__name__} [{guard}]' if guard else row.event.__name__
 

@@ -51,9 +51,7 @@ def parameter_table():
             owners.setdefault(parameter.name, (parameter, []))[1].append(executable)
     rows = []
     for name, (parameter, nodes_) in owners.items():
-        default = str(parameter.default).lower() if parameter.kind == 'bool' else (
-            parameter.default if parameter.default not in ('', []) else 'empty')
-        rows.append((code(name), parameter.kind, default, parameter.range,
+        rows.append((code(name), parameter.type, parameter.default_text, parameter.range,
                      'yes' if parameter.dynamic else '', ', '.join(nodes_), parameter.text))
     return table(('parameter', 'type', 'default', 'range', 'dynamic', 'nodes', 'description'),
                  rows, '18 8 9 14 8 15 28')
@@ -63,11 +61,11 @@ def scenario_table(kind):
     """Return a table of the scenario fields of `Table1` or `Extensions`."""
     rows = []
     for field in dataclasses.fields({'table1': Table1, 'extensions': Extensions}[kind]):
-        declared = field.metadata
+        declared, source = field.metadata['declared'], field.metadata['source']
         default = list(field.default) if isinstance(field.default, tuple) else field.default
-        source = f' Source: {declared["source"]}.' if declared['source'] else ''
-        rows.append((code(field.name), declared['unit'], 'null' if default is None else default,
-                     f'{declared["low"]:g} to {declared["high"]:g}', declared['text'] + source))
+        source = f' Source: {source}.' if source else ''
+        rows.append((code(field.name), declared.unit, 'null' if default is None else default,
+                     f'{declared.low:g} to {declared.high:g}', declared.text + source))
     return table(('field', 'unit', 'default', 'range', 'meaning'), rows, '22 7 11 14 46')
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Scenario, mobility
-from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user
@@ -63,7 +63,7 @@ def cycle():
     codebook = random_codebook(scenario, np.random.default_rng(0))
     roles = {
         'user': user.User(
-            {1: mobility.Static(scenario.roi_center_m)}, user.timeouts(1.0, 3.0)),
+            {1: mobility.Static(scenario.roi_center_m)}, step_s=1.0, beacon_s=3.0),
         'channel': Channel(scenario, 0),
         'rhs_controller': RhsController(), 'transmission': Transmission(scenario),
         'positioner': Positioner(scenario, lambda: 0.0),

@@ -9,7 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form, region_information
+from rhs_isac_ros.bounds.fisher import (
+    inverse_information,
+    quadratic_form,
+    region_information,
+    without_nuisance,
+)
 from rhs_isac_ros.bounds.rows import (
     PLAIN,
     Evaluation,
@@ -21,21 +26,21 @@ from rhs_isac_ros.bounds.rows import (
     rows_within,
 )
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.gaussian import marginalise
-from rhs_isac_ros.model.impairments import AppliedBeams, nuisance_of
-from rhs_isac_ros.model.impairments.elements import (
+from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.elements import (
+    SurfaceEstimate,
     element_correlation,
     error_radiation,
     error_terms,
 )
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions, los_and_derivative
 from rhs_isac_ros.model.multipath import (
     coupling,
     declared_covariance,
     measurement_correlation,
 )
-from rhs_isac_ros.model.surface import Beamforming, onboard_matrix
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights, onboard_matrix
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Callable that takes a block of n items and their forms, float64 [n, G, G], and returns the losses
@@ -44,14 +49,9 @@ Loss = Callable[[slice, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Gradient(NamedTuple):
-    """An average with its gradients.
+    """An average with its gradients: d/dC, float64 [N_B, F, N_E], and the one by S.
 
-    Attributes
-    ----------
-    by_analog
-        Derivative with respect to C, float64 [N_B, F, N_E].
-    by_digital
-        d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K].
+    The latter is d/dRe(S) + i d/dIm(S), complex128 [N_B, N_SB, F, K].
     """
 
     value: float
@@ -60,21 +60,14 @@ class Gradient(NamedTuple):
 
 
 class Combination(NamedTuple):
-    """Rows of a quadratic form, each a multiple of one of the rows of the source.
+    """Rows of a quadratic form, each a multiple of one of the rows of the source."""
 
-    Attributes
-    ----------
-    sources
-        Index of the source's row, int [G].
-    scale
-        Factor of the row in each band, complex128 [N_B, G].
-    """
-
+    # Index of the source's row [G], and factor of the row in each band, complex128 [N_B, G].
     sources: np.ndarray
     scale: np.ndarray
 
     def forward(self, band: int, whitened: np.ndarray) -> np.ndarray:
-        """Return the rows, complex128 [n, G, R], from those of the source, [n, S, R]."""
+        """Return the rows, complex128 [n, G, R], from the source's rows, [n, S, R]."""
         return whitened[:, self.sources] * self.scale[band, :, None]
 
     def backward(self, band: int, weighted: np.ndarray, n_rows: int) -> np.ndarray:
@@ -95,23 +88,19 @@ class Average:
     Parameters
     ----------
     tolerance
-        Relative error of the rows, see `CompressedRows`; 0 selects exact ones.
+        Relative error of the rows, see `CompressedRows`; 0 selects exact ones. A tolerance that
+        is too small raises ValueError.
     patterns
         Factors of the rows' means.
     combination
-        The form's rows, if they are not those of the source.
+        The form's rows, if they differ from the source's.
     tick
         Called repeatedly while the rows are computed; an exception ends the computation.
 
     Attributes
     ----------
     surface
-        An estimate of the surface that is taken as exact; None for that of the scenario.
-
-    Raises
-    ------
-    ValueError
-        If the tolerance is neither 0 nor large enough.
+        An estimate of the surface that is taken as exact; None for the scenario's elements.
     """
 
     @one_blas_thread
@@ -134,10 +123,10 @@ class Average:
     def __call__(self, codebook: Beamforming) -> Gradient:
         """Compute the average and its gradients."""
         model = self._model(codebook)
-        evaluation = self.rows.begin(model)
+        evaluation = Evaluation(self.rows, model)
         bands = range(self.scenario.n_bands)
         total = 0.0
-        for block in self._blocks():
+        for block in blocks(self.rows.n_items, self._n_rows, self.rows.width):
             whitened = self._whitened(evaluation, block)
             losses, weights = self._loss(block, _sum_of_forms(whitened))
             total += float(losses.sum())
@@ -154,12 +143,9 @@ class Average:
 
     def _losses(self, codebook: Beamforming) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Results of the loss for each block."""
-        evaluation = self.rows.begin(self._model(codebook))
-        for block in self._blocks():
+        evaluation = Evaluation(self.rows, self._model(codebook))
+        for block in blocks(self.rows.n_items, self._n_rows, self.rows.width):
             yield self._loss(block, _sum_of_forms(self._whitened(evaluation, block)))
-
-    def _blocks(self) -> Iterator[slice]:
-        return blocks(self.rows.n_items, self._n_rows, self.rows.width)
 
     def _model(self, codebook: Beamforming) -> MeasurementModel:
         exact = self.surface.without_errors() if self.surface else None
@@ -177,8 +163,8 @@ def average_crlb(
         scenario: Scenario, codebook: Beamforming, positions: np.ndarray) -> Gradient:
     """Compute the average bound, Eq. (17), with its gradients by Propositions 2 and 3.
 
-    Takes positions of the user, float64 [N, 3] [m]. The value is in m^2, as is the derivative
-    with respect to C; that with respect to S is in m^2/sqrt(W).
+    Takes at least one position of the user, float64 [N, 3] [m]. The value is in m^2, as is the
+    derivative with respect to C; that with respect to S is in m^2/sqrt(W).
 
     Raises
     ------
@@ -191,20 +177,8 @@ def average_crlb(
 class AverageCrlb(Average):
     """Average bound at fixed positions, float64 [N, 3] [m], for evaluation with many codebooks.
 
-    Nuisance parameters and errors of the elements are taken into account as `crlb` does.
-
-    Parameters
-    ----------
-    tolerance
-        Relative error of the rows, see `CompressedRows`; 0 selects exact ones.
-    region_prior
-        Whether to add the information of the region of interest, as `crlb` does.
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array or holds no position, or the tolerance is
-        neither 0 nor large enough.
+    Nuisance parameters, errors of the elements and `region_prior` enter as in `crlb`, and
+    `tolerance` and `tick` as in `Average`.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,
@@ -220,35 +194,29 @@ class AverageCrlb(Average):
             return np.concatenate([derivative, *[gain[:, None]] * len(patterns)], axis=1)
 
         super().__init__(
-            scenario, source, len(self.positions), 3 + len(patterns),
-            self._marginal_trace if combination else self._trace_of_inverse,
-            tolerance, patterns or PLAIN, combination, tick)
+            scenario, source, len(self.positions), 3 + len(patterns), self._bounds, tolerance,
+            patterns or PLAIN, combination, tick)
 
-    def _trace_of_inverse(
-            self, block: slice, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Trace of the inverse [n] and its negative derivative [n, 3, 3]."""
+    def _bounds(self, _: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds [n] and their negative derivatives with respect to the forms."""
+        information, regression = without_nuisance(joint)
         inverse = inverse_information(information + self._prior)
         values = np.trace(inverse, axis1=1, axis2=2)
         # Where the signals do not determine the position, the value is infinite and the slope
         # zero.
         finite = np.where(np.isfinite(values)[:, None, None], inverse, 0.0)
-        return values, np.matmul(finite, finite)
-
-    def _marginal_trace(
-            self, block: slice, joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Trace of the bound [n] and its negative derivative [n, 3 + Q, 3 + Q]."""
-        prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
-        marginal = marginalise(joint + prior, np.zeros(joint.shape[:2]))
-        values, by_marginal = self._trace_of_inverse(block, marginal.information)
+        slopes = np.matmul(finite, finite)
+        if not regression.shape[1]:
+            return values, slopes
         # The Schur complement is W^T J W with W = [I; regression] held fixed, because W minimises
         # it.
         identity = np.broadcast_to(np.eye(3), (len(joint), 3, 3))
-        whole = np.concatenate([identity, marginal.regression], axis=1)
-        return values, whole @ by_marginal @ np.swapaxes(whole, 1, 2)
+        whole = np.concatenate([identity, regression], axis=1)
+        return values, whole @ slopes @ np.swapaxes(whole, 1, 2)
 
 
 def _structure(scenario: Scenario) -> tuple[list[Pattern], Combination | None]:
-    """Rows of position and nuisance parameters from those of the derivative and of the gain.
+    """Rows of position and nuisance parameters from rows of the derivative and of the gain.
 
     A parameter whose pattern is constant in each band multiplies the row of the gain; any other
     one has a row of its own. Without parameters, the derivative is sufficient.
@@ -278,7 +246,7 @@ def _weighted(weights: np.ndarray, whitened: np.ndarray) -> np.ndarray:
     parts = whitened.view(whitened.real.dtype)
     weights = weights.astype(parts.dtype, copy=False)
     # Products of single rows take many times as long as one product of arrays.
-    product: np.ndarray = weights * parts if parts.shape[1] == 1 else np.matmul(weights, parts)
+    product = weights * parts if parts.shape[1] == 1 else np.matmul(weights, parts)
     return product.view(whitened.dtype)
 
 
@@ -286,11 +254,10 @@ def quadratic_gradients(
         model: MeasurementModel, codebook: Beamforming, mean_terms: np.ndarray,
         covariance_terms: np.ndarray, n_items: int, surface: SurfaceEstimate | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the gradients of an average from the sums of `GradientSums` over n items.
+    """Compute the gradients of an average, as in `Gradient`, from the sums over n items.
 
-    The sums are those of all bands, complex128 [N_B, N_SB F, N_E] and [N_B, N_SB F, N_SB F].
-    Returns the gradients with respect to C and S, in the form of `Gradient`. An estimate of the
-    surface is taken as exact.
+    The sums are `GradientSums` of all bands, complex128 [N_B, N_SB F, N_E] and
+    [N_B, N_SB F, N_SB F]. An estimate of the surface is taken as exact.
     """
     scenario = model.scenario
     correlation = np.conj(measurement_correlation(scenario))
@@ -345,7 +312,7 @@ def gradient_analog(
     The paper writes the chain rule for every pair of coordinates. Here, the pairs have already
     been summed in the derivative with respect to T_i.
     """
-    weights = np.matmul(codebook.digital, onboard_matrix(scenario))
+    weights = feed_weights(scenario, codebook)
     by_radiation = by_radiation.reshape(weights.shape)
     return np.einsum('ijqm,ijqm->iqm', np.conj(by_radiation), weights).real
 
@@ -357,4 +324,4 @@ def gradient_digital(
     n_bands, n_subbands, _, n_elements = onboard.shape
     by_radiation = by_radiation.reshape(n_bands, n_subbands, -1, n_elements)
     weighted = by_radiation * codebook.analog[:, None]
-    return np.matmul(weighted, np.conj(np.swapaxes(onboard, 2, 3)))
+    return np.matmul(weighted, adjoint(onboard))

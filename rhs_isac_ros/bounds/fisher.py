@@ -25,7 +25,7 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
     Takes positions of the user, float64 [N, 3] [m]. Returns float64 [N] [m^2]; infinite where
     the signals do not determine the position. Nuisance parameters that the scenario declares are
     unknown, with their distributions as priors: the result is then the hybrid bound. Errors of
-    the elements enter with their covariance averaged over the region.
+    the elements enter with their covariance, averaged over the region.
 
     Parameters
     ----------
@@ -45,37 +45,29 @@ def crlb(scenario: Scenario, codebook: Beamforming, positions: np.ndarray, *,
 def crlb_of(model: MeasurementModel, positions: np.ndarray, *,
             region_prior: bool = False) -> np.ndarray:
     """Compute `crlb` for a model, whose whitener is shared by all calls."""
-    information = position_information_of(model, positions)
+    information, _ = without_nuisance(joint_information_of(model, positions))
     if region_prior:
         information = information + region_information(model.scenario)
     return np.trace(inverse_information(information), axis1=1, axis2=2)
 
 
-def position_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
-    """Compute the information about the position with unknown nuisance parameters.
+def without_nuisance(joint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the information about the position that remains with unknown nuisance parameters.
 
-    Without nuisance parameters, this is `fisher_information_of`. Returns float64 [N, 3, 3]
-    [1/m^2].
+    Takes the result of `joint_information_of`, float64 [N, 3 + Q, 3 + Q]. Returns float64
+    [N, 3, 3] [1/m^2], and how the parameters change with the position, [N, Q, 3].
     """
-    if not len(nuisance_of(model.scenario)):
-        return fisher_information_of(model, positions)
-    return marginal_information(joint_information_of(model, positions))
-
-
-def marginal_information(joint: np.ndarray) -> np.ndarray:
-    """Compute the information about the position that remains without the nuisance parameters.
-
-    Takes the joint information of position and scaled nuisance parameters, whose prior
-    information is the identity matrix, float64 [N, 3 + Q, 3 + Q]. Returns float64 [N, 3, 3].
-    """
+    if joint.shape[1] == 3:
+        return joint, np.empty((len(joint), 0, 3))
     prior = np.diag(np.repeat([0.0, 1.0], [3, joint.shape[1] - 3]))
-    return marginalise(joint + prior, np.zeros(joint.shape[:2])).information
+    marginal = marginalise(joint + prior, np.zeros(joint.shape[:2]))
+    return marginal.information, marginal.regression
 
 
 def region_information(scenario: Scenario) -> np.ndarray:
-    """Return the information of the region of interest as a prior, float64 [3, 3] [1/m^2].
+    """Return the information of a Gaussian as wide as the region, float64 [3, 3] [1/m^2].
 
-    The uniform distribution is replaced by a Gaussian of the same covariance, size^2 / 12.
+    Its covariance is that of the uniform distribution, size^2 / 12.
     """
     shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
     return np.diag(12 / np.maximum(scenario.roi_size_m, _NO_EXTENT * shortest)**2)
@@ -107,7 +99,7 @@ def inverse_information(information: np.ndarray) -> np.ndarray:
     root[:, 2, 0], root[:, 2, 1], root[:, 2, 2] = first * second - third, -second, 1.0
     root[:, 1] /= np.sqrt(pivot)[:, None]
     root[:, 2] /= np.sqrt(last)[:, None]
-    inverse: np.ndarray = np.matmul(np.swapaxes(root, 1, 2), root) / scale
+    inverse = np.matmul(np.swapaxes(root, 1, 2), root) / scale
     inverse[~regular] = np.diag([np.inf] * 3)
     return inverse
 
@@ -118,11 +110,6 @@ def fisher_information(
     """Implements Eq. (12). Fisher information of the received signals about the position.
 
     Takes positions of the user, float64 [N, 3] [m]. Returns I_FIM, float64 [N, 3, 3] [1/m^2].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array.
     """
     return fisher_information_of(MeasurementModel(scenario, codebook), positions)
 
@@ -135,8 +122,8 @@ def fisher_information_of(model: MeasurementModel, positions: np.ndarray) -> np.
 def joint_information_of(model: MeasurementModel, positions: np.ndarray) -> np.ndarray:
     """Compute the information about position and nuisance parameters, without any prior.
 
-    Returns float64 [N, 3 + Q, 3 + Q]; nuisance parameters are scaled so that their prior is
-    standard normal, and units do not matter.
+    Returns float64 [N, 3 + Q, 3 + Q]; the nuisance parameters are scaled to a standard normal
+    prior.
     """
     return _information(model, positions, nuisance_of(model.scenario).scaled_patterns)
 
@@ -146,12 +133,11 @@ def _information(
     """Information about the position and the Q parameters of patterns [Q, N_B, N_SB F]."""
     positions = checked_positions(positions)
     information = np.zeros((len(positions), *[3 + len(patterns)] * 2))
-    whiteners = model.whitener
 
     def fill(block: slice) -> None:
         if len(patterns):
             directions = patterns * model.mean(positions[block])[:, None]
-        for band, whitener in enumerate(whiteners):
+        for band, whitener in enumerate(model.whitener):
             rows = model.band_jacobian(positions[block], band)
             if len(patterns):
                 rows = np.concatenate([rows, directions[:, :, band]], axis=1)
@@ -162,11 +148,9 @@ def _information(
 
 
 def quadratic_form(whitened: np.ndarray) -> np.ndarray:
-    """Compute 2 Re(D^H Lambda^-1 D) of one band, float64 [N, G, G].
+    """Compute 2 Re(D^H Lambda^-1 D) of one band, float64 [N, G, G], as in Eq. (12).
 
-    If D is the derivative of the mean [1/m], with G = 3, this is the term of one band in Eq. (12)
-    [1/m^2]. `whitened` is the transpose of L^-1 D, complex128 [N, G, N_SB F], where
-    L L^H = Lambda.
+    Takes the transpose of L^-1 D, complex128 [N, G, N_SB F], where L L^H = Lambda.
     """
     # Re(a^H b) is the inner product of real and imaginary parts.
     parts = np.ascontiguousarray(whitened).view(whitened.real.dtype)

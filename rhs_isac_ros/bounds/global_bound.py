@@ -22,6 +22,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import fisher_information_of
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import Beamforming
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -51,8 +52,6 @@ class GlobalBound(NamedTuple):
     ----------
     value, standard_error
         The bound and the standard error of its Monte-Carlo average [m^2].
-    range_part
-        Part of the value that is an error of the range [m^2].
     positions
         Positions of the phases that were drawn, float64 [n, 3] [m].
     squared_errors
@@ -64,7 +63,6 @@ class GlobalBound(NamedTuple):
 
     value: float
     standard_error: float
-    range_part: float
     positions: np.ndarray
     squared_errors: np.ndarray
     coarseness: float
@@ -76,13 +74,8 @@ def global_bound(
         n_phases: int = 2048) -> GlobalBound:
     """Compute the bound from the posterior of `n_phases` random positioning phases.
 
-    Nuisance parameters of the scenario are not included: the bound is that of a user who is
-    synchronised.
-
-    Raises
-    ------
-    ValueError
-        If `n_phases` is less than 2.
+    Nuisance parameters of the scenario are not included: the bound holds for a user who is
+    synchronised. Raises ValueError if `n_phases` is less than 2.
     """
     if n_phases < 2:
         raise ValueError(f'n_phases: {n_phases}, expected at least 2')
@@ -98,7 +91,7 @@ def global_bound(
     variances = moments[:, 3]
     return GlobalBound(
         float(variances.mean()), float(variances.std(ddof=1) / np.sqrt(n_phases)),
-        float(moments[:, 4].mean()), moments[:, :3], moments[:, 5], coarseness)
+        moments[:, :3], moments[:, 4], coarseness)
 
 
 class _Lattice:
@@ -133,7 +126,7 @@ class _Lattice:
         sight, inside = sight[used], inside[used]
         self._sight, self._ranges = sight, ranges
         with np.errstate(divide='ignore'):
-            # The density of (r, u, v) is that of the position times r^2 / w.
+            # The density of (r, u, v) is the density of the position times r^2 / w.
             self._prior = np.log(np.where(inside, ranges**2 / thickness / sight[:, :1], 0.0))
         self._interpolate(sight, ranges, box[:, 0])
 
@@ -168,8 +161,7 @@ class _Lattice:
     def phases(self, n: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
         """Draw true points and signals.
 
-        Yields for each the position [3], the variance of the posterior, that of the range, and the
-        squared error.
+        Yields for each the position [3], the variance of the posterior and the squared error.
         """
         model = self._model
         # Systematic sampling spreads the points evenly over the region.
@@ -180,8 +172,7 @@ class _Lattice:
         signals = model.whiten(model.mean(truth))
         noise = rng.standard_normal((2, *signals.shape)) / np.sqrt(2)
         signals += noise[0] + 1j * noise[1]
-        for first in range(0, n, _BLOCK):
-            block = slice(first, first + _BLOCK)
+        for block in blocks(n, _BLOCK):
             for products, ray, index in zip(
                     self._products(signals[block]), rays[block], ranges[block], strict=True):
                 yield self._moments(products, ray, index)
@@ -207,12 +198,12 @@ class _Lattice:
         values = values[chosen, at].astype(float)
         weights = np.exp(values - values.max())
         weights /= weights.sum()
-        truth, ranges = self._sight[ray] * self._ranges[index], self._ranges[at]
-        offsets = (self._sight[rays[chosen]] * ranges[:, None] - truth) * self._extends
+        truth = self._sight[ray] * self._ranges[index]
+        places = self._sight[rays[chosen]] * self._ranges[at, None]
+        offsets = (places - truth) * self._extends
         mean = weights @ offsets
         return np.array([
-            *truth, weights @ np.sum((offsets - mean)**2, axis=1),
-            weights @ (ranges - weights @ ranges)**2, mean @ mean])
+            *truth, weights @ np.sum((offsets - mean)**2, axis=1), mean @ mean])
 
 
 def _weights(nodes: np.ndarray, angles: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -256,7 +247,7 @@ def _steps(model: MeasurementModel, rng: np.random.Generator) -> tuple[np.ndarra
     diagonal = np.einsum('nap,nab,nbp->np', slopes, information, slopes).mean(axis=0)
     low, high = _polar_box(model.scenario)
     extent = high - low
-    steps: np.ndarray = np.minimum(
+    steps = np.minimum(
         _STEPS / np.sqrt(np.maximum(diagonal, 1e-30)),
         np.where(extent > 0, extent / _MIN_STEPS, np.inf))
     n_points = np.prod(np.maximum(extent / steps, 1.0))

@@ -16,6 +16,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import inverse_information
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
@@ -46,7 +47,7 @@ class Misspecified(NamedTuple):
     bias
         Pseudo-true less true position, float64 [N, 3] [m].
     covariance
-        Of the errors about the pseudo-true position, float64 [N, 3, 3] [m^2].
+        Covariance of the errors about the pseudo-true position, float64 [N, 3, 3] [m^2].
     valid
         Whether the result describes the estimator: ambiguities of the range are improbable, the
         mean is linear over the errors, the border of the region is far away, and estimators
@@ -68,13 +69,8 @@ def misspecified(assumed: Scenario, true: Scenario, codebook: Beamforming,
                  positions: np.ndarray) -> Misspecified:
     """Compute the errors of an estimator that assumes one scenario while another one is true.
 
-    Takes positions of the user, float64 [N, 3] [m].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array, the sizes of the scenarios differ, or one of
-        them declares nuisance parameters, such as phases, which are not included.
+    Takes positions of the user, float64 [N, 3] [m], and scenarios of equal sizes without nuisance
+    parameters, such as phases; raises ValueError for others.
     """
     return misspecified_of(
         MeasurementModel(assumed, codebook), MeasurementModel(true, codebook), positions)
@@ -94,11 +90,10 @@ def misspecified_of(assumed: MeasurementModel, true: MeasurementModel, positions
     places = _pseudo_true(assumed, positions, target)
     slopes, residual = _slopes(assumed, places), target - assumed.whiten(assumed.mean(places))
     # L^-1 of the assumed model turns the true covariance into W Lambda W^H.
-    white = np.matmul(assumed.whitener @ true.covariance(),
-                      np.conj(np.swapaxes(assumed.whitener, 1, 2)))
+    white = np.matmul(assumed.whitener @ true.covariance(), adjoint(assumed.whitener))
     gradients = 2 * np.einsum('nair,irs,nbis->nab', slopes.conj(), white, slopes,
                               optimize=True).real
-    curvature = 2 * np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
+    curvature = 2 * _products(slopes)
     curvature -= _bending(assumed, places, residual)
     inverse = inverse_information(curvature)
     covariance = inverse @ gradients @ inverse
@@ -115,19 +110,28 @@ def _slopes(model: MeasurementModel, places: np.ndarray) -> np.ndarray:
     return model.whiten(model.jacobian(places))
 
 
+def _products(slopes: np.ndarray) -> np.ndarray:
+    """Real inner products of derivatives, float64 [N, 3, 3]."""
+    return np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
+
+
+def _projections(slopes: np.ndarray, signals: np.ndarray) -> np.ndarray:
+    """Real inner products of derivatives and signals, float64 [N, 3]."""
+    return np.einsum('nair,nir->na', slopes.conj(), signals).real
+
+
 def _pseudo_true(model: MeasurementModel, positions: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Minimise the distance of the whitened mean from a target by damped Gauss-Newton steps."""
     def cost(places: np.ndarray) -> np.ndarray:
         distances = np.abs(target - model.whiten(model.mean(places)))**2
         return np.sum(distances, axis=(1, 2))
 
-    places: np.ndarray = positions.copy()
+    places = positions.copy()
     costs = cost(positions)
     for _ in range(_MAX_STEPS):
         slopes = _slopes(model, places)
-        residual = target - model.whiten(model.mean(places))
-        information = np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
-        gradient = np.einsum('nair,nir->na', slopes.conj(), residual).real
+        information = _products(slopes)
+        gradient = _projections(slopes, target - model.whiten(model.mean(places)))
         ridge = 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = np.linalg.solve(information + ridge, gradient[..., None])[..., 0]
         for _ in range(_HALVINGS):
@@ -152,7 +156,7 @@ def _bending(model: MeasurementModel, places: np.ndarray, residual: np.ndarray) 
         step = _DIFFERENCE_M * np.eye(3)[axis]
         second = (_slopes(model, places + step) - _slopes(model, places - step)) / (
             2 * _DIFFERENCE_M)
-        bending[:, axis] = 2 * np.einsum('nair,nir->na', second.conj(), residual).real
+        bending[:, axis] = 2 * _projections(second, residual)
     return (bending + np.swapaxes(bending, 1, 2)) / 2
 
 
@@ -163,7 +167,7 @@ def _is_valid(model: MeasurementModel, places: np.ndarray, bias: np.ndarray,
 
     low, high = model.scenario.roi_bounds_m
     reach = _MIN_BORDER * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    valid: np.ndarray = ((places - reach >= low) & (places + reach <= high)).all(axis=1)
+    valid = ((places - reach >= low) & (places + reach <= high)).all(axis=1)
     energy = np.trace(white, axis1=1, axis2=2).real.sum() + np.sum(
         np.abs(residual)**2, axis=(1, 2))
     spread = np.sum(np.abs(white)**2) + 2 * np.einsum(
@@ -191,8 +195,8 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                  residual: np.ndarray, white: np.ndarray, covariance: np.ndarray) -> float:
     """Bound the squared error from other ranges of the same direction [m^2].
 
-    It is the sum over maxima of the probability that a range is more likely than the true one,
-    times the squared distance.
+    The bound is the sum over maxima of the probability that a range is more likely than the true
+    one, times the squared distance.
     """
     from scipy.special import ndtr
 
@@ -206,10 +210,8 @@ def _ambiguities(model: MeasurementModel, place: np.ndarray, mean: np.ndarray,
                      & (points[:, None] * direction <= high)).all(axis=1)]
     means, slopes = model.mean_and_jacobian(points[:, None] * direction, whitened=True)
     # The maximum of an ambiguity is beside the ray.
-    away = mean + residual - means
-    information = np.einsum('nair,nbir->nab', slopes.conj(), slopes).real
-    information += np.diag([_MAX_OFFSET_M**-2] * 3)
-    gradient = np.einsum('nair,nir->na', slopes.conj(), away).real
+    information = _products(slopes) + np.diag([_MAX_OFFSET_M**-2] * 3)
+    gradient = _projections(slopes, mean + residual - means)
     offset = np.linalg.solve(information, gradient[..., None])[..., 0]
     difference = means + np.einsum('na,nair->nir', offset, slopes) - mean
     excess = np.sum(np.abs(difference)**2, axis=(1, 2)) - 2 * np.einsum(

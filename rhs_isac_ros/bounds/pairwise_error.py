@@ -2,8 +2,8 @@
 
 The phases of the bands may be unknown: theta = A z, with standard normal z. The distance of two
 signals is then the smallest over z of ``sum_i 2 |a_i exp(i theta_i) - b_i|^2 + |z|^2``. For small
-deviations it is what the marginalisation of the Fisher information leaves; for large ones it
-vanishes if the signals differ in the phases of their bands alone.
+deviations it agrees with the marginal Fisher information; for large ones it vanishes if the
+signals differ in the phases of their bands alone.
 """
 
 import copy
@@ -30,9 +30,9 @@ class PairwiseErrorCost(Average):
     A maximum-likelihood decision between two positions is wrong with probability Q(sqrt(q / 2)),
     where q = sum_i dmu_i^H Lambda_i^-1 dmu_i and dmu is the difference of the mean signals. The
     cost is the average of ``|p - p'|^2 Q(sqrt(q / 2))``, in m^2 like the bound. The quadratic
-    form is that of Eq. (12), with the difference h(p) - h(p') instead of the derivative. If the
-    scenario declares phases as unknown, the form is the smallest over the phases; other nuisance
-    parameters are not included.
+    form has the difference h(p) - h(p') in place of the derivative in Eq. (12). If the scenario
+    declares phases as unknown, the form is the smallest over the phases; other nuisance parameters
+    are not included.
 
     Parameters
     ----------
@@ -40,16 +40,14 @@ class PairwiseErrorCost(Average):
         The two positions of each pair, float64 [N, 3] [m].
     weights
         Weights of the pairs, float64 [N]; 1 by default.
-    tolerance
-        Relative error of the differences, see `CompressedRows`; 0 for exact ones.
-    tick
-        Called repeatedly while the differences are computed; an exception ends the computation.
+    tolerance, tick
+        As in `Average`, for the differences.
 
     Raises
     ------
     ValueError
-        If an argument has a wrong shape or a value that is not finite, there are no pairs, a
-        weight is negative, or the tolerance is neither 0 nor large enough.
+        If an argument has a wrong shape or a value that is not finite, there are no pairs, or a
+        weight is negative.
     """
 
     def __init__(
@@ -90,19 +88,15 @@ class PairwiseErrorCost(Average):
 
         The cost of the sample is an unbiased estimate for this codebook, and close to the whole
         cost for similar ones: a few pairs, which are the most similar, contribute most of it. An
-        evaluation is in single precision.
-
-        Raises
-        ------
-        ValueError
-            If n is not from 1 to the number of pairs, or the differences are exact.
+        evaluation is in single precision. Raises ValueError if n is not from 1 to the number of
+        pairs, or the differences are exact.
         """
         total = len(self._costs)
         if not 1 <= n <= total:
             raise ValueError(f'n: {n}, expected 1 to {total}, the number of pairs')
         if not isinstance(self.rows, CompressedRows):
             raise ValueError('tolerance: 0, expected compressed differences to draw a sample of')
-        costs = self._cost_of_pairs(codebook)
+        costs = np.concatenate([losses for losses, _ in self._losses(codebook)])
         shares = np.full(total, 1 / total)
         if costs.any():
             shares += (1 - _UNIFORM_SHARE) * (costs / costs.sum() - shares)
@@ -117,10 +111,6 @@ class PairwiseErrorCost(Average):
         sample._costs = self._costs[items] / probabilities[items] * (n / total)
         sample._loss = sample._confusion
         return sample
-
-    def _cost_of_pairs(self, codebook: Beamforming) -> np.ndarray:
-        """Weighted cost of each pair, float64 [N] [m^2]."""
-        return np.concatenate([losses for losses, _ in self._losses(codebook)])
 
     def _confusion(self, block: slice, forms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cost times Q(sqrt(q / 2)) [n], and minus its derivative d/d(2 q), [n, 1, 1]."""
@@ -153,19 +143,9 @@ class PairwiseErrorCost(Average):
 def best_phases(products: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the phases theta with which signals a are the closest to signals b, almost always.
 
-    Parameters
-    ----------
-    products
-        Twice the inner products a_i^H b_i of the whitened signals, complex128 [n, N_B].
-    scales
-        The matrix A, float64 [N_B, Q] [rad].
-
-    Returns
-    -------
-    phases : numpy.ndarray
-        Theta, float64 [n, N_B] [rad].
-    penalties : numpy.ndarray
-        The cost ``|z|^2`` of these phases, float64 [n].
+    Takes twice the inner products a_i^H b_i of the whitened signals, complex128 [n, N_B], and the
+    matrix A, float64 [N_B, Q] [rad]. Returns theta, float64 [n, N_B] [rad], and the cost
+    ``|z|^2`` of these phases, float64 [n].
     """
     magnitude, angle = np.abs(products), np.angle(products)
     # The cosines have curvatures up to the magnitudes, so that steps with these do not overshoot.

@@ -10,6 +10,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds.pairwise_error import best_phases
 from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.gaussian import eliminate
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.los import checked_positions
@@ -51,8 +52,8 @@ def range_confusion_error(
     distinct, index = np.unique(frequencies_hz, return_inverse=True)
     cosines = np.cos(2 * np.pi / SPEED_OF_LIGHT_MPS * np.outer(distinct, lags))
     index = index.reshape(frequencies_hz.shape)
-    for start in range(0, len(errors), _BLOCK):
-        mismatch = n_bands - sum(cosines[index[start:start + _BLOCK, i]] for i in range(n_bands))
+    for block in blocks(len(errors), _BLOCK):
+        mismatch = n_bands - sum(cosines[index[block, i]] for i in range(n_bands))
         plan, lag = np.nonzero(_is_minimum(mismatch))
         ratio = np.sqrt(_refined(mismatch, plan, lag) / n_bands)
         share = 1 - lags[lag] / max_lag_m
@@ -61,7 +62,7 @@ def range_confusion_error(
             weights = 2 * share * ndtr(-ratio * np.sqrt(energy))
             total, confused = (np.bincount(plan, values, minlength=len(mismatch))
                                for values in (weights, weights * lags[lag]**2))
-            errors[start:start + _BLOCK] += confused / (0.5 + total) / len(energies)
+            errors[block] += confused / (0.5 + total) / len(energies)
     return errors
 
 
@@ -69,21 +70,11 @@ def range_confusion_error_of(
         model: MeasurementModel, positions: np.ndarray, rng: np.random.Generator) -> float:
     """Estimate the squared error by confusion of ranges with a codebook [m^2].
 
-    The error is that of the posterior mean, if the user is at a position or at one of those that
-    can be confused with it: the lags are the minima of the mismatch along the line of sight. The
-    differences of the signals are those that remain after a small displacement of the confused
-    position, to first order, and with the best values of phases that the scenario declares as
-    unknown. Noise is drawn several times for each position.
-
-    Parameters
-    ----------
-    positions
-        Positions of the user, float64 [N, 3] [m], to average over.
-
-    Raises
-    ------
-    ValueError
-        If the positions are not a finite [N, 3] array.
+    This is the error of the posterior mean if the user is at one of N positions, float64 [N, 3]
+    [m], or at one that can be confused with it: the lags are the minima of the mismatch along the
+    line of sight. A small displacement of the confused position, to first order, and phases that
+    the scenario declares as unknown make the signals as similar as possible. Noise is drawn
+    several times for each position.
     """
     positions = checked_positions(positions)
     scenario = model.scenario

@@ -2,8 +2,7 @@
 
 A row is a linear function of one band's line-of-sight gains, such as their derivative with respect
 to one coordinate, or their difference between two positions. Its mean is the same function of the
-mean signals, as in Eq. (13). The objectives are functions of whitened means, whose computation
-takes most of their time.
+mean signals, as in Eq. (13). Whitened means take most of the time of an objective.
 """
 
 import copy
@@ -50,15 +49,9 @@ class GradientSums(NamedTuple):
     """Sums over all items from which the gradients of one band are computed.
 
     Here, zeta is Lambda^-1 times the means, and w is Lambda^-1 times the weighted means.
-
-    Attributes
-    ----------
-    mean_term
-        Sum of w conj(row), complex128 [N_SB F, N_E].
-    covariance_term
-        Sum of w zeta^H, complex128 [N_SB F, N_SB F].
     """
 
+    # Sum of w conj(row) [N_SB F, N_E], and of w zeta^H [N_SB F, N_SB F].
     mean_term: np.ndarray
     covariance_term: np.ndarray
 
@@ -77,10 +70,6 @@ class MeasurementRows:
         # Complex numbers of an exact row.
         self.width = scenario.n_subbands * scenario.n_elements
         self.bases: list[np.ndarray | None] = [None] * scenario.n_bands
-
-    def begin(self, model: MeasurementModel) -> 'Evaluation':
-        """Begin an evaluation with the radiation and whitening matrices of a model."""
-        return Evaluation(self, model)
 
     def in_block(self, block: slice, band: int) -> np.ndarray:
         """Return the coefficients of a block of n items, complex [J, n, G, R]."""
@@ -171,7 +160,7 @@ class Evaluation:
     def sums(self, band: int) -> GradientSums:
         """Return the sums over the blocks that were accumulated."""
         whitener, products = self._whitener[band], self._products[band]
-        total: np.ndarray = np.zeros(())
+        total = np.zeros(())
         for (_, pattern), filters, gathered in zip(
                 self._patterns, self._filters[band], self._weights[band], strict=True):
             weights = np.conj(gathered)
@@ -190,16 +179,15 @@ def rows_within(
         patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick) -> MeasurementRows:
     """Return rows with a relative error, see `CompressedRows`; exact ones for an error of 0.
 
-    Few rows that would need a large basis are exact up to single precision. `tick` is called
-    repeatedly.
+    Few rows that would need a large basis are exact up to single precision.
     """
+    of = scenario, source, n_items, n_rows
     if tolerance == 0:
-        return ExactRows(scenario, source, n_items, n_rows, patterns, tick)
+        return ExactRows(*of, patterns, tick)
     if n_items * n_rows <= _SKETCHED_ROWS and any(
-            _rank_of_some(scenario, source, n_items, n_rows, tolerance, band) > _MAX_RANK
-            for band in range(scenario.n_bands)):
-        return ExactRows(scenario, source, n_items, n_rows, patterns, tick, np.complex64)
-    return CompressedRows(scenario, source, n_items, n_rows, tolerance, patterns, tick)
+            _rank_of_some(*of, tolerance, band) > _MAX_RANK for band in range(scenario.n_bands)):
+        return ExactRows(*of, patterns, tick, np.complex64)
+    return CompressedRows(*of, tolerance, patterns, tick)
 
 
 def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
@@ -209,12 +197,10 @@ def _rank_of_some(scenario: Scenario, source: RowSource, n_items: int, n_rows: i
     if n_items * n_rows <= size or width <= 3 * size:
         return 0
     columns = streams.generator(0, streams.SKETCH, size).permutation(width)[:size]
-    parts = []
-    for block in blocks(n_items, n_rows, width):
-        chosen = slice(block.start, block.stop, max(n_items * n_rows // size, 1))
-        rows = source(chosen, band)
-        parts.append(rows.reshape(-1, width)[:, columns])
-    some = np.concatenate(parts)
+    step = max(n_items * n_rows // size, 1)
+    some = np.concatenate([
+        source(slice(block.start, block.stop, step), band).reshape(-1, width)[:, columns]
+        for block in blocks(n_items, n_rows, width)])
     norms = np.linalg.norm(some, axis=1)
     coefficients = some[norms > 0] / norms[norms > 0, None]
     values = np.linalg.eigvalsh(np.conj(coefficients.T) @ coefficients / max(len(some), 1))
@@ -253,12 +239,8 @@ class CompressedRows(MeasurementRows):
 
     Over a region of interest, the rows of all positions and sub-bands span, to a given accuracy,
     far fewer dimensions than there are elements and sub-bands. A randomised range finder with a
-    fixed seed finds a basis. `tolerance` is the root mean square of the rows' relative errors.
-
-    Raises
-    ------
-    ValueError
-        If the tolerance is not from `MIN_TOLERANCE` to 1.
+    fixed seed finds a basis. `tolerance`, from `MIN_TOLERANCE` to 1, is the root mean square of
+    the rows' relative errors.
     """
 
     def __init__(self, scenario: Scenario, source: RowSource, n_items: int, n_rows: int,
@@ -275,9 +257,10 @@ class CompressedRows(MeasurementRows):
                 rows = source(block, band)
                 return np.ascontiguousarray(rows.reshape(-1, rows.shape[2] * rows.shape[3]))
 
+            # The first sketch has enough columns for Table I, and more for larger surfaces.
             coefficients, basis = _compress(
                 flat_rows, list(blocks(n_items, n_rows, width)), n_items * n_rows, tolerance,
-                _first_sketch(scenario))
+                max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK)))
             self.coefficients.append(coefficients)
             self.bases[band] = basis.reshape(1, scenario.n_subbands, scenario.n_elements, -1)
 
@@ -314,11 +297,6 @@ def blocks(n_items: int, n_rows: int = 3, width: int = 0) -> Iterator[slice]:
     size = max(min(size, _BLOCK_NUMBERS // max(n_rows * width, 1)), 1)
     for start in range(0, n_items, size):
         yield slice(start, min(start + size, n_items))
-
-
-def _first_sketch(scenario: Scenario) -> int:
-    """Columns of the first sketch: enough for Table I, and more for larger surfaces."""
-    return max(_MIN_SKETCH, min(scenario.n_elements // 2, _MAX_RANK))
 
 
 def _compress(rows_of: Callable[[slice], np.ndarray], every: list[slice], n_rows: int,
@@ -378,7 +356,7 @@ def _sketch(
         rows_of: Callable[[slice], np.ndarray], chosen: Sequence[slice], size: int) -> np.ndarray:
     """Orthonormal basis of random combinations of the rows, normalised to unit length."""
     rng = streams.generator(0, streams.SKETCH, size)
-    mixtures: np.ndarray = np.zeros(())
+    mixtures = np.zeros(())
     for block in chosen:
         rows = rows_of(block)
         norms = np.linalg.norm(rows, axis=1)

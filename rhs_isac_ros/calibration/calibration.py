@@ -10,8 +10,8 @@ import numpy as np
 from rhs_isac_ros import __version__
 from rhs_isac_ros.calibration.estimate import TOLERANCE, Pilots, estimate_surface, prior_of
 from rhs_isac_ros.calibration.mixture import SurfacePrior
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model import Scenario, SurfaceEstimate
+from rhs_isac_ros.model.arrays import check_arrays, read_only
 from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
 
 _FORMAT = 1
@@ -38,9 +38,9 @@ class Calibration:
     scenario_id
         `Scenario.id` of the scenario for which it holds, without the files of a hall.
     about
-        How it was made: ``pilots``, their number; ``codebooks``, their ids; ``prior``, that of
-        the elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the
-        estimation, and whether it ``converged``; ``version``.
+        How it was made: ``pilots``, their number; ``codebooks``, their ids; ``prior`` of the
+        elements; ``scenario``, the fields that differ from Table I; ``rounds`` of the estimation,
+        and whether it ``converged``; ``version``.
 
     Raises
     ------
@@ -55,17 +55,13 @@ class Calibration:
     def __post_init__(self) -> None:
         """Check sizes and numbers, and make the arrays read-only."""
         n_elements, n_bands = np.size(self.surface.gains), np.size(self.surface.band_gains)
-        rank = np.shape(self.surface.factor)[-1] if np.ndim(self.surface.factor) == 2 else 0
-        shapes = {'gains': (n_elements,), 'offsets': (n_elements,), 'band_gains': (n_bands,),
-                  'factor': (2 * n_elements + n_bands, rank),
-                  'failed_probability': (n_elements,)}
-        for name, shape in shapes.items():
-            array = getattr(self.surface, name)
-            if np.shape(array) != shape:
-                raise CalibrationError(f'{name}: shape {np.shape(array)}, expected {shape}')
-            if not np.isfinite(array).all():
-                raise CalibrationError(f'{name}: not finite, expected finite numbers')
-            array.flags.writeable = False
+        rank = (*np.shape(self.surface.factor), 0, 0)[1]
+        check_arrays(self.surface, {
+            'gains': (n_elements,), 'offsets': (n_elements,), 'band_gains': (n_bands,),
+            'factor': (2 * n_elements + n_bands, rank), 'failed_probability': (n_elements,),
+        }, CalibrationError)
+        for name in _ARRAYS:
+            read_only(getattr(self.surface, name))
         probability = self.surface.failed_probability
         if n_elements and not (0 <= probability.min() and probability.max() <= 1):
             raise CalibrationError(
@@ -103,16 +99,9 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path) -> 'Calibration':
-        """Read a calibration from a file.
-
-        Raises
-        ------
-        CalibrationError
-            If the file cannot be read, is damaged, or does not contain a calibration.
-        """
+        """Read a calibration from a file; raise CalibrationError if the file is invalid."""
         try:
-            arrays, about = read_archive(
-                path, 'calibration', _FORMAT, {*_ARRAYS, *_DEVIATIONS})
+            arrays, about = read_archive(path, 'calibration', _FORMAT, {*_ARRAYS, *_DEVIATIONS})
         except ArchiveError as error:
             raise CalibrationError(str(error)) from error
         try:
@@ -125,10 +114,7 @@ class Calibration:
 
 def calibrate(scenario: Scenario, pilots: Sequence[Pilots],
               prior: SurfacePrior | None = None) -> Calibration:
-    """Estimate a surface from pilots; see `estimate_surface`.
-
-    The ids of the codebooks are those of beamforming that has one.
-    """
+    """Estimate a surface from pilots; see `estimate_surface`."""
     prior = prior or prior_of(scenario)
     changes: list[float] = []
     surface = estimate_surface(scenario, pilots, prior, lambda _, change: changes.append(change))
@@ -148,10 +134,7 @@ def _without_hall(scenario: Scenario) -> Scenario:
 def load_surface(path: str, scenario: Scenario) -> SurfaceEstimate | None:
     """Return the estimate in a calibration file; None if the path is empty.
 
-    Raises
-    ------
-    CalibrationError
-        If the file is invalid or belongs to another scenario.
+    Raises CalibrationError if the file is invalid or belongs to another scenario.
     """
     if not path:
         return None

@@ -18,18 +18,13 @@ from rhs_isac_ros.calibration.mixture import (
     surface_posterior,
     without_data,
 )
-from rhs_isac_ros.model import Beamforming, Scenario
+from rhs_isac_ros.model import Beamforming, Scenario, SurfaceEstimate
+from rhs_isac_ros.model.arrays import blocks, check_arrays
+from rhs_isac_ros.model.elements import direct_design, element_radiation, scattered_errors
 from rhs_isac_ros.model.gaussian import eliminate
-from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.los import checked_positions
 from rhs_isac_ros.model.measurement import signal_covariance
-from rhs_isac_ros.model.surface_estimate import (
-    SurfaceEstimate,
-    direct_design,
-    element_radiation,
-    scattered_errors,
-)
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Prior of scenarios that declare no errors or failures.
@@ -48,19 +43,8 @@ _BLOCK = 64
 class Pilots:
     """Signals of a reference user at known positions, received with one codebook.
 
-    Attributes
-    ----------
-    beams
-        The codebook.
-    positions
-        Float64 [N, 3] [m].
-    received
-        Complex128 [N, N_B, N_SB F], sub-band-major.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong or a number is not finite.
+    Positions are float64 [N, 3] [m]; received signals are complex128 [N, N_B, N_SB F],
+    sub-band-major. Raises ValueError if a shape is wrong or a number is not finite.
     """
 
     beams: Beamforming
@@ -71,17 +55,11 @@ class Pilots:
         """Check the arrays."""
         checked_positions(self.positions)
         n_bands, n_subbands, n_frames, _ = self.beams.digital.shape
-        expected = len(self.positions), n_bands, n_subbands * n_frames
-        if np.shape(self.received) != expected:
-            raise ValueError(
-                f'received: shape {np.shape(self.received)}, expected [N, N_B, N_SB F] = '
-                f'{expected}')
-        if not np.isfinite(self.received).all():
-            raise ValueError('received: not finite, expected finite numbers')
+        check_arrays(self, {'received': (len(self.positions), n_bands, n_subbands * n_frames)})
 
 
 def prior_of(scenario: Scenario) -> SurfacePrior:
-    """Return the prior that a scenario declares, with defaults for what it leaves at zero."""
+    """Return the prior that a scenario declares, with defaults for fields that are zero."""
     return SurfacePrior(scenario.element_error_rms or DEFAULT_ERROR_RMS,
                         scenario.failed_element_share or DEFAULT_FAILED_SHARE)
 
@@ -95,17 +73,13 @@ def estimate_surface(
     Parameters
     ----------
     pilots
-        Pilots of one or several codebooks; without any, the result is the prior.
+        Pilots of one or several codebooks of the scenario's sizes; without any, the result is the
+        prior.
     prior
-        By default that of `prior_of`.
+        By default the result of `prior_of`.
     progress
         Called after each round with its number and the largest change of a parameter, in
         standard deviations.
-
-    Raises
-    ------
-    ValueError
-        If the beamforming of pilots does not have the sizes of the scenario.
     """
     prior = prior or prior_of(scenario)
     statistics = PilotStatistics(scenario, pilots)
@@ -128,25 +102,61 @@ def estimate_surface(
     return _result(posterior, gains)
 
 
-def set_phases(values: np.ndarray, outputs: np.ndarray, phases: np.ndarray) -> None:
-    """Set the values that turn whole bands to the most likely ones, one after the other.
+class Alignment:
+    """Scoring steps of nuisance parameters to the signals of pilots.
 
-    Takes nuisance parameters [N, Q], outputs of the bands' matched filters, complex128 [N, N_B],
-    and `Nuisance.phases` [N_B, Q].
+    The values are scaled: they are standard normal a priori.
     """
-    for q in np.flatnonzero(phases.any(axis=0)):
-        turns = phases[:, q]
-        output = outputs[:, turns != 0].sum(axis=1)
-        turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
-        values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
-        outputs = outputs * np.exp(-1j * values[:, q, None] * turns)
+
+    def __init__(self, scenario: Scenario) -> None:
+        nuisance = nuisance_of(scenario)
+        self.patterns, self._phases = nuisance.scaled_patterns, nuisance.phases
+        self._moves_multipath = nuisance.moves_multipath[:, None, None]
+
+    def aligned(self, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return signals [N, N_B, N_SB F] without the factors of values [N, Q]."""
+        return signals * np.exp(-np.tensordot(values, self.patterns, axes=1))
+
+    def slopes(self, aligned: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Return the derivatives of aligned signals by the values, [N, Q, N_B, N_SB F].
+
+        Offsets of carrier and timing move the multipath out of the nulls of its covariance, and
+        are visible there. Their derivatives therefore contain the signals, not the mean.
+        """
+        return self.patterns * np.where(self._moves_multipath, aligned[:, None], mean[:, None])
+
+    def start(self, white: np.ndarray, white_mean: np.ndarray, values: np.ndarray) -> None:
+        """Set the values that turn whole bands to the most likely ones, one after the other."""
+        outputs = np.sum(np.conj(white_mean) * white, axis=2)
+        for q in np.flatnonzero(self._phases.any(axis=0)):
+            turns = self._phases[:, q]
+            output = outputs[:, turns != 0].sum(axis=1)
+            turn, magnitude = turns[turns != 0].mean(), 2 * np.abs(output)
+            values[:, q] = turn * magnitude * np.angle(output) / (turn**2 * magnitude + 1)
+            outputs = outputs * np.exp(-1j * values[:, q, None] * turns)
+
+    def step(self, whiten: Callable[[np.ndarray], np.ndarray], signals: np.ndarray,
+             mean: np.ndarray, values: np.ndarray) -> None:
+        """Improve the values for signals with a mean, both [N, N_B, N_SB F]."""
+        aligned = self.aligned(signals, values)
+        slopes = whiten(self.slopes(aligned, mean))
+        residual = whiten(aligned) - whiten(mean)
+        gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real - values
+        curvature = self.curvature(slopes)
+        values += eliminate(curvature, curvature[..., :0], gradient)[1]
+
+    def curvature(self, slopes: np.ndarray) -> np.ndarray:
+        """Return the curvature [N, Q, Q] of whitened slopes and prior."""
+        n, n_values = slopes.shape[:2]
+        flat = np.ascontiguousarray(slopes.reshape(n, n_values, -1)).view(float)
+        return 2 * np.matmul(flat, np.swapaxes(flat, 1, 2)) + np.eye(n_values)
 
 
 def _band_rms(scenario: Scenario, prior: SurfacePrior) -> np.ndarray:
     """RMS of real and imaginary parts of the bands' relative errors in a round [2, N_B].
 
-    A gain or phase that users or cycles draw at random cannot be distinguished from that of
-    the bands, which is then fixed: pilots of one user reveal the sum only.
+    Pilots of one user reveal only the sum of its random gain or phase and the one of the bands,
+    which is then fixed.
     """
     rms = np.full((2, scenario.n_bands), prior.band_gain_rms / np.sqrt(2))
     nuisance = nuisance_of(scenario)
@@ -189,42 +199,35 @@ class PilotStatistics:
         self._scenario, self._pilots = scenario, pilots
         self._radiation = [element_radiation(scenario, group.beams) for group in pilots]
         self._size = 2 * scenario.n_elements + scenario.n_bands
-        # Values are standard normal a priori.
-        nuisance = nuisance_of(scenario)
-        self._patterns = nuisance.scaled_patterns
-        self._phases = nuisance.phases
-        self._is_sharp = nuisance.moves_multipath
+        self._alignment = Alignment(scenario)
+        self._n_values = len(self._alignment.patterns)
         self._values: list[np.ndarray] = []
 
     def evaluate(self, gains: np.ndarray, mean: np.ndarray, covariance: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray]:
         """Compute information [2 P, 2 P] and shift [2 P] for real and then imaginary parts.
 
-        Parameters
-        ----------
-        gains
-            Gains of the bands about which the model is linear, complex128 [N_B].
-        mean, covariance
-            Of gains and offsets of the elements, complex128 [2 N_E] and [2 N_E, 2 N_E].
+        Takes the gains of the bands about which the model is linear, complex128 [N_B], and mean
+        and covariance of gains and offsets of the elements, [2 N_E] and [2 N_E, 2 N_E].
         """
         size = self._size
         normal, product = np.zeros((size, size), complex), np.zeros(size, complex)
         lost, moved = np.zeros((2 * size, 2 * size)), np.zeros(2 * size)
         is_first = not self._values
-        for index, (group, radiation) in enumerate(
-                zip(self._pilots, self._radiation, strict=True)):
-            if is_first:
-                self._values.append(np.zeros((len(group.positions), len(self._patterns))))
+        if is_first:
+            self._values = [np.zeros((len(group.positions), self._n_values))
+                            for group in self._pilots]
+        for group, radiation, of_group in zip(
+                self._pilots, self._radiation, self._values, strict=True):
             whiteners = self._whiteners(radiation, gains, mean, covariance)
-            for start in range(0, len(group.positions), _BLOCK):
-                block = slice(start, start + _BLOCK)
+            for block in blocks(len(group.positions), _BLOCK):
                 part = _Block(self._scenario, radiation, whiteners, group.positions[block], mean)
-                signals = group.received[block] / gains[:, None]
-                values = self._values[index][block]
-                if len(self._patterns):
+                signals, values = group.received[block] / gains[:, None], of_group[block]
+                if self._n_values:
                     if is_first:
-                        self._align(part, signals, values)
-                    signals, slopes = self._step(part, signals, values)
+                        self._alignment.start(
+                            part.whiten(signals), part.whiten(part.mean), values)
+                    signals, slopes = self._linearised(part, signals, values)
                     of_values = self._integrated(part, signals, slopes)
                     lost, moved = lost + of_values[0], moved + of_values[1]
                 whitened = part.whiten(signals)
@@ -232,7 +235,8 @@ class PilotStatistics:
                     flat = columns.reshape(-1, size)
                     normal += np.conj(flat.T) @ flat
                     product += np.conj(flat.T) @ white.reshape(-1)
-        return _real_matrix(normal) - lost, _real_vector(product) - moved
+        information = 2 * np.block([[normal.real, -normal.imag], [normal.imag, normal.real]])
+        return information - lost, 2 * np.concatenate([product.real, product.imag]) - moved
 
     def _whiteners(self, radiation: np.ndarray, gains: np.ndarray, mean: np.ndarray,
                    covariance: np.ndarray) -> np.ndarray:
@@ -246,46 +250,16 @@ class PilotStatistics:
         total += excess[:, None, None] * np.eye(total.shape[1])
         return np.linalg.inv(np.linalg.cholesky(total))
 
-    def _factors(self, values: np.ndarray) -> np.ndarray:
-        return np.exp(-np.tensordot(values, self._patterns, axes=1))
+    def _linearised(self, part: '_Block', signals: np.ndarray, values: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray]:
+        """Improve the values; return the signals as in a model linear in them, and their slopes.
 
-    def _align(self, part: '_Block', signals: np.ndarray, values: np.ndarray) -> None:
-        """Set the phases to those of the expected signals."""
-        outputs = np.sum(np.conj(part.mean) * part.whiten(signals), axis=2)
-        set_phases(values, outputs, self._phases)
-
-    def _step(self, part: '_Block', signals: np.ndarray, values: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray]:
-        """Improve the values; return the signals, linear in the values, and their slopes.
-
-        The signals are those of a linear model with the values themselves as parameters, so that
-        the prior applies to these.
+        The parameters are the values themselves, not their changes, so that the prior applies.
         """
-        aligned = signals * self._factors(values)
-        slopes = part.whiten(self._directions(part, aligned))
-        residual = part.whiten(aligned) - part.mean
-        gradient = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), residual).real
-        gradient -= values
-        curvature = self._curvature(slopes)
-        values += eliminate(curvature, curvature[..., :0], gradient)[1]
-        aligned = signals * self._factors(values)
-        directions = self._directions(part, aligned)
-        linear: np.ndarray = aligned + np.einsum('nq,nqir->nir', values, directions)
-        return linear, part.whiten(directions)
-
-    def _directions(self, part: '_Block', aligned: np.ndarray) -> np.ndarray:
-        """Derivatives with respect to the values [N, Q, N_B, N_SB F].
-
-        Offsets of carrier and timing move the multipath out of the nulls of its covariance, and
-        are visible there. Their derivatives are therefore those of the signals, not of the mean.
-        """
-        sources = np.where(self._is_sharp[:, None, None], aligned[:, None], part.plain[:, None])
-        return self._patterns * sources
-
-    def _curvature(self, slopes: np.ndarray) -> np.ndarray:
-        n, n_values = slopes.shape[:2]
-        flat = np.ascontiguousarray(slopes.reshape(n, n_values, -1)).view(float)
-        return 2 * np.matmul(flat, np.swapaxes(flat, 1, 2)) + np.eye(n_values)
+        self._alignment.step(part.whiten, signals, part.mean, values)
+        aligned = self._alignment.aligned(signals, values)
+        slopes = self._alignment.slopes(aligned, part.mean)
+        return aligned + np.einsum('nq,nqir->nir', values, slopes), part.whiten(slopes)
 
     def _integrated(self, part: '_Block', signals: np.ndarray, slopes: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
@@ -294,7 +268,7 @@ class PilotStatistics:
                        for band, columns in enumerate(part.columns))
         coupling = 2 * np.concatenate([coupling.real, -coupling.imag], axis=2)
         of_signals = 2 * np.einsum('nqir,nir->nq', np.conj(slopes), part.whiten(signals)).real
-        regression, _ = eliminate(self._curvature(slopes), coupling, of_signals)
+        regression, _ = eliminate(self._alignment.curvature(slopes), coupling, of_signals)
         flat = -regression.reshape(-1, regression.shape[2])
         return coupling.reshape(flat.shape).T @ flat, of_signals.reshape(-1) @ flat
 
@@ -302,37 +276,24 @@ class PilotStatistics:
 class _Block:
     """Linear model of several pilots.
 
-    Attributes
-    ----------
-    columns
-        Whitened derivatives of each band's signals, complex128 [N, N_SB F, P].
-    plain, mean
-        Expected signals before and after whitening, complex128 [N, N_B, N_SB F].
+    `columns` are the whitened derivatives of each band's signals, complex128 [N, N_SB F, P], and
+    `mean` the expected signals, complex128 [N, N_B, N_SB F].
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray, whiteners: np.ndarray,
                  positions: np.ndarray, mean: np.ndarray) -> None:
         self._whiteners = whiteners
         self.columns: list[np.ndarray] = []
-        self.plain = np.empty((len(positions), *radiation.shape[:2]), complex)
+        self.mean = np.empty((len(positions), *radiation.shape[:2]), complex)
         n = 2 * scenario.n_elements
         for band, whitener in enumerate(whiteners):
             design = direct_design(scenario, radiation, band, positions)
-            self.plain[:, band] = design @ mean
+            self.mean[:, band] = design @ mean
             columns = np.zeros((*design.shape[:2], n + scenario.n_bands), complex)
             columns[..., :n] = np.matmul(whitener, design)
-            columns[..., n + band] = self.plain[:, band] @ whitener.T
+            columns[..., n + band] = self.mean[:, band] @ whitener.T
             self.columns.append(columns)
-        self.mean = self.whiten(self.plain)
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
         """Whiten signals [..., N_B, N_SB F]."""
         return np.einsum('irs,...is->...ir', self._whiteners, signals)
-
-
-def _real_matrix(matrix: np.ndarray) -> np.ndarray:
-    return 2 * np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
-
-
-def _real_vector(vector: np.ndarray) -> np.ndarray:
-    return 2 * np.concatenate([vector.real, vector.imag])

@@ -20,16 +20,10 @@ _MIN_PROBABILITY = 1e-7
 
 @dataclasses.dataclass(frozen=True)
 class SurfacePrior:
-    """What is known of a surface before the calibration.
+    """Knowledge of a surface before the calibration.
 
-    Attributes
-    ----------
-    element_error_rms
-        RMS of the relative errors of the coefficients.
-    failed_element_share
-        Probability that an element has failed; from 0 to below 1.
-    band_gain_rms
-        RMS of the relative errors of the bands' gains.
+    This is the RMS of the relative errors of the coefficients, the probability that an element has
+    failed, and the RMS of the relative errors of the bands' gains.
     """
 
     element_error_rms: float
@@ -46,20 +40,12 @@ class SurfacePrior:
 
 
 class Posterior(NamedTuple):
-    """Gaussian approximation of a posterior, over real and then imaginary parts.
+    """Gaussian approximation of a posterior, over real and then imaginary parts."""
 
-    Attributes
-    ----------
-    mean, covariance
-        Of the P = 2 N_E + N_B gains, offsets and band gains, float64 [2 P] and [2 P, 2 P].
-    failed
-        The most likely states, bool [N_E].
-    failed_probability
-        Float64 [N_E].
-    """
-
+    # Of the P = 2 N_E + N_B gains, offsets and band gains, float64 [2 P] and [2 P, 2 P].
     mean: np.ndarray
     covariance: np.ndarray
+    # The most likely states, bool [N_E], and probabilities, float64 [N_E].
     failed: np.ndarray
     failed_probability: np.ndarray
 
@@ -91,18 +77,11 @@ def without_data(prior: SurfacePrior, band_rms: np.ndarray, n_elements: int) -> 
 
 def surface_posterior(information: np.ndarray, shift: np.ndarray, prior: SurfacePrior,
                       band_rms: np.ndarray, failed: np.ndarray) -> Posterior:
-    """Compute the posterior of a surface.
+    """Compute the posterior of a surface, with a search that starts from some `failed` [N_E].
 
-    Parameters
-    ----------
-    information, shift
-        The log-likelihood is ``-x^T information x / 2 + shift^T x``, float64 [2 P, 2 P] and
-        [2 P], for real and then imaginary parts.
-        The P parameters are gains and offsets of the elements, then errors of the bands' gains.
-    band_rms
-        RMS of real and imaginary parts of the latter before, float64 [2, N_B].
-    failed
-        States of the elements to start from, bool [N_E].
+    The P parameters are gains and offsets of the elements, then errors of the bands' gains, whose
+    real and imaginary parts have the prior RMS `band_rms`, float64 [2, N_B]. The log-likelihood is
+    ``-x^T information x / 2 + shift^T x``, for real and then imaginary parts x.
     """
     search = _Search(information, shift, prior, band_rms)
     state, log_odds = search.climb(failed.copy())
@@ -211,5 +190,5 @@ class _Search:
         precision, mean = self._precision[indices], self._mean[indices]
         best = np.linalg.solve(curvature, gradient[..., None])[..., 0]
         exponents = np.log(precision) + gradient * best - precision * mean**2
-        evidence: np.ndarray = exponents.sum(axis=1) - np.linalg.slogdet(curvature)[1]
+        evidence = exponents.sum(axis=1) - np.linalg.slogdet(curvature)[1]
         return evidence / 2

@@ -22,12 +22,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rhs_isac_ros import __version__
-from rhs_isac_ros.calibration.estimate import Pilots, set_phases
+from rhs_isac_ros.calibration.estimate import Alignment, Pilots
 from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
+from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
+from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.measurement import Surface
-from rhs_isac_ros.model.multipath_estimate import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Share of positions in the region of the local bound, and of residuals that pass their test, with
@@ -38,6 +39,8 @@ _FALSE_ALARM = 1e-9
 # Inflation that a survey without positions would have, and its weight in positions: a margin for
 # small surveys, in which the quantiles above are uncertain.
 _INFLATION, _INFLATION_WEIGHT = 1.8, 40
+# The same of the level of users in sight [dB].
+_LEVEL_STD_DB = 1.2
 # Smaller surveys, and those that span less of a side of the region, cause a warning.
 MIN_POSITIONS = 20
 _MIN_SPAN = 0.5
@@ -72,7 +75,7 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     received
         Complex128 [N, N_B, N_SB F], sub-band-major.
     surface
-        What is known of the surface, as in `MeasurementModel`.
+        Knowledge of the surface, as in `MeasurementModel`.
 
     Returns
     -------
@@ -110,13 +113,14 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     inside = int(np.sum(left_out.distances <= inflation * _radius()))
     about: dict[str, Any] = {
         'positions': n_sight, 'blocked': n - n_sight, 'prior_weight': fit.weight,
-        'inflation': inflation, 'coverage': [inside / n_sight, *_interval(inside, n_sight)],
+        'inflation': inflation, 'level_std_db': _level_std_db(left_out, int(np.prod(model.shape))),
+        'coverage': [inside / n_sight, *_interval(inside, n_sight)],
         'warnings': texts, 'codebook': str(getattr(codebook, 'id', '')), 'version': __version__}
     plain = scenario.fields()
     return MultipathEstimate(
         **{name: getattr(fit.fields, name) for name in FIELDS},
         radiation=np.array(model.radiation),
-        excess=(excess + np.conj(np.swapaxes(excess, 1, 2))) / 2,
+        excess=(excess + adjoint(excess)) / 2,
         conditions={name: plain[name] for name in CONDITIONS}, about=about)
 
 
@@ -137,24 +141,15 @@ def survey_report(estimate: MultipathEstimate) -> str:
 
 
 class _Fit(NamedTuple):
-    """The most likely fields of a scenario, and what follows from them.
+    """The most likely fields of a scenario, and residuals with these."""
 
-    Attributes
-    ----------
-    fields, weight
-        Scenario with the fields, and weight of the prior in positions.
-    residuals
-        Of all positions, complex128 [N, N_B, R].
-    in_sight
-        Which positions have a direct path, bool [N].
-    total
-        Sum over these positions and of the prior, complex128 [N_B, R, R].
-    """
-
+    # Scenario with the fields, and weight of the prior in positions.
     fields: Scenario
     weight: float
+    # Of all positions, complex128 [N, N_B, R], and which of them have a direct path [N].
     residuals: np.ndarray
     in_sight: np.ndarray
+    # Sum over positions with a direct path, and of the prior, complex128 [N_B, R, R].
     total: np.ndarray
 
 
@@ -177,22 +172,12 @@ def _fitted(fields: Scenario, pilots: Pilots, surface: Surface | None) -> _Fit:
 
 def _residuals(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     """Signals without the most likely factors of impairments, less their mean [N, N_B, R]."""
-    nuisance, mean = nuisance_of(model.scenario), model.mean(pilots.positions)
-    patterns, n = nuisance.scaled_patterns, len(mean)
-    values = np.zeros((n, len(nuisance)))
-    outputs = np.sum(np.conj(model.whiten(mean)) * model.whiten(pilots.received), axis=2)
-    set_phases(values, outputs, nuisance.phases)
-    for _ in range(_ALIGNMENT_STEPS if len(nuisance) else 0):
-        signals = pilots.received * np.exp(-np.tensordot(values, patterns, axes=1))
-        sources = np.where(
-            nuisance.moves_multipath[:, None, None], signals[:, None], mean[:, None])
-        slopes = model.whiten(patterns * sources).reshape(n, len(nuisance), -1)
-        white = model.whiten(signals - mean).reshape(n, -1, 1)
-        gradient = 2 * np.matmul(slopes.conj(), white)[..., 0].real - values
-        curvature = 2 * np.matmul(slopes.conj(), np.swapaxes(slopes, 1, 2)).real
-        values += np.linalg.solve(
-            curvature + np.eye(len(nuisance)), gradient[..., None])[..., 0]
-    return pilots.received * np.exp(-np.tensordot(values, patterns, axes=1)) - mean
+    alignment, mean = Alignment(model.scenario), model.mean(pilots.positions)
+    values = np.zeros((len(mean), len(alignment.patterns)))
+    alignment.start(model.whiten(pilots.received), model.whiten(mean), values)
+    for _ in range(_ALIGNMENT_STEPS if values.shape[1] else 0):
+        alignment.step(model.whiten, pilots.received, mean, values)
+    return alignment.aligned(pilots.received, values) - mean
 
 
 def _most_likely(scenario: Scenario, model: MeasurementModel, sample: np.ndarray, n: int
@@ -247,15 +232,7 @@ def _log_evidence(declared: np.ndarray, sample: np.ndarray, n: int, weight: floa
 
 
 class _LeftOut(NamedTuple):
-    """What each position yields under the covariance of all others.
-
-    Attributes
-    ----------
-    distances
-        Squared Mahalanobis distance of the local position error, float64 [N].
-    energies
-        Energy of the whitened residual, float64 [N].
-    """
+    """Squared Mahalanobis distances of local position errors, and energies of residuals [N]."""
 
     distances: np.ndarray
     energies: np.ndarray
@@ -265,8 +242,8 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
               total: np.ndarray, n_others: float) -> _LeftOut:
     """Evaluate every position under the covariance ``(total - e e^H) / n_others`` of the others.
 
-    `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. The errors are
-    those of a scoring step from the true position, with unknown nuisance parameters.
+    `total` is complex128 [N_B, R, R]; the residuals e are complex128 [N, N_B, R]. An error is a
+    scoring step from the true position, with unknown nuisance parameters.
     """
     whitener = np.linalg.inv(np.linalg.cholesky(total))
     nuisance = nuisance_of(model.scenario).scaled_patterns
@@ -307,7 +284,7 @@ def _in_sight(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
     blocked = log_evidence_of_level(energy_without, int(np.prod(model.shape)), BLOCKED_STD_DB)
     prior = min(model.scenario.blocked_probability or _BLOCKED_PROBABILITY, _MAX_BLOCKED)
     log_odds = np.log(1 / prior - 1) - energy - blocked
-    result: np.ndarray = log_odds > 0
+    result = log_odds > 0
     return result if result.any() else np.ones(len(result), bool)
 
 
@@ -322,6 +299,16 @@ def _inflation(left_out: _LeftOut, n_measurements: int) -> float:
                      / gammainccinv(n_measurements, _FALSE_ALARM)))
     weights = np.array([n, _INFLATION_WEIGHT])
     return float(np.exp(weights @ np.log([most, _INFLATION]) / weights.sum()))
+
+
+def _level_std_db(left_out: _LeftOut, n_measurements: int) -> float:
+    """Return the standard deviation of the power of the residuals among users [dB]."""
+    n = len(left_out.energies)
+    # The energies of Gaussian residuals of equal power scatter as well.
+    excess = max(float(np.var(np.log(left_out.energies))) - 1 / n_measurements, 0.0)
+    usual = (np.log(10) / 10 * _LEVEL_STD_DB)**2
+    variance = (n * excess + _INFLATION_WEIGHT * usual) / (n + _INFLATION_WEIGHT)
+    return float(10 / np.log(10) * np.sqrt(variance))
 
 
 def _radius() -> float:

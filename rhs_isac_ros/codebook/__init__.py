@@ -1,11 +1,14 @@
 """Codebooks of analog and digital beamforming, and their optimisation."""
 
-from rhs_isac_ros.codebook.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.codebook.objective import OBJECTIVES
+from rhs_isac_ros.codebook.codebook import (
+    Codebook,
+    CodebookError,
+    Provenance,
+    default_codebook_file,
+)
+from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.optimize import METHODS, OptimizeResult, optimize
 from rhs_isac_ros.codebook.problem import Progress
-from rhs_isac_ros.codebook.provenance import Provenance
-from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.starts import directional_codebook, random_codebook
 
 __all__ = [

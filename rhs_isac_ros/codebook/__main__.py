@@ -1,12 +1,62 @@
 """Optimise a codebook and write it as a ROS 2 parameter file."""
 
 import argparse
+import dataclasses
+import importlib.util
+import math
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from rhs_isac_ros.codebook.command import ERRORS, add_options, check, run
+import yaml
+
+from rhs_isac_ros.bounds import crlb_of
+from rhs_isac_ros.calibration import Calibration
+from rhs_isac_ros.codebook.band_plan import (
+    DEFAULT_RASTER_HZ,
+    BandPlan,
+    Candidate,
+    best_of,
+    choose_bands,
+)
+from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
+from rhs_isac_ros.codebook.optimize import (
+    DEFAULT_POSITIONS,
+    METHODS,
+    OptimizeResult,
+    check_start,
+    optimize,
+)
+from rhs_isac_ros.codebook.plot import plot_optimization
+from rhs_isac_ros.codebook.problem import Progress
+from rhs_isac_ros.codebook.starts import STARTS
 from rhs_isac_ros.executables import exit_code_of, print_error
-from rhs_isac_ros.support.arguments import ArgumentParser
+from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    check_distinct,
+    input_file,
+    integer,
+    interval,
+    output_file,
+    picture_file,
+    positive_float,
+    positive_int,
+    seed,
+)
+from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.support.progress import progress_bar
+
+# Positions for the average bound of the result, drawn independently of the samples.
+HELD_OUT_POSITIONS = 2000
+# Beyond this, the samples would fill the memory.
+_MAX_POSITIONS = 10**5
+# Errors that the user can correct; their messages state the expected values.
+ERRORS = (MissingLibraryError, ValueError, OSError, MemoryError)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,6 +73,197 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(error, parser.prog)
         return 2
     return 0
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of an optimisation to a parser."""
+    add = parser.add_argument
+    add('--output', type=output_file, default='codebook.yaml',
+        help='file to write; an existing file is replaced at the end')
+    add('--scenario', type=input_file,
+        help="YAML file of the scenario; the paper's Table I if omitted")
+    add('--calibration', type=input_file,
+        help="calibration file of the surface; the scenario's surface if omitted")
+    add('--method', choices=sorted(METHODS), default='lbfgs', help='optimiser')
+    add('--objective', choices=sorted(OBJECTIVES),
+        help='the average bound; the ambiguity between distant positions, which a local bound '
+             'ignores; error, the same with weights close to the squared error; or the bound with '
+             'unknown phases of the bands and the region as prior. crlb if omitted, or error with '
+             '--spectrum')
+    add('--sampling', choices=sorted(SAMPLINGS), default='sobol',
+        help='how the region of interest is sampled')
+    add('--positions', type=integer(1, _MAX_POSITIONS), default=DEFAULT_POSITIONS,
+        help='number of samples')
+    add('--steps', type=positive_int,
+        help='maximum number of update steps; the default of the method if omitted')
+    add('--evaluations', type=positive_int,
+        help='maximum number of evaluations; unlimited if omitted')
+    add('--seed', type=seed, default=0, help='seed of the samples, the start and the method')
+    add('--start', type=_start_name, metavar='START',
+        help=f'{", ".join(STARTS)} or a codebook file; random if omitted')
+    add('--resume', action='store_true',
+        help='continue from OUTPUT.part, which an unfinished run leaves, or from OUTPUT')
+    add('--plot', type=picture_file,
+        help='file for a plot of convergence, bound and beam patterns: PNG, PDF or SVG')
+    add('--spectrum', type=interval, nargs='+', metavar='LOW:HIGH',
+        help='choose the centre frequencies of the bands within these intervals [Hz]')
+    add('--bands', type=positive_int, help='number of bands to choose')
+    add('--raster', type=positive_float, default=DEFAULT_RASTER_HZ,
+        help='spacing of possible centre frequencies [Hz]')
+    add('--min-gap', type=positive_float,
+        help='smallest distance of centre frequencies [Hz]; the width of a band if omitted')
+    add('--plan', type=output_file, default='bandplan.yaml',
+        help='file to write the scenario with the chosen bands to')
+    add('--quiet', action='store_true', help='show no progress')
+
+
+def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Exit with a usage error if options contradict each other or a library is missing."""
+    inputs = {'--scenario': options.scenario, '--calibration': options.calibration}
+    outputs = {'--output': options.output, '--plot': options.plot}
+    if options.spectrum:
+        outputs['--plan'] = Path(options.plan)
+    check_distinct(parser, inputs, outputs)
+    if bool(options.spectrum) != bool(options.bands):
+        parser.error('argument --bands: expected together with --spectrum')
+    if options.spectrum and (options.start or options.resume):
+        parser.error('argument --spectrum: not allowed with --start or --resume; to resume, '
+                     'expected --scenario with the file of --plan')
+    if options.spectrum and options.calibration:
+        parser.error('argument --calibration: not allowed with --spectrum, because a calibration '
+                     'belongs to one scenario')
+    if options.resume and options.start:
+        parser.error('argument --start: not allowed with --resume, which continues from a file')
+    partial = _partial(options.output)
+    if options.resume and not (partial.exists() or options.output.exists()):
+        parser.error(f'argument --resume: expected {partial} or {options.output}')
+    if options.plot and not importlib.util.find_spec('matplotlib'):
+        parser.error('argument --plot: drawing needs matplotlib, which is not installed '
+                     "(pip install 'rhs_isac_ros[plot]')")
+
+
+def run(options: argparse.Namespace) -> tuple[Codebook, str]:
+    """Optimise according to the options of `add_options`, write the file and print a summary.
+
+    Ctrl-C ends the search; the best codebook found so far is then written. Returns the codebook
+    in the file and why the search stopped. Raises one of `ERRORS` if an option or a file is
+    invalid, or a library is missing; an existing output file is kept.
+    """
+    output, partial = options.output, _partial(options.output)
+    scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+    objective = options.objective or ('error' if options.spectrum else 'crlb')
+    calibration = None
+    if options.calibration:
+        calibration = Calibration.load(options.calibration)
+        calibration.check(scenario)
+    start = _start(options.start, scenario, options.seed)
+    resumed = Codebook.load(partial if partial.exists() else output) if options.resume else None
+    for codebook in filter(None, (start, resumed)):
+        check_start(codebook, scenario)
+
+    def search(scenario: Scenario) -> OptimizeResult:
+        with progress_bar(options.steps or METHODS[options.method].steps, 'step',
+                          quiet=options.quiet, line_every=50) as show:
+            return optimize(
+                scenario, method=options.method, objective=objective,
+                sampling=options.sampling, n_positions=options.positions, seed=options.seed,
+                start=start, resume=resumed, calibration=calibration, max_steps=options.steps,
+                max_evaluations=options.evaluations,
+                progress=show and (lambda progress: show(progress.step, _value(progress))),
+                keep=lambda result: _save_partial(result, partial))
+
+    if options.spectrum:
+        plan = _choose_bands(options, scenario, search)
+        scenario, result = plan.scenario, plan.result
+    else:
+        result = search(scenario)
+    held_out = scenario.sample_positions(
+        HELD_OUT_POSITIONS, streams.generator(options.seed, streams.HELD_OUT))
+    bounds = crlb_of(MeasurementModel(
+        scenario, result.codebook, calibration.surface if calibration else None), held_out)
+    average, error = float(bounds.mean()), float(bounds.std() / HELD_OUT_POSITIONS**0.5)
+    codebook = dataclasses.replace(result.codebook, average_crlb_m2=average)
+    _save(codebook, output)
+    partial.unlink(missing_ok=True)
+    print(f'{output}: average CRLB {average:.5f} m^2 (standard error {error:.5f}) over '
+          f'{HELD_OUT_POSITIONS} held-out positions; {result.reason}')
+    if options.plot:
+        plot_optimization(scenario, codebook, result.history, options.plot)
+    return codebook, result.reason
+
+
+def _choose_bands(
+        options: argparse.Namespace, scenario: Scenario,
+        search: Callable[[Scenario], OptimizeResult]) -> BandPlan:
+    """Choose the bands and the codebook, write the scenario with them, and return both."""
+    def report(candidate: Candidate) -> None:
+        if not options.quiet:
+            print(f'{_in_ghz(candidate.frequencies_hz)}: {candidate.error_m2:.4f} m^2 expected',
+                  file=sys.stderr)
+
+    def write_and_search(scenario: Scenario) -> OptimizeResult:
+        # An unfinished codebook belongs to this plan.
+        _save_plan(options.plan, scenario)
+        return search(scenario)
+
+    candidates = choose_bands(
+        scenario, options.spectrum, options.bands, raster_hz=options.raster,
+        min_gap_hz=options.min_gap, seed=options.seed, report=report)
+    best = best_of(scenario, candidates, write_and_search, options.seed, report)
+    _save_plan(options.plan, best.scenario)
+    print(f'{options.plan}: {_in_ghz(best.scenario.center_frequencies_hz)}, '
+          f'{best.scenario.n_frames} frames each')
+    return best
+
+
+def _save_plan(path: Path, scenario: Scenario) -> None:
+    changes = yaml.safe_dump(scenario.changes(), sort_keys=False, default_flow_style=None)
+    write_whole(path, f'# Chosen by python3 -m rhs_isac_ros.codebook --spectrum. Omitted '
+                      f'fields have the values of Table I.\n{changes}')
+
+
+def _in_ghz(frequencies_hz: Sequence[float]) -> str:
+    return ', '.join(f'{frequency / 1e9:g}' for frequency in frequencies_hz) + ' GHz'
+
+
+def _partial(output: Path) -> Path:
+    """Return the file in which an unfinished search is kept."""
+    return output.with_name(output.name + '.part')
+
+
+def _start_name(text: str) -> str:
+    return text if text in STARTS else str(input_file(text))
+
+
+def _start(name: str | None, scenario: Scenario, seed: int) -> Codebook | None:
+    if name is None:
+        return None
+    if name in STARTS:
+        return STARTS[name](scenario, streams.generator(seed, streams.START))
+    return Codebook.load(name)
+
+
+def _save_partial(result: OptimizeResult, partial: Path) -> None:
+    """Save an unfinished result; on failure only warn, as the final write may still succeed."""
+    try:
+        result.codebook.save(partial)
+    except OSError as error:
+        print(f'warning: {partial}: {error}', file=sys.stderr)
+
+
+def _save(codebook: Codebook, output: Path) -> None:
+    """Save the result, which may have taken hours; on failure, in a temporary directory."""
+    try:
+        codebook.save(output)
+    except OSError as error:
+        rescue = Path(tempfile.mkdtemp(prefix='rhs_isac_ros.')) / output.name
+        codebook.save(rescue)
+        raise OSError(f'{output}: {error}; the codebook is in {rescue}') from error
+
+
+def _value(progress: Progress) -> str:
+    return ('setting up the objective' if math.isinf(progress.value_m2)
+            else f'{progress.value_m2:.5f} m^2')
 
 
 if __name__ == '__main__':

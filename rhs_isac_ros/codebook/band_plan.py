@@ -29,10 +29,7 @@ _STARTS = 8
 
 
 def raster(spectrum_hz: Sequence[tuple[float, float]], raster_hz: float) -> np.ndarray:
-    """Return the possible centre frequencies, ascending, float64 [n] [Hz].
-
-    Raise ValueError if an interval or the raster is invalid.
-    """
+    """Return the possible centre frequencies, ascending, float64 [n] [Hz]."""
     if not 0 < raster_hz < math.inf:
         raise ValueError(f'raster: {raster_hz:g} Hz, expected a positive number')
     if not spectrum_hz:
@@ -51,8 +48,8 @@ def screen(
         max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
     """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
 
-    Up to `max_exhaustive` plans are all evaluated. Of more, the ends of a coordinate search from
-    several starts are returned: it moves one frequency at a time to its best place on the raster.
+    Up to `max_exhaustive` plans, these are all. Of more, they are the ends of a coordinate search
+    from several starts, which moves one frequency at a time to its best place on the raster.
     """
     if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
         return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)
@@ -65,7 +62,7 @@ def _coordinate_search(
         frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         errors: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the searches from several starts, which are random as far as the gap permits."""
+    """Search from random starts that have the gap, and from the lowest frequencies."""
     drawn = np.sort([rng.choice(frequencies_hz, n_bands, replace=False)
                      for _ in range(_STARTS)], axis=1)
     first = first_fit(frequencies_hz, n_bands, gap_hz)
@@ -88,7 +85,7 @@ def _coordinate_search(
 
 
 def has_gap(plans: np.ndarray, gap_hz: float) -> np.ndarray:
-    """Which ascending plans have a gap between all bands, up to rounding, bool [P]."""
+    """Return which ascending plans have a gap between all bands, up to rounding, bool [P]."""
     return np.all(np.diff(plans, axis=1) >= gap_hz * (1 - 1e-9), axis=1)
 
 
@@ -105,8 +102,8 @@ def first_fit(frequencies_hz: np.ndarray, n_bands: int, gap_hz: float) -> np.nda
 
 DEFAULT_RASTER_HZ = 10e6
 # Energies of a codebook relative to a random one, for each of which the screening proposes plans:
-# with more energy, wider plans are better. Energies from 8 proposed plans with more confusion of
-# directions, which the screening does not see.
+# with more energy, wider plans are better. From 8, proposed plans confuse directions more often,
+# which the screening does not take into account.
 _ENERGY_LEVELS = (2.0, 3.0, 4.0)
 # Plans with a codebook, and the positions and steps of their optimisations.
 _CANDIDATES = 6
@@ -126,12 +123,10 @@ _MIN_DIFFERENCE = 4
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A band plan that was compared with others.
+    """A band plan that was compared with others, by its ascending centre frequencies.
 
     Attributes
     ----------
-    frequencies_hz
-        Centre frequencies in ascending order.
     screening_m2
         Squared error by confusion of ranges, from the range ambiguity function.
     error_m2
@@ -161,14 +156,9 @@ def optimize_band_plan(
         scenario: Scenario, spectrum_hz: Sequence[tuple[float, float]], n_bands: int, *,
         raster_hz: float = DEFAULT_RASTER_HZ, min_gap_hz: float | None = None, seed: int = 0,
         max_steps: int | None = None) -> BandPlan:
-    """Choose centre frequencies as `choose_bands` and `best_of` do, with codebooks for them.
+    """Choose centre frequencies and a codebook for them with `choose_bands` and `best_of`.
 
     `max_steps` limits the full optimisations, for which `optimize` describes the default.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range, or no plan has the gap.
     """
     candidates = choose_bands(
         scenario, spectrum_hz, n_bands, raster_hz=raster_hz, min_gap_hz=min_gap_hz, seed=seed)
@@ -183,18 +173,10 @@ def best_of(
         report: Callable[[Candidate], None] | None = None) -> BandPlan:
     """Optimise codebooks for the first candidates, and return the plan with the lowest error.
 
-    Of plans whose errors hardly differ, the first one is returned. Candidates with much larger
-    errors than the first one are left out.
-
-    Parameters
-    ----------
-    candidates
-        At least one candidate, the best one first.
-    search
-        Optimisation of a codebook. After one that is interrupted, the best plan so far is
-        returned.
-    report
-        Called with each plan and its error with the codebook, except for an interrupted search.
+    The best of the candidates comes first. It is also the result unless the error of another one
+    is clearly lower. Candidates with much larger errors are left out. An interrupted `search` for
+    a codebook ends the comparison with the best plan so far. `report` is called with each other
+    plan and its error with the codebook.
     """
     best: BandPlan | None = None
     for candidate in candidates[:_FINALISTS]:
@@ -221,8 +203,6 @@ def choose_bands(
         report: Callable[[Candidate], None] | None = None) -> tuple[Candidate, ...]:
     """Choose centre frequencies with which users are located accurately.
 
-    Returns the plans for which codebooks were compared, the best one first.
-
     Parameters
     ----------
     spectrum_hz
@@ -237,6 +217,11 @@ def choose_bands(
         Number of plans for which codebooks are compared.
     report
         Called with each of these.
+
+    Returns
+    -------
+    tuple of Candidate
+        The plans for which codebooks were compared, the best one first.
 
     Raises
     ------
@@ -260,8 +245,11 @@ def choose_bands(
     for plan, screening in _proposals(
             scenario, frequencies_hz, n_bands, gap_hz, _MIN_DIFFERENCE * raster_hz,
             n_candidates, streams.generator(seed, streams.PLANS)):
-        error = _short_error(with_bands(scenario, plan), seed)
-        candidates.append(Candidate(plan, screening, error))
+        world = with_bands(scenario, plan)
+        short = optimize(world, objective='error', seed=seed, n_positions=_SHORT_POSITIONS,
+                         max_steps=_SHORT_STEPS)
+        error_m2 = expected_error(world, short.codebook, seed, _SHORT_PHASES)
+        candidates.append(Candidate(plan, screening, error_m2))
         if report:
             report(candidates[-1])
     return tuple(sorted(candidates, key=lambda candidate: candidate.error_m2))
@@ -278,7 +266,7 @@ def _proposals(
         scenario: Scenario, frequencies_hz: np.ndarray, n_bands: int, gap_hz: float,
         difference_hz: float, n: int, rng: np.random.Generator
 ) -> list[tuple[tuple[float, ...], float]]:
-    """Up to n plans that differ, from the energy levels in turn, with their screening values."""
+    """Return up to n different plans, from the energy levels in turn, with screening values."""
     spread = np.linspace(frequencies_hz[0], frequencies_hz[-1], n_bands)
     energies = _energies(with_bands(scenario, spread.tolist()))
     low, high = scenario.roi_bounds_m
@@ -305,8 +293,8 @@ def expected_error(
         scenario: Scenario, codebook: Codebook, seed: int = 0, n_phases: int = 2048) -> float:
     """Estimate the mean squared error with a codebook [m^2].
 
-    The estimate is the global bound, which is a few percent below the error. If the scenario
-    declares nuisance parameters, which that bound ignores, it is the average local bound with the
+    The estimate is the global bound, a few percent below the error. This bound ignores nuisance
+    parameters: if the scenario declares any, the estimate is the average local bound with the
     region as prior, plus the squared error by confusion of ranges.
     """
     rng = streams.generator(seed, streams.PLANS, 1)
@@ -318,21 +306,12 @@ def expected_error(
             + range_confusion_error_of(model, positions, rng))
 
 
-def _short_error(scenario: Scenario, seed: int) -> float:
-    """Expected error with a codebook of a short search [m^2]."""
-    codebook = optimize(
-        scenario, objective='error', seed=seed, n_positions=_SHORT_POSITIONS,
-        max_steps=_SHORT_STEPS).codebook
-    return expected_error(scenario, codebook, seed, _SHORT_PHASES)
-
-
 def _energies(scenario: Scenario) -> np.ndarray:
-    """Energies of the whitened mean signals over the region, as quantiles, float64 [n]."""
+    """Return quantiles of the energies of whitened mean signals over the region, float64 [n]."""
     rng = streams.generator(0, streams.PLANS, 2)
     model = MeasurementModel(scenario, random_codebook(scenario, rng))
     whitened = model.whiten(model.mean(scenario.sample_positions(_POSITIONS, rng)))
     energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
     # A phase of each band that is unknown leaves less of the energy to compare phases with.
     energies /= 1 + 2 * scenario.band_phase_std_rad**2 * energies / scenario.n_bands
-    return np.quantile(
-        energies, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
+    return np.quantile(energies, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)

@@ -1,23 +1,28 @@
-"""The codebook: the beamforming of the surface and the base station while positioning."""
+"""The codebook: the beamforming of the surface and the base station while positioning.
+
+`Codebook` has the arrays and their ROS parameters and files, `Provenance` its origin.
+"""
 
 import dataclasses
 import functools
 import hashlib
+import json
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from rhs_isac_ros.codebook.provenance import from_parameter, to_parameter
+from rhs_isac_ros import __version__
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.scenario import check_shape
 from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support.files import read_yaml, write_whole
 
-# The node whose parameters a codebook file holds, in any namespace.
+# The node with the parameters of a codebook file, in any namespace.
 PARAMETER_NODE = '/**/optimizer'
 # Relative tolerance of the power constraint.
 _POWER_TOLERANCE = 1e-6
@@ -48,7 +53,7 @@ class Codebook:
     ------
     CodebookError
         If an array has the wrong number of dimensions or entries that are not finite, the sizes
-        of the arrays disagree, or a configuration is outside [0, 1].
+        disagree, or a configuration is outside [0, 1].
     """
 
     analog: np.ndarray
@@ -129,14 +134,10 @@ class Codebook:
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> 'Codebook':
-        """Create a codebook from the parameters that `to_parameters` returns.
+        """Create a codebook from parameters as `to_parameters` returns them.
 
-        ``codebook.id`` may be empty or missing.
-
-        Raises
-        ------
-        CodebookError
-            If a parameter is missing or malformed, or the id does not match the content.
+        ``codebook.id`` may be empty or missing. Raise CodebookError if a parameter is missing or
+        malformed, or the id does not match the content.
         """
         shape = parameters.get('codebook.shape')
         if not isinstance(shape, Sequence) or len(shape) != 5 or not all(
@@ -146,8 +147,8 @@ class Codebook:
         n_bands, n_subbands, n_frames, n_feeds, n_elements = shape
         digital_shape = (n_bands, n_subbands, n_frames, n_feeds)
         # `_array` compares the sizes before memory is allocated for a shape that may be too large.
-        real = _array(parameters, 'digital_re', digital_shape)
-        imag = _array(parameters, 'digital_im', digital_shape)
+        real, imag = (_array(parameters, name, digital_shape)
+                      for name in ('digital_re', 'digital_im'))
         digital = np.empty(digital_shape, complex)
         digital.real, digital.imag = real, imag
         codebook = cls(
@@ -172,13 +173,7 @@ class Codebook:
 
     @classmethod
     def load(cls, path: str | Path) -> 'Codebook':
-        """Read a codebook from a ROS 2 parameter file.
-
-        Raises
-        ------
-        CodebookError
-            If the file cannot be read or contains no valid codebook.
-        """
+        """Read a ROS 2 parameter file, or raise CodebookError if it has no valid codebook."""
         try:
             content = read_yaml(path)
         except ValueError as error:
@@ -226,10 +221,7 @@ def _array(parameters: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.
 def default_codebook_file() -> Path:
     """Return the path of the default codebook, ``config/codebook.yaml``.
 
-    Raises
-    ------
-    CodebookError
-        If the package was installed without its data files.
+    Raise CodebookError if the package was installed without its data files.
     """
     # Every installation scheme puts share/ into a folder above the modules: the prefix of pip and
     # colcon, or the folder of pip's --target. A clone has config/ beside the package.
@@ -241,3 +233,136 @@ def default_codebook_file() -> Path:
             return file
     raise CodebookError(f'codebook.yaml: not found in {folders[0]}, nor in '
                         f'share/rhs_isac_ros/config of any folder above {package}')
+
+
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """The arguments of an optimisation and the progress it made.
+
+    Attributes
+    ----------
+    positions
+        Number of positions.
+    scenario
+        Fields of the scenario that differ from Table I.
+    version
+        Version of this package.
+    calibration
+        Id of the calibration; empty without one.
+    steps, evaluations
+        Totals, including the runs that it resumed.
+    value_m2
+        The objective [m^2].
+    reason
+        Why the search stopped.
+    """
+
+    method: str
+    objective: str
+    seed: int
+    sampling: str
+    positions: int
+    scenario: dict[str, Any]
+    version: str = __version__
+    calibration: str = ''
+    steps: int = 0
+    evaluations: int = 0
+    value_m2: float = math.nan
+    reason: str = ''
+
+    def to_text(self) -> str:
+        """Return one line that describes a result, for `Codebook.provenance`."""
+        fields = dataclasses.asdict(self)
+        if not self.calibration:
+            del fields['calibration']
+        return encode(fields)
+
+    def resumed(self, text: str) -> 'Provenance':
+        """Return the provenance of an earlier result, to resume it.
+
+        Raise ValueError unless it is the result of an optimisation with the same arguments.
+        """
+        earlier = Provenance.parse(text)
+        if earlier is None:
+            raise ValueError(f'resume: provenance {text!r}, expected that of an optimisation')
+        for name in ('method', 'objective', 'seed', 'sampling', 'positions', 'scenario',
+                     'calibration'):
+            given, expected = getattr(self, name), getattr(earlier, name)
+            if given != expected:
+                raise ValueError(
+                    f'{name}: {given!r}, expected {expected!r} as in the codebook to resume from')
+        return earlier
+
+    @classmethod
+    def parse(cls, text: str) -> 'Provenance | None':
+        """Parse the text that `to_text` returns; return None for any other text."""
+        try:
+            return cls(**decode(from_parameter(text)))
+        except (TypeError, ValueError, RecursionError):
+            return None
+
+
+# ``ros2 param load`` parses each value of a file as YAML a second time, so that a string such as
+# ``{seed: 0}`` becomes a mapping, which it cannot send. A plain string in YAML is preserved. It
+# needs no quotes. Its only separators are single spaces, so that ``, `` separates the fields.
+_WORDS = re.compile(r'[A-Za-z][\w.+-]*( [\w.+-]+)*', re.ASCII)
+# Values of JSON that look like words.
+_CONSTANTS = {'null', 'true', 'false', 'NaN', 'Infinity'}
+_NOTE = 'note='
+
+
+def encode(fields: Mapping[str, Any]) -> str:
+    """Return fields as ``name=value, name=value``; a value is plain words or JSON."""
+    return ', '.join(
+        f'{name}={value if _is_bare(value) else _to_json(value)}'
+        for name, value in fields.items())
+
+
+def decode(text: str) -> dict[str, Any]:
+    """Return the fields of a text that `encode` returned, or raise ValueError."""
+    pairs = [part.partition('=') for part in text.split(', ')]
+    if not all(name and separator for name, separator, _ in pairs):
+        raise ValueError(f'{text!r}, expected name=value, name=value')
+    return {name: value if _is_bare(value) else json.loads(value) for name, _, value in pairs}
+
+
+def to_parameter(text: str) -> str:
+    """Return any text as a string that YAML parses as the same string."""
+    if not text or _parse_yaml(text) == text and not text.startswith(_NOTE):
+        return text
+    return _NOTE + _to_json(text)
+
+
+def from_parameter(text: str) -> str:
+    """Return the text for which `to_parameter` returned a string.
+
+    The mapping in YAML that versions up to 0.1.0 wrote becomes the text of `encode`.
+    """
+    legacy = _parse_yaml(text) if text.startswith('{') else None
+    if isinstance(legacy, dict):
+        return encode(legacy)
+    if not text.startswith(f'{_NOTE}"'):
+        return text
+    try:
+        return str(json.loads(text.removeprefix(_NOTE)))
+    except ValueError:
+        return text
+
+
+def _to_json(value: Any) -> str:
+    # Compact JSON contains spaces only within strings, where they can be escaped.
+    return json.dumps(value, separators=(',', ':'), default=str).replace(' ', r'\u0020')
+
+
+def _is_bare(value: Any) -> bool:
+    return (isinstance(value, str) and bool(_WORDS.fullmatch(value))
+            and value not in _CONSTANTS)
+
+
+def _parse_yaml(text: str) -> Any:
+    """Return the value of a text in YAML; None if it is invalid."""
+    try:
+        return yaml.safe_load(text)
+    # PyYAML raises ValueError for impossible dates and RecursionError for deep nesting.
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return None

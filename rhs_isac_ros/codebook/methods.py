@@ -1,8 +1,8 @@
 """Optimisation methods: each minimises a `Search` and returns the reason for stopping.
 
 The default is L-BFGS-B, on samples of the pairs if there are many, and followed by exchanges if
-the elements have a few amplitudes. The alternating, direct and genetic methods are those of the
-paper and its references.
+the elements have a few amplitudes. The paper and its references describe the alternating, direct
+and genetic methods.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def run_lbfgs(
         on_step: Callable[[], None], memory: int = _MEMORY) -> OptimizeResult:
     """Minimise a function that returns its value and gradient, with SciPy's L-BFGS-B.
 
-    The result does not depend on the unit of the function, whose value is positive. `on_step` is
-    called after each of at most `max_steps` steps; `memory` is the number of corrections.
+    The result does not depend on the unit of the function, whose value is positive. L-BFGS-B calls
+    `on_step` after each step.
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
@@ -80,14 +80,14 @@ _DIGITAL_SCALE = 0.3
 def minimize_sampled(search: Search) -> str:
     """Minimise with L-BFGS-B on samples of the pairs; return the reason for stopping.
 
-    Each round draws a sample for the codebook that the previous one has found, as
-    `PairwiseErrorCost.sample` describes, and evaluates this codebook with all pairs. The search
-    ends with its steps, or with a round that does not lower the objective.
+    Each round draws a sample for the codebook of the previous round, see
+    `PairwiseErrorCost.sample`, and evaluates its result with all pairs. The search ends with its
+    steps, or with a round that does not lower the objective.
     """
     variables, left = search.start, search.max_steps
     value = search.value_m2
     for n_pairs, steps in itertools.chain(_ROUNDS, itertools.repeat(_ROUNDS[-1])):
-        done, variables = _round(search, variables, min(n_pairs, search.n_pairs),
+        done, variables = _round(search, variables, min(n_pairs, search.problem.n_pairs),
                                  min(steps, left))
         left -= done
         if not left:
@@ -142,11 +142,11 @@ _MAX_FAILURES = 64
 def minimize_levels(search: Search) -> str:
     """Minimise over levels of the amplitudes, and return the reason for stopping.
 
-    Three phases follow each other. The first treats amplitudes as continuous. The second adds
-    the penalty sin^2(pi (L - 1) c), which is zero at the L levels, with growing weight: the
-    amplitudes reach the levels while the others and the combining vectors adapt. The third
-    exchanges single amplitudes for neighbouring levels, in the order of the gradient, as long as
-    that lowers the objective. L-BFGS-B minimises over continuous variables.
+    The first of three phases treats amplitudes as continuous. The second adds the penalty
+    sin^2(pi (L - 1) c), which is zero at the L levels, with growing weight: the amplitudes reach
+    the levels while the others and the combining vectors adapt. The third exchanges single
+    amplitudes for neighbouring levels, in the order of the gradient, as long as that lowers the
+    objective. L-BFGS-B minimises over continuous variables.
     """
     share = _PENALISED / len(_WEIGHTS)
     variables, left = search.start, search.max_steps
@@ -162,7 +162,7 @@ def minimize_levels(search: Search) -> str:
 def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int) -> np.ndarray:
     """Minimise the relaxed objective plus a penalty, and evaluate the rounded result."""
     scale = weight * search.relaxed_value_and_gradient(start)[0] / search.n_analog
-    frequency = np.pi * (search.amplitude_levels - 1)
+    frequency = np.pi * _top_level(search)
 
     def objective(variables: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = search.relaxed_value_and_gradient(variables)
@@ -177,7 +177,7 @@ def _penalised(search: Search, start: np.ndarray, weight: float, max_steps: int)
 
 def _exchange(search: Search, variables: np.ndarray, max_steps: int) -> str:
     """Exchange single amplitudes until none lowers the objective; return why it stopped."""
-    levels = search.amplitude_levels - 1
+    levels = _top_level(search)
     variables = np.array(variables)
     variables[:search.n_analog] = np.rint(variables[:search.n_analog] * levels) / levels
     while max_steps > 0:
@@ -197,10 +197,10 @@ def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
            ) -> tuple[np.ndarray, int, int, int]:
     """Exchange amplitudes in the order of the expected decrease.
 
-    Returns the variables, the number of exchanges, that of failures since the last one, and that
-    of the amplitudes that have a level in the direction of descent.
+    Returns the variables, and the numbers of exchanges, of failures since the last one, and of
+    amplitudes with a level in the direction of descent.
     """
-    levels = search.amplitude_levels - 1
+    levels = _top_level(search)
     value, gradient = search.value_and_gradient(variables)
     by_analog = gradient[:search.n_analog]
     target = variables[:search.n_analog] - np.sign(by_analog) / levels
@@ -224,21 +224,18 @@ def _sweep(search: Search, variables: np.ndarray, max_exchanges: int
 
 def _digital(search: Search, start: np.ndarray, max_steps: int) -> tuple[int, np.ndarray]:
     """Minimise over the combining vectors alone; return the steps taken and the variables."""
-    steps = 0
-
     def objective(digital: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = search.value_and_gradient(
             np.concatenate([start[:search.n_analog], digital]))
         return value, gradient[search.n_analog:]
 
-    def on_step() -> None:
-        nonlocal steps
-        steps += 1
-        search.on_step()
-
     result = run_lbfgs(objective, start[search.n_analog:], search.bounds[search.n_analog:],
-                       max_steps, on_step)
-    return steps, np.concatenate([start[:search.n_analog], result.x])
+                       max_steps, search.on_step)
+    return result.nit, np.concatenate([start[:search.n_analog], result.x])
+
+
+def _top_level(search: Search) -> int:
+    return search.problem.scenario.amplitude_levels - 1
 
 
 # Initial weight of the barrier; the objective is scaled to 1 at the start.
@@ -251,18 +248,8 @@ def minimize_interior_point(
     """Minimise over the free variables: barrier, trust region, conjugate gradients, BFGS Hessian.
 
     SciPy's `trust-constr` is the algorithm of Byrd, Hribar and Nocedal that the paper cites.
-
-    Parameters
-    ----------
-    start
-        Initial values of all variables, float64 [n].
-    free
-        Mask of the variables to change, bool [n].
-
-    Returns
-    -------
-    numpy.ndarray
-        The best point evaluated, `start` included, float64 [n].
+    Takes all variables, float64 [n], and the mask of those to change, bool [n]. Returns the best
+    point evaluated, `start` included, float64 [n].
     """
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import BFGS, Bounds, minimize
@@ -314,8 +301,7 @@ _ITERATIONS = 4
 def minimize_alternating(search: Search) -> str:
     """Implements Algorithm 1. Solve sP1 and sP2 alternately until neither changes a variable.
 
-    The steps of the search are divided evenly among the 2 N_itr sub-problems. Returns the reason
-    for stopping.
+    The 2 N_itr sub-problems share the steps of the search evenly.
     """
     steps = max(search.max_steps // (2 * _ITERATIONS), 1)
     remaining = search.max_steps
@@ -348,8 +334,7 @@ def minimize_genetic(search: Search) -> str:
     """Minimise with pymoo's genetic algorithm, one step a generation.
 
     Only the direction of a combining vector matters, so its unscaled parts are searched in
-    [-1, 1]. The first generation contains the start. Returns the reason for stopping; raises
-    MissingLibraryError if pymoo is not installed.
+    [-1, 1]. The first generation contains the start. Raise MissingLibraryError without pymoo.
     """
     with optional_import("method 'genetic'", extra='genetic'):
         from pymoo.algorithms.soo.nonconvex.ga import GA

@@ -1,7 +1,9 @@
-"""Objectives of the codebook optimisation.
+"""Objectives of the codebook optimisation, and the samples of the region that they average over.
 
-`tick` is called repeatedly while the parts of an objective that do not depend on the codebook are
-computed; an exception ends the computation.
+An objective takes a scenario, sampled positions, float64 [N_sam, 3] [m], and a generator, and
+raises ValueError if the positions are not a finite [N, 3] array with at least one row. It calls
+`tick` repeatedly while it computes the parts that do not depend on the codebook; an exception of
+`tick` ends the computation.
 """
 
 import dataclasses
@@ -12,9 +14,10 @@ import numpy as np
 from rhs_isac_ros.bounds import AverageCrlb, PairwiseErrorCost
 from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.bounds.rows import Tick, no_tick
-from rhs_isac_ros.codebook.sampling import WIDE, confusable_volumes, draw_confusable
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import element_interval_m
 from rhs_isac_ros.model.los import checked_positions
+from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 
 # Relative error of an objective's rows. The error of its value is then below 0.1 %, far less than
 # the sampling error, and the gradient is exact for that value.
@@ -30,10 +33,7 @@ _VOLUME_POWER = 0.6
 def average_bound(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
-    """Implements Eq. (17). Objective of P1 [m^2] on sampled positions, float64 [N_sam, 3] [m].
-
-    Raise ValueError if `positions` is empty or not a finite [N, 3] array. `rng` is unused.
-    """
+    """Implements Eq. (17). Objective of P1 [m^2] on sampled positions; `rng` is unused."""
     return AverageCrlb(scenario, positions, ROW_TOLERANCE, tick=tick)
 
 
@@ -43,12 +43,9 @@ def nuisance(
     """Objective [m^2]: average bound with unknown phases of the bands and the region as prior.
 
     A phase is unknown in effect even where the signals carry it, because the same phase occurs in
-    each wavelength of range. The information of the region keeps positions that the rest of the
-    signals does not determine from dominating the average. Further nuisance parameters are those
-    that the scenario declares.
-
-    The positions are float64 [N_sam, 3] [m]. Raise ValueError if `positions` is empty or not a
-    finite [N, 3] array. `rng` is unused.
+    each wavelength of range. Without the information of the region, positions that the signals do
+    not determine otherwise would dominate the average. The scenario may declare further nuisance
+    parameters. `rng` is unused.
     """
     uniform = dataclasses.replace(
         scenario, band_phase_std_rad=max(scenario.band_phase_std_rad, 2 * np.pi))
@@ -58,11 +55,7 @@ def nuisance(
 def ambiguity(
         scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
         tick: Tick = no_tick) -> Average:
-    """Objective [m^2]: mean cost of confusing sampled positions with similar-looking ones.
-
-    The positions are float64 [N_sam, 3] [m]; `rng` draws those that they may be confused with.
-    Raise ValueError if `positions` is empty or not a finite [N, 3] array.
-    """
+    """Objective [m^2]: mean cost of confusing sampled positions with similar-looking ones."""
     first_positions = np.repeat(positions, _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng)
     return PairwiseErrorCost(
@@ -77,9 +70,6 @@ def error(
     Pairs extend farther across the line of sight, up to the far side lobes. Their weights grow
     with the volume that each represents, see `confusable_volumes`: with the volumes themselves,
     the cost would be proportional to the union bound on the mean squared error.
-
-    The positions are float64 [N_sam, 3] [m]; `rng` draws those that they may be confused with.
-    Raise ValueError if `positions` is empty or not a finite [N, 3] array.
     """
     first_positions = np.repeat(checked_positions(positions), _PAIRS_PER_POSITION, axis=0)
     second_positions = draw_confusable(scenario, first_positions, rng, WIDE)
@@ -92,5 +82,134 @@ def error(
 
 
 OBJECTIVES: Mapping[str, Callable[..., Average]] = {
-    'ambiguity': ambiguity, 'crlb': average_bound, 'error': error,
-    'nuisance': nuisance}
+    'ambiguity': ambiguity, 'crlb': average_bound, 'error': error, 'nuisance': nuisance}
+
+
+def monte_carlo(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw independent uniform positions, as the paper does, float64 [n, 3] [m]."""
+    return scenario.sample_positions(n, rng)
+
+
+def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw scrambled Sobol points, which are more evenly spread, float64 [n, 3] [m].
+
+    A power of two for `n` gives the most even spread.
+    """
+    # A slow import, which loading a codebook does not need.
+    from scipy.stats import qmc
+
+    points = qmc.Sobol(3, scramble=True, seed=rng).random_base2(max(n - 1, 0).bit_length())[:n]
+    low, high = scenario.roi_bounds_m
+    return low + (high - low) * points
+
+
+SAMPLINGS: Mapping[str, Callable[[Scenario, int, np.random.Generator], np.ndarray]] = {
+    'monte_carlo': monte_carlo, 'sobol': sobol}
+
+# Grid points of the range lag per shortest carrier wavelength.
+_LAGS_PER_WAVELENGTH = 64
+# Ranges of the scale of transverse displacements, in widths of the narrowest beam: up to the first
+# side lobes, and beyond.
+NEAR, WIDE = (0.03, 0.3), (0.03, 0.6)
+# Fraction of the pairs that differ in direction only.
+_ZERO_LAG_FRACTION = 0.3
+# Lags in radians, and squared displacements in beam widths, that are zero but for rounding.
+_ROUNDING = 1e-7
+# Number of attempts to draw a position inside the region.
+_MAX_DRAWS = 200
+
+
+def draw_confusable(
+        scenario: Scenario, positions: np.ndarray, rng: np.random.Generator,
+        scales: tuple[float, float] = NEAR) -> np.ndarray:
+    """Draw for each position another one in the region of interest that has similar signals.
+
+    Two positions are hard to distinguish if their ranges differ by about a whole number of
+    wavelengths in every band, so range lags are drawn with a density proportional to
+    exp(-sum_i (1 - cos 2 pi f_i lag / v_0)). For a fraction of the positions the lag is 0: these
+    pairs differ in direction only. Across the line of sight, the displacement ranges from well
+    below the beam width up to the side lobes. Positions are float64 [N, 3] [m]; `scales` are the
+    limits of the log-uniform scale of this displacement, in widths of the narrowest beam.
+    """
+    low, high = scenario.roi_bounds_m
+    lags, density = _lag_density(scenario)
+    cumulative = np.cumsum(density)
+    cumulative = (cumulative - cumulative[0]) / (cumulative[-1] - cumulative[0])
+    lagging = rng.uniform(size=len(positions)) >= _ZERO_LAG_FRACTION
+    others = np.array(positions)
+    pending = np.arange(len(positions))
+    for _ in range(_MAX_DRAWS):
+        lag = np.interp(rng.uniform(size=len(pending)), cumulative, lags) * lagging[pending]
+        moved = _displaced(scenario, positions[pending], lag, rng, scales)
+        # Clipping covers regions so thin, compared with a beam, that no draw is inside.
+        others[pending] = np.clip(moved, low, high)
+        pending = pending[~((moved >= low) & (moved <= high)).all(axis=1)]
+    return others
+
+
+def confusable_volumes(
+        scenario: Scenario, positions: np.ndarray, others: np.ndarray,
+        scales: tuple[float, float]) -> np.ndarray:
+    """Compute the volumes that positions from `draw_confusable` represent, float64 [N].
+
+    They are the reciprocal densities of the draws, so that weighted sums over the draws are
+    integrals over the region. The unit is proportional to the volume that the posterior of the
+    true position occupies: with signals whose amplitude is inversely proportional to the range
+    r, it grows as r^5.
+    """
+    # Lags of zero stand for those below the phase of a radian.
+    shortest = SPEED_OF_LIGHT_MPS / (2 * np.pi * max(scenario.center_frequencies_hz))
+    ranges, other_ranges = (
+        np.maximum(np.linalg.norm(points, axis=1), shortest) for points in (positions, others))
+    lags, density = _lag_density(scenario)
+    lag = np.abs(other_ranges - ranges)
+    by_lag = np.where(lag < _ROUNDING * shortest, _ZERO_LAG_FRACTION / shortest,
+                      (1 - _ZERO_LAG_FRACTION) * np.interp(lag, lags, density))
+    cosine = np.sum(positions * others, axis=1) / (ranges * other_ranges)
+    # The squared displacement in beam widths; its density is an average of Gaussians.
+    square = np.maximum(
+        (1 / np.clip(cosine, 0.01, 1)**2 - 1) / _beam_width(scenario)**2, _ROUNDING)
+    narrow, wide = (np.exp(-square / (2 * scale**2)) for scale in scales)
+    by_direction = (wide - narrow) / (2 * np.pi * square * np.log(scales[1] / scales[0]))
+    return other_ranges**2 / (
+        ranges**5 * np.maximum(by_lag * by_direction, np.finfo(float).tiny))
+
+
+def _displaced(scenario: Scenario, positions: np.ndarray, lags: np.ndarray,
+               rng: np.random.Generator, scales: tuple[float, float]) -> np.ndarray:
+    """Move positions by range lags of random sign and randomly across the line of sight."""
+    n, (low, high) = len(positions), scenario.roi_bounds_m
+    free = high > low
+    ranges = np.linalg.norm(positions, axis=1, keepdims=True)
+    sight = positions / np.maximum(ranges, 1e-9)
+    least, most = np.log(scales)
+    scale = np.exp(rng.uniform(least, most, size=(n, 1))) * _beam_width(scenario) * ranges
+    transverse = rng.normal(size=(n, 3)) * scale
+    transverse -= sight * np.sum(transverse * sight, axis=1, keepdims=True)
+    lags = lags * rng.choice([-1, 1], size=n)
+    moved = positions + free * transverse
+    # Coordinates without extent stay as they are, and the others determine the range.
+    wanted = ranges[:, 0] + lags
+    within = np.sqrt(np.maximum(wanted**2 - np.sum(moved[:, ~free]**2, axis=1), 0))
+    within = np.copysign(within, wanted) / np.linalg.norm(moved[:, free], axis=1)
+    moved[:, free] *= within[:, None]
+    return moved
+
+
+def _lag_density(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Return lags up to the diagonal of the region [m] and their probability density [1/m]."""
+    low, high = scenario.roi_bounds_m
+    frequencies = np.array(scenario.center_frequencies_hz)[:, None]
+    shortest = SPEED_OF_LIGHT_MPS / frequencies.max()
+    longest = np.linalg.norm(high - low)
+    lags = np.linspace(0, longest, 2 + int(longest / shortest * _LAGS_PER_WAVELENGTH))
+    mismatch = np.sum(1 - np.cos(2 * np.pi * frequencies * lags / SPEED_OF_LIGHT_MPS), axis=0)
+    density = np.exp(-mismatch)
+    return lags, density / (density.mean() * longest)
+
+
+def _beam_width(scenario: Scenario) -> float:
+    """Return the width of the narrowest beam that the surface can form [rad]."""
+    shortest = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+    side = max(scenario.n_columns, scenario.n_rows) * element_interval_m(scenario)
+    return float(min(shortest / side, 1.0))

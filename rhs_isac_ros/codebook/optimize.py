@@ -9,7 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
-from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.codebook.codebook import Codebook, Provenance
 from rhs_isac_ros.codebook.methods import (
     FEWEST_PAIRS,
     minimize_alternating,
@@ -19,10 +19,8 @@ from rhs_isac_ros.codebook.methods import (
     minimize_levels,
     minimize_sampled,
 )
-from rhs_isac_ros.codebook.objective import OBJECTIVES
+from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress, Search
-from rhs_isac_ros.codebook.provenance import Provenance
-from rhs_isac_ros.codebook.sampling import SAMPLINGS
 from rhs_isac_ros.codebook.starts import STARTS, random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import checked_positions
@@ -39,21 +37,21 @@ INTERRUPTED = 'interrupted'
 class Method(NamedTuple):
     """An optimisation method with its default limit on update steps.
 
-    `minimize` takes a `Search` and returns the reason for stopping. `minimize` is None for a
-    method whose result is its start; its objective is not set up.
+    `minimize` takes a `Search` and returns the reason for stopping. It is None for a method whose
+    result is its start.
     """
 
     minimize: Callable[[Search], str] | None
-    steps: int
+    steps: int = 1
 
 
 METHODS: Mapping[str, Method] = {
     'alternating': Method(minimize_alternating, 400),
     'direct': Method(minimize_direct, 400),
-    'directional': Method(None, 0),
+    'directional': Method(None),
     'genetic': Method(minimize_genetic, 10),
     'lbfgs': Method(minimize_lbfgs, 3000),
-    'random': Method(None, 0),
+    'random': Method(None),
 }
 
 
@@ -142,7 +140,7 @@ def optimize(
         if value not in known:
             raise ValueError(f'{name}: {value!r}, expected one of {sorted(known)}')
     if max_steps is None:
-        max_steps = METHODS[method].steps or 1
+        max_steps = METHODS[method].steps
     for name, number, low in (('n_positions', n_positions, 1), ('seed', seed, 0),
                               ('max_evaluations', max_evaluations, 1),
                               ('max_steps', max_steps, 1)):
@@ -197,10 +195,10 @@ def optimize(
     minimize = _minimizer(problem, method)
     search = Search(
         problem, problem.pack(first), max_steps, max_evaluations,
-        streams.generator(seed, streams.METHOD),
-        _PeriodicCall(report, lambda: keep(
-            result(problem.unpack(search.best), search.history, 'not finished')))
-        if keep else report, (done.steps, done.evaluations))
+        streams.generator(seed, streams.METHOD), report, (done.steps, done.evaluations))
+    if keep:
+        report.keep = lambda: keep(
+            result(problem.unpack(search.best), search.history, 'not finished'))
     reason = _run(search, minimize)
     return result(problem.unpack(search.best), search.history, reason)
 
@@ -208,21 +206,20 @@ def optimize(
 def check_start(codebook: Codebook, scenario: Scenario) -> None:
     """Raise CodebookError if a search for a scenario cannot start from a codebook.
 
-    Its amplitudes may be continuous even if those of the scenario are not, because the search
-    over levels begins with continuous amplitudes.
+    Its amplitudes may be continuous even if the amplitudes of the scenario are not: a search over
+    levels begins with continuous ones.
     """
     codebook.check(dataclasses.replace(scenario, amplitude_levels=0))
 
 
 def _minimizer(problem: Problem, method: str) -> Callable[[Search], str]:
     """Return the function of a method, or raise ValueError if it needs continuous amplitudes."""
-    scenario = problem.scenario
-    if scenario.amplitude_levels and method == 'lbfgs':
+    levels = problem.scenario.amplitude_levels
+    if levels and method == 'lbfgs':
         return minimize_levels
-    if scenario.amplitude_levels and method in ('alternating', 'direct'):
-        raise ValueError(
-            f'method: {method!r} with amplitude_levels = {scenario.amplitude_levels}, expected '
-            "'lbfgs' or 'genetic'")
+    if levels and method in ('alternating', 'direct'):
+        raise ValueError(f'method: {method!r} with amplitude_levels = {levels}, expected '
+                         "'lbfgs' or 'genetic'")
     if method == 'lbfgs' and problem.n_pairs >= FEWEST_PAIRS:
         return minimize_sampled
     minimize = METHODS[method].minimize
@@ -253,40 +250,27 @@ def _run(search: Search, minimize: Callable[[Search], str]) -> str:
 
 
 class _Report:
-    """Progress callback that is also called once a second before the first step."""
+    """Progress callback that is also called during the set-up, and calls `keep` periodically."""
 
-    _PERIOD_S = 1.0
+    _TICK_S, _KEEP_S = 1.0, 10.0
 
     def __init__(self, progress: Callable[[Progress], None] | None, before: Progress) -> None:
+        self.keep: Callable[[], None] | None = None
         self._progress, self._before = progress, before
-        self._begin, self._is_searching = time.perf_counter(), False
+        self._begin, self._is_searching, self._kept_s = time.perf_counter(), False, 0.0
 
     def __call__(self, entry: Progress) -> None:
         self._is_searching = True
         if self._progress:
             self._progress(entry)
+        if self.keep and entry.elapsed_s >= self._kept_s + self._KEEP_S:
+            self._kept_s = entry.elapsed_s
+            self.keep()
 
     def tick(self) -> None:
-        """Report the time since the beginning, at most once per period."""
+        """Report the time since the beginning, at most once a second."""
         elapsed_s = time.perf_counter() - self._begin
-        if not (self._is_searching or elapsed_s < self._before.elapsed_s + self._PERIOD_S):
+        if not (self._is_searching or elapsed_s < self._before.elapsed_s + self._TICK_S):
             self._before = dataclasses.replace(self._before, elapsed_s=elapsed_s)
             if self._progress:
                 self._progress(self._before)
-
-
-class _PeriodicCall:
-    """Progress callback that also calls `keep`, but at most once per period."""
-
-    _PERIOD_S = 10.0
-
-    def __init__(self, progress: Callable[[Progress], None] | None,
-                 keep: Callable[[], None]) -> None:
-        self._progress, self._keep, self._last_s = progress, keep, 0.0
-
-    def __call__(self, entry: Progress) -> None:
-        if self._progress:
-            self._progress(entry)
-        if entry.elapsed_s >= self._last_s + self._PERIOD_S:
-            self._last_s = entry.elapsed_s
-            self._keep()

@@ -35,16 +35,7 @@ def plot_optimization(
         path: str | Path) -> None:
     """Plot convergence, the bound over the region of interest, and the beam patterns.
 
-    The suffix of `path` determines the file format.
-
-    Raises
-    ------
-    MissingLibraryError
-        If matplotlib is not installed.
-    ValueError
-        If the suffix is not one of `PICTURE_FORMATS`.
-    OSError
-        If the file cannot be written.
+    Errors are those of `paper_style` and `write_picture`.
     """
     write_picture(path, compose(scenario, codebook, history))
 
@@ -73,10 +64,10 @@ def compose(scenario: Scenario, codebook: Codebook, history: Sequence[Progress])
 
 def beam_powers(
         scenario: Scenario, codebook: Codebook, band: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power of every frame's beam over azimuth, in the middle sub-band of a band.
+    """Return azimuths, float64 [n] [rad], and the received powers, float64 [F, n] [W].
 
-    The azimuths are float64 [361] [rad], at the height and distance of the centre of the region
-    of interest; the powers that a user there would receive are float64 [F, 361] [W].
+    The user is at the height and distance of the centre of the region of interest, and receives
+    the middle sub-band of a band.
     """
     azimuths = np.linspace(-np.pi / 2, np.pi / 2, _N_AZIMUTHS)
     x, y, z = scenario.roi_center_m

@@ -55,13 +55,9 @@ class Problem:
         return cost.rows.n_items if isinstance(cost, PairwiseErrorCost) else 0
 
     def sample(self, variables: np.ndarray, n_pairs: int, rng: np.random.Generator) -> 'Problem':
-        """Return the problem with a sample of the pairs, see `PairwiseErrorCost.sample`.
-
-        Raise ValueError if the objective has fewer pairs.
-        """
+        """Return the problem with a sample of the `n_pairs`, see `PairwiseErrorCost.sample`."""
         cost = self.objective
-        if not isinstance(cost, PairwiseErrorCost):
-            raise ValueError('objective: expected one of pairs to draw a sample of')
+        assert isinstance(cost, PairwiseErrorCost)
         return Problem(self.scenario, cost.sample(self.unpack(variables), n_pairs, rng))
 
     def value(self, variables: np.ndarray) -> float:
@@ -72,7 +68,8 @@ class Problem:
             self, variables: np.ndarray, *, relaxed: bool = False) -> tuple[float, np.ndarray]:
         """Return the objective [m^2] and its gradient, float64, shaped like `variables`.
 
-        Both are those of the codebook of `unpack`. If relaxed, configurations are not rounded.
+        They belong to the codebook of `unpack` or, if relaxed, to configurations that are not
+        rounded.
         """
         _, raw, norm = self._split(variables)
         value, by_analog, by_digital = self.objective(self._codebook(variables, relaxed=relaxed))
@@ -99,19 +96,7 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Progress of an optimisation after a step.
-
-    Attributes
-    ----------
-    step
-        Update steps so far.
-    evaluations
-        Evaluations of the objective so far, with or without its gradient.
-    value_m2
-        Lowest objective so far [m^2].
-    elapsed_s
-        Time since the start [s].
-    """
+    """Steps and evaluations so far, the lowest objective, and the time since the start."""
 
     step: int
     evaluations: int
@@ -126,21 +111,13 @@ class BudgetSpent(Exception):
 class Search:
     """Objective that a method minimises; counts evaluations and keeps the best point.
 
-    Parameters
-    ----------
-    start
-        First point, float64 [n].
-    max_steps
-        Maximum number of update steps; each method defines what a step is.
-    max_evaluations
-        Maximum number of evaluations; None if unlimited.
-    progress
-        Called after each step.
-    done
-        Steps and evaluations of the search that this one resumes; they count towards the limits.
+    Each method defines what an update step is. `done` are the steps and evaluations of the search
+    that this one resumes, which count towards the limits.
 
     Attributes
     ----------
+    start
+        First point, float64 [n].
     max_steps
         Update steps that remain.
     value_m2
@@ -158,29 +135,17 @@ class Search:
             done: tuple[int, int] = (0, 0)) -> None:
         self._first_step, self._evaluations = done
         self.start, self.max_steps, self.rng = start, max_steps - self._first_step, rng
-        self.bounds, self.n_analog = problem.bounds, problem.n_analog
-        self._problem, self._progress = problem, progress
-        self._max_evaluations = max_evaluations
+        self.problem, self.bounds, self.n_analog = problem, problem.bounds, problem.n_analog
+        self._progress, self._max_evaluations = progress, max_evaluations
         self._begin = time.perf_counter()
         self.value_m2, self.best = np.inf, start
         self.history: list[Progress] = []
         self._last: tuple[np.ndarray, float, np.ndarray] | None = None
 
-    @property
-    def amplitude_levels(self) -> int:
-        """Number of amplitudes of an element; 0 if they are continuous."""
-        return self._problem.scenario.amplitude_levels
-
-    @property
-    def n_pairs(self) -> int:
-        """Number of pairs of the objective that samples are drawn from; 0 if it has no pairs."""
-        return self._problem.n_pairs
-
     def begin(self) -> float:
         """Evaluate the start [m^2] and record it as the first entry of the history.
 
-        An evaluation of the same point by an earlier search is not counted again. Raise
-        BudgetSpent if no evaluation is left.
+        An evaluation of the same point by an earlier search is not counted again.
         """
         if self._evaluations:
             self._evaluations -= 1
@@ -196,7 +161,7 @@ class Search:
     def value(self, variables: np.ndarray) -> float:
         """Evaluate the objective [m^2] at a point, float64 [n], or raise BudgetSpent."""
         self._count()
-        value = self._problem.value(variables)
+        value = self.problem.value(variables)
         self._keep_best(value, variables)
         return value
 
@@ -205,28 +170,25 @@ class Search:
         # A method begins by evaluating the point at which the previous one ended.
         if self._last is None or not np.array_equal(self._last[0], variables):
             self._count()
-            value, gradient = self._problem.value_and_gradient(variables)
+            value, gradient = self.problem.value_and_gradient(variables)
             self._keep_best(value, variables)
             self._last = np.array(variables), value, gradient
         return self._last[1:]
 
     def relaxed_value_and_gradient(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
-        """Evaluate as if amplitudes were continuous [m^2], [n], or raise BudgetSpent.
-
-        The point does not become the best one.
-        """
+        """Evaluate as if amplitudes were continuous; the point does not become the best one."""
         self._count()
-        return self._problem.value_and_gradient(variables, relaxed=True)
+        return self.problem.value_and_gradient(variables, relaxed=True)
 
     def sample(
             self, variables: np.ndarray, n_pairs: int
     ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
         """Return an estimate of `value_and_gradient` from a sample of the pairs at a point.
 
-        It counts evaluations as `value_and_gradient` does, and raises BudgetSpent if none would
-        be left for its result. Its points do not become the best one.
+        It also raises BudgetSpent if no evaluation would be left for its result. Its points do
+        not become the best one.
         """
-        problem = self._problem.sample(variables, n_pairs, self.rng)
+        problem = self.problem.sample(variables, n_pairs, self.rng)
 
         def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
             self._count(reserve=1)

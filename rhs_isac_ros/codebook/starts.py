@@ -1,7 +1,9 @@
 """Codebooks without optimisation: random ones, and focused beams that scan the region of interest.
 
-Both are benchmarks of the paper and starts of its optimisation. The paper leaves open which points
-the beams are focused on. `SCANS` contains three readings.
+Both are benchmarks of the paper and starts of its optimisation. The paper leaves open where the
+beams are focused. `SCANS` contains three readings, functions that return focal points, float64
+[F, N_B, 3] [m]. Frames of the first two alternate between points below and above mid-height:
+beams that were all symmetric in height could not distinguish up from down.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,19 +36,8 @@ def directional_codebook(
 
     The configuration follows the holographic principle. The weights of each sub-band are the
     matched filter of the resulting feed signals, with equal power in all sub-bands. The codebook
-    is deterministic; `rng` is unused.
-
-    Parameters
-    ----------
-    scan
-        One of `SCANS`: ``width``, N_B F points across the width of the region; ``width_per_band``,
-        F points across the width, the same in each band; ``grid``, F points of a grid across width
-        and height, the same in each band.
-
-    Raises
-    ------
-    ValueError
-        If the scan is unknown, or a gain pattern of the scenario is zero at a focal point.
+    is deterministic; `rng` is unused. `scan` is one of `SCANS`. Raise ValueError if it is unknown,
+    or a gain pattern of the scenario is zero at a focal point.
     """
     if scan not in SCANS:
         raise ValueError(f'scan: {scan!r}, expected one of {sorted(SCANS)}')
@@ -70,28 +61,20 @@ def directional_codebook(
 
 
 def width_points(scenario: Scenario) -> np.ndarray:
-    """Return N_B F focal points across the width of the region, float64 [F, N_B, 3] [m].
-
-    Consecutive points belong to different bands, so that each band scans the whole width. Frames
-    alternate between points below and above mid-height: beams that were all symmetric in height
-    could not distinguish up from down.
-    """
+    """Return N_B F points across the width of the region; each band scans the whole width."""
     n_frames, n_bands = scenario.n_frames, scenario.n_bands
     across = _centers(n_frames * n_bands).reshape(n_frames, n_bands)
     return _points(scenario, across, _alternating(n_frames)[:, None])
 
 
 def width_points_per_band(scenario: Scenario) -> np.ndarray:
-    """Return F focal points across the width, the same in each band, float64 [F, N_B, 3] [m].
-
-    Frames alternate between points below and above mid-height.
-    """
+    """Return F points across the width, the same in each band."""
     n_frames = scenario.n_frames
     return _points(scenario, _centers(n_frames)[:, None], _alternating(n_frames)[:, None])
 
 
 def grid_points(scenario: Scenario) -> np.ndarray:
-    """Return a grid of F focal points, the same in each band, float64 [F, N_B, 3] [m].
+    """Return a grid of F points across width and height, the same in each band.
 
     The number of rows is the largest divisor of F up to its root: four frames make a grid of
     2 x 2 points.
@@ -117,7 +100,6 @@ def _points(scenario: Scenario, across: np.ndarray, up: np.ndarray) -> np.ndarra
 
 
 def _centers(n: int) -> np.ndarray:
-    """Return the centres of n equal parts of the interval from 0 to 1."""
     return (np.arange(n) + 0.5) / n
 
 

@@ -36,7 +36,6 @@ from rhs_isac_ros.positioning import REGION_ESTIMATORS
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    HelpFormatter,
     input_file,
     integer,
     picture_file,
@@ -46,7 +45,6 @@ from rhs_isac_ros.support.arguments import (
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.pictures import write_picture
 
-PROGRAM = 'python3 -m rhs_isac_ros.experiments'
 # The bootstrap holds 2000 weights of each position.
 _MAX_POSITIONS = 10**5
 _MAX_SETTINGS = 10**4
@@ -55,10 +53,22 @@ _EPILOG = '\n\n'.join(textwrap.fill(f'{title}: {", ".join(names)}.', 79) for tit
     ('fields', (*FIELDS, CODEBOOK, ESTIMATOR)), ('measures', MEASURES)))
 
 
-def sweep(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit code of `run_command`, or 2 after a usage error."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    parser = ArgumentParser(
+        prog='python3 -m rhs_isac_ros.experiments',
+        description='Run experiments on the cores of this machine or on a Dask cluster.',
+        epilog='The option --help of an experiment lists its options.')
+    experiments = parser.add_subparsers(dest='experiment', required=True, metavar='experiment')
+    sweep = experiments.add_parser(
+        'sweep', help='measures over combinations of values of scenario fields',
+        description=__doc__, epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    _add_options(sweep)
+    return _sweep(sweep, parser.parse_args(arguments))
+
+
+def _sweep(parser: ArgumentParser, options: argparse.Namespace) -> int:
     _check(parser, options)
     try:
         base = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
@@ -72,10 +82,7 @@ def sweep(arguments: Sequence[str] | None = None) -> int:
     return run_command(lambda: _run(sweep, options))
 
 
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        prog=f'{PROGRAM} sweep', description=__doc__, epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+def _add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add('--vary', type=_type(lambda text: parse_axis(text).distinct()), action='append',
         required=True, metavar='FIELD=VALUE,...',
@@ -111,7 +118,6 @@ def _parser() -> ArgumentParser:
     add('--picture', type=picture_file, metavar='FILE',
         help='PNG, PDF or SVG file (default: sweep.png in the folder of the results)')
     add_run_options(parser, 'results/sweep')
-    return parser
 
 
 def _check(parser: ArgumentParser, options: argparse.Namespace) -> None:
@@ -185,24 +191,6 @@ def _type(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
     return parse_argument
-
-
-_COMMANDS = {'sweep': sweep}
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    parser = ArgumentParser(
-        prog=PROGRAM,
-        description='Run experiments on the cores of this machine or on a Dask cluster.',
-        formatter_class=HelpFormatter,
-        epilog='The option --help of an experiment lists its options.')
-    parser.add_argument('experiment', choices=_COMMANDS,
-                        help='sweep: measures over combinations of values of scenario fields')
-    # Only the first argument: all others belong to the experiment.
-    options = parser.parse_args(arguments[:1])
-    return _COMMANDS[options.experiment](arguments[1:])
 
 
 if __name__ == '__main__':

@@ -18,15 +18,14 @@ from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 
 class JobError(Exception):
-    """A job failed; the message names it."""
+    """A job failed; the message begins with its name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A call of the function of an experiment.
+    """A call of the function of an experiment with arguments that JSON can represent.
 
-    `name` is the name of the result file without suffix, unique in its folder; `arguments` are
-    keyword arguments of the function, JSON serialisable.
+    `name` is the name of the result file without suffix, unique in its folder.
     """
 
     name: str
@@ -34,9 +33,9 @@ class Job:
 
 
 class JobResult(NamedTuple):
-    """Result of a job as JSON in `text`, or the text of its error in `error`; the other is empty.
+    """Result of a job as JSON in `text`, or its error in `error`; the other is empty.
 
-    `version` is that of this package in the process that ran the job.
+    `version` is the version of this package in the process that ran the job.
     """
 
     job: Job
@@ -48,8 +47,7 @@ class JobResult(NamedTuple):
 def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
     """Run a job in the current process.
 
-    The function takes the job's arguments and returns a mapping that JSON can serialise.
-    Exceptions are returned as text, because not all of them can be pickled.
+    The result contains an exception as text, because not all exceptions can be pickled.
     """
     try:
         return JobResult(job, text=json.dumps(function(**job.arguments)))
@@ -59,43 +57,29 @@ def attempt(function: Callable[..., Mapping[str, Any]], job: Job) -> JobResult:
         return JobResult(job, error=traceback.format_exc())
 
 
-class ResultStore:
-    """Folder with one JSON file per result, which later runs reuse; it is created if necessary."""
+def _stored(folder: Path, job: Job) -> dict[str, Any] | None:
+    """Return the result of a job from its file.
 
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._folder = folder
-
-    def path(self, job: Job) -> Path:
-        """Return the file of a job's result, which may not exist yet."""
-        return self._folder / f'{job.name}.json'
-
-    def read(self, job: Job) -> dict[str, Any] | None:
-        """Return the stored result of a job.
-
-        The result is None if there is no file, the file is damaged, or it was written for other
-        arguments or by another version of this package.
-        """
-        try:
-            record = json.loads(self.path(job).read_bytes())
-        except (FileNotFoundError, ValueError):
-            return None
-        if not isinstance(record, dict) or not isinstance(record.get('result'), dict):
-            return None
-        if any(record.get(key) != value for key, value in _settings(job).items()):
-            return None
-        return record['result']
-
-    def write(self, job: Job, result: Mapping[str, Any]) -> None:
-        """Store the result of a job, replacing an existing one atomically, or raise OSError."""
-        record = {**_settings(job), 'result': result}
-        write_whole(self.path(job), json.dumps(record, indent=1) + '\n')
+    The result is None if there is no file, the file is damaged, or it was written for other
+    arguments or by another version of this package.
+    """
+    try:
+        record = json.loads(_file(folder, job).read_bytes())
+    except (FileNotFoundError, ValueError):
+        return None
+    if not isinstance(record, dict) or not isinstance(record.get('result'), dict):
+        return None
+    # JSON has no tuples.
+    expected = json.loads(json.dumps(_record(job, {})))
+    return record['result'] if record | {'result': {}} == expected else None
 
 
-def _settings(job: Job) -> dict[str, Any]:
-    """Return version and arguments as they are read back from JSON, which has no tuples."""
-    settings = {'version': __version__, 'arguments': dict(job.arguments)}
-    return json.loads(json.dumps(settings))
+def _record(job: Job, result: Mapping[str, Any]) -> dict[str, Any]:
+    return {'version': __version__, 'arguments': dict(job.arguments), 'result': result}
+
+
+def _file(folder: Path, job: Job) -> Path:
+    return folder / f'{job.name}.json'
 
 
 # Timeout for the scheduler of a cluster, and for its first worker.
@@ -109,15 +93,7 @@ def run_locally(
     """Run jobs in single-threaded processes on this machine; yield each result when it is ready.
 
     There are `n_jobs` processes: -1 selects one per core; 1 runs all jobs in this process.
-    Closing the generator ends them. Before joblib 1.4, a result also waits for those of all
-    earlier jobs.
-
-    Raises
-    ------
-    JobError
-        If a process dies.
-    MissingLibraryError
-        If joblib is not installed.
+    Closing the generator ends them. Before joblib 1.4, a result also waits for all earlier ones.
     """
     with optional_import('running jobs', extra='experiments'):
         import joblib
@@ -149,18 +125,11 @@ def run_locally(
 def run_on_cluster(
         function: Callable[..., Mapping[str, Any]], jobs: Sequence[Job], address: str
 ) -> Generator[JobResult, None, None]:
-    """Run jobs on a Dask cluster; yield each result when it is ready.
+    """Run jobs on the Dask cluster of a scheduler; yield each result when it is ready.
 
-    The address is that of the scheduler. Closing the generator cancels pending jobs. This uses
-    `distributed` directly: through joblib, jobs for a cluster with a single thread run in this
-    process instead, and the run never ends if a worker dies.
-
-    Raises
-    ------
-    ConnectionError
-        If there is no scheduler, or no worker.
-    MissingLibraryError
-        If distributed is not installed.
+    Closing the generator cancels pending jobs. This uses `distributed` directly: through joblib,
+    jobs for a cluster with a single thread run in this process instead, and the run never ends if
+    a worker dies.
     """
     with optional_import('running jobs on a Dask cluster', extra='experiments'):
         from distributed import Client, as_completed
@@ -190,11 +159,10 @@ def _return_as(version: str) -> str:
 
 @contextlib.contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore SIGINT inside the block, so that processes started there ignore it, too.
+    """Ignore SIGINT inside the block, so that processes started there inherit this.
 
     A terminal sends SIGINT to the whole process group, but only this process may end the
-    workers. Ignored signals are inherited. A blocked signal would be delivered after the block
-    instead of being lost, but joblib unblocks it.
+    workers. Blocking it would not lose a signal in the meantime, but joblib unblocks it.
     """
     # Only the main thread can set handlers, and only there SIGINT raises KeyboardInterrupt.
     if threading.current_thread() is not threading.main_thread():
@@ -213,25 +181,21 @@ def run_jobs(
     """Run the jobs that have no stored result; return all results in order, decoded from JSON.
 
     Each result is stored as soon as it is available. After an interruption or an error, the same
-    call resumes the experiment. A progress bar is shown on a terminal.
+    call resumes the experiment. A terminal shows a progress bar with a label.
 
     Parameters
     ----------
     function
         Callable that takes the arguments of a job and returns a dict that JSON can serialise.
     folder
-        Folder of the stored results.
+        Folder with one JSON file for each result.
     n_jobs
         Number of parallel jobs on this machine; -1 for one per core.
     dask
         Address of the scheduler of a Dask cluster to use instead.
-    label
-        Label of the progress bar.
 
     Raises
     ------
-    ValueError
-        If two jobs have the same name.
     JobError
         If a job fails, or its worker has another version of this package.
     ConnectionError
@@ -246,8 +210,8 @@ def run_jobs(
     with optional_import('showing progress', extra='experiments'):
         from tqdm import tqdm
 
-    store = ResultStore(folder)
-    known = {job.name: result for job in jobs if (result := store.read(job)) is not None}
+    folder.mkdir(parents=True, exist_ok=True)
+    known = {job.name: result for job in jobs if (result := _stored(folder, job)) is not None}
     pending = [job for job in jobs if job.name not in known]
     # None disables the bar if stderr is not a terminal.
     with tqdm(total=len(jobs), initial=len(known), unit='job', disable=None,
@@ -257,14 +221,16 @@ def run_jobs(
                            else run_locally(function, pending, n_jobs))
             with contextlib.closing(job_results):
                 for job_result in job_results:
-                    known[job_result.job.name] = result = _decoded(job_result)
-                    store.write(job_result.job, result)
+                    job = job_result.job
+                    known[job.name] = result = _decoded(job_result)
+                    write_whole(_file(folder, job),
+                                json.dumps(_record(job, result), indent=1) + '\n')
                     bar.update()
     return [known[job.name] for job in jobs]
 
 
 def _decoded(job_result: JobResult) -> dict[str, Any]:
-    """Decode the result of a job, or raise JobError if it failed or ran in another version."""
+    """Return the result of a job, or raise JobError if it failed or ran in another version."""
     name = job_result.job.name
     if job_result.error:
         raise JobError(f'job {name} failed: {job_result.error.strip()}')

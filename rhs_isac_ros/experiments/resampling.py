@@ -1,7 +1,7 @@
-"""Bootstrap intervals of comparisons, over cases alone or over cases and members."""
+"""Bootstrap intervals over cases and members, and intervals of shares."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,48 +9,6 @@ from scipy.special import ndtri, stdtrit
 
 _RESAMPLES = 2000
 _INTERVAL = (2.5, 97.5)
-
-
-def reduction(
-        samples: np.ndarray, baseline: np.ndarray,
-        statistic: Callable[[np.ndarray], np.ndarray], paired: bool = True
-) -> tuple[float, float, float]:
-    """Return the relative reduction of a statistic and its 95 % interval.
-
-    The interval is that of the percentile bootstrap, with a fixed seed.
-
-    Parameters
-    ----------
-    samples, baseline
-        Samples, float64 [N]; if paired, equal indices belong to the same case.
-    statistic
-        Callable that takes samples, float64 [..., N], and returns float64 [...].
-    paired
-        Whether to resample both with the same indices.
-
-    Returns
-    -------
-    tuple of float
-        Reduction and the ends of its interval [%]; NaN or infinite where the statistic of the
-        baseline is 0.
-
-    Raises
-    ------
-    ValueError
-        If a sample is empty, or paired samples differ in length.
-    """
-    samples, baseline = np.asarray(samples, dtype=float), np.asarray(baseline, dtype=float)
-    n_samples, n_baseline = len(samples), len(baseline)
-    if not n_samples or not n_baseline or (paired and n_samples != n_baseline):
-        raise ValueError(f'samples, baseline: {n_samples} and {n_baseline} values, expected at '
-                         'least one each, and the same number if paired')
-    rng = np.random.default_rng(0)
-    picks = rng.integers(n_samples, size=(_RESAMPLES, n_samples))
-    others = picks if paired else rng.integers(n_baseline, size=(_RESAMPLES, n_baseline))
-    with np.errstate(divide='ignore', invalid='ignore'):
-        reductions = 1 - statistic(samples[picks]) / statistic(baseline[others])
-        low, high = np.percentile(100 * reductions, _INTERVAL)
-        return 100 * float(1 - statistic(samples) / statistic(baseline)), float(low), float(high)
 
 
 class Replicates(NamedTuple):
@@ -65,8 +23,6 @@ class Replicates(NamedTuple):
         [1 + replicates]; NaN where a replicate has no result.
     by_member
         The same with all cases once: replicates that resample the members only.
-    n_members
-        Number of members.
     """
 
     values: np.ndarray
@@ -112,11 +68,6 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
         Seed of the resampled members; different for results with other members.
     quantiles
         Quantiles to compute instead of the mean, from 0 to 1.
-
-    Raises
-    ------
-    ValueError
-        If `results` has another shape or no finite value, or a quantile is out of range.
     """
     if results.ndim != 2 or not np.isfinite(results).any():
         raise ValueError(f'results: shape {results.shape}, expected [members, cases] with a '
@@ -137,13 +88,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
 
 
 def share_percent(count: int, total: int) -> tuple[float, float, float]:
-    """Return a share with its 95 % interval by Wilson, value, low and high [%].
-
-    Raises
-    ------
-    ValueError
-        If `total` is not positive.
-    """
+    """Return a share of a positive total with its 95 % interval by Wilson: value and ends [%]."""
     if total < 1:
         raise ValueError(f'total: {total}, expected at least 1')
     z2 = float(ndtri(0.975))**2
@@ -157,8 +102,7 @@ def _mean(results: np.ndarray, members: np.ndarray, cases: np.ndarray) -> np.nda
     present = np.isfinite(results)
     sums = cases @ np.where(present, results, 0.0).astype(np.float32).T
     counts = cases @ present.T.astype(np.float32)
-    means: np.ndarray = np.sum(members * sums, axis=1) / np.sum(members * counts, axis=1)
-    return means[None]
+    return (np.sum(members * sums, axis=1) / np.sum(members * counts, axis=1))[None]
 
 
 def _quantiles(results: np.ndarray, members: np.ndarray, cases: np.ndarray,

@@ -88,10 +88,10 @@ def with_power(codebook: Codebook, power_w: float) -> Codebook:
 
 def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '',
            steps: int = 0) -> dict[str, Any]:
-    """Make a codebook of one of `KINDS`, and return its parameters.
+    """Make a codebook of one of `KINDS` and return its parameters, as a job.
 
-    The scenario is given by the fields that differ from Table I. Only an optimisation has an
-    objective and steps.
+    `scenario` has the fields that differ from Table I. Only an optimisation has an objective and
+    steps.
     """
     world = Scenario(**scenario)
     if kind == DIRECTIONAL:
@@ -108,10 +108,10 @@ def design(scenario: Mapping[str, Any], kind: str, seed: int, objective: str = '
 
 def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, Any], seed: int,
              first: int, n: int, estimator: str = '') -> dict[str, list[float]]:
-    """Compute the quantities of a family at positions `first` to ``first + n`` of a sequence.
+    """Compute the quantities of a family at positions `first` to ``first + n``, as a job.
 
-    The seed determines the sequence, which is the same for all scenarios with the same region.
-    Lists of the result have a value for each position.
+    The seed determines the sequence of positions, which is the same for all scenarios with the
+    same region. Lists of the result have a value for each position.
     """
     world, book = Scenario(**scenario), Codebook.from_parameters(dict(codebook))
     if family == BOUND:
@@ -148,17 +148,14 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
 
 @functools.lru_cache(maxsize=1)
 def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
-    """Return an estimator for a scenario and a codebook as JSON, the same for successive jobs."""
+    """Return an estimator for JSON of scenario and codebook, the same for successive jobs."""
     _initialise_sobol()
     return make_estimator(name, Scenario(**json.loads(scenario)),
                           Codebook.from_parameters(json.loads(codebook)))
 
 
 def _initialise_sobol() -> None:
-    """Create a Sobol sequence, of which only one thread of a cluster's worker may be the first.
-
-    SciPy reads its table of direction numbers for the first sequence of a process, without a lock.
-    """
+    """Create a Sobol sequence: for the first of a process, SciPy reads a table without a lock."""
     with _FIRST_SOBOL:
         qmc.Sobol(1)
 
@@ -169,15 +166,7 @@ _STRUCTURE = ('center_frequencies_hz', 'n_subbands', 'n_frames', 'elements_per_s
 
 
 class Results(NamedTuple):
-    """Quantities of a setting at all positions.
-
-    Attributes
-    ----------
-    setting, codebooks
-        The setting and its codebooks.
-    quantities
-        The quantities by name, float64 [codebooks, positions].
-    """
+    """Quantities of a setting at all positions, by name, float64 [codebooks, positions]."""
 
     setting: Setting
     codebooks: tuple[Codebook, ...]
@@ -220,12 +209,9 @@ class Sweep:
 
     Raises
     ------
-    CodebookError
-        If a file contains no codebook, or one that does not fit a setting.
-    ScenarioError
-        If the base values contradict those that an optimisation takes from a setting.
     ValueError
-        If a measure is unknown, or a number is out of range.
+        If a measure is unknown, a number is out of range, a file has no codebook that fits its
+        settings, or base values contradict those that an optimisation takes from a setting.
     """
 
     base: Scenario
@@ -239,7 +225,7 @@ class Sweep:
     repeats: int = 1
 
     def __post_init__(self) -> None:
-        """Check names, numbers, the codebooks of files and the scenarios of the others."""
+        """Check names, numbers and codebooks."""
         for name in self.measures:
             if name not in MEASURES:
                 raise ValueError(f'measures: {name!r}, expected some of {", ".join(MEASURES)}')
@@ -271,7 +257,7 @@ class Sweep:
         return dataclasses.replace(self.base, **taken)
 
     def designs(self, setting: Setting) -> list[Job]:
-        """Return the jobs that make the codebooks of a setting, none if it is a file."""
+        """Return the jobs that make the codebooks of a setting, none for a file."""
         if setting.codebook not in KINDS:
             return []
         arguments: dict[str, Any] = {
@@ -301,10 +287,7 @@ class Sweep:
 
 def run_sweep(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = None
               ) -> list[Point]:
-    """Return the measures of the results of `run_blocks`, with their intervals, in order.
-
-    Arguments and errors are those of `run_blocks`.
-    """
+    """Return the measures of the results of `run_blocks`, with their intervals, in order."""
     return [Point(results.setting, name,
                   measured(MEASURES[name], results.quantities[MEASURES[name].quantity]),
                   tuple(codebook.id for codebook in results.codebooks))
@@ -315,20 +298,15 @@ def run_blocks(sweep: Sweep, folder: Path, n_jobs: int = -1, dask: str | None = 
                ) -> list[Results]:
     """Run the jobs of a sweep that have no stored result, and return the results in order.
 
-    Parameters
-    ----------
-    folder
-        Folder of the stored results, which several sweeps may share.
-    n_jobs, dask
-        See `run_jobs`; errors are the same.
+    Several sweeps may share a folder. `run_jobs` describes the other arguments and the errors.
     """
-    designs = _distinct(job for setting in sweep.settings for job in sweep.designs(setting))
+    designs = [job for setting in sweep.settings for job in sweep.designs(setting)]
     made = _results(design, designs, folder, n_jobs, dask, 'codebooks')
     codebooks = [sweep.codebooks(setting, made) for setting in sweep.settings]
     blocks = [[sweep.blocks(setting, codebook) for codebook in of_setting]
               for setting, of_setting in zip(sweep.settings, codebooks, strict=True)]
-    jobs = _distinct(job for of_setting in blocks for of_codebook in of_setting
-                     for of_family in of_codebook.values() for job in of_family)
+    jobs = [job for of_setting in blocks for of_codebook in of_setting
+            for of_family in of_codebook.values() for job in of_family]
     found = _results(evaluate, jobs, folder, n_jobs, dask, 'positions')
     return [Results(setting, tuple(of_setting), _stacked(of_blocks, found))
             for setting, of_setting, of_blocks in zip(
@@ -378,11 +356,9 @@ def _job(kind: str, arguments: dict[str, Any]) -> Job:
     return Job(f'{kind}-{digest[:24]}', arguments)
 
 
-def _distinct(jobs: Iterable[Job]) -> list[Job]:
-    return list({job.name: job for job in jobs}.values())
-
-
-def _results(function: Callable[..., dict[str, Any]], jobs: Sequence[Job], folder: Path,
+def _results(function: Callable[..., dict[str, Any]], jobs: Iterable[Job], folder: Path,
              n_jobs: int, dask: str | None, label: str) -> dict[str, dict[str, Any]]:
-    results = run_jobs(function, jobs, folder, n_jobs, dask, label)
-    return {job.name: result for job, result in zip(jobs, results, strict=True)}
+    """Run every job once, and return the results by name."""
+    distinct = {job.name: job for job in jobs}
+    results = run_jobs(function, [*distinct.values()], folder, n_jobs, dask, label)
+    return dict(zip(distinct, results, strict=True))

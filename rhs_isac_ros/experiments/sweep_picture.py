@@ -231,7 +231,7 @@ def _key(point: Point, axes: Sequence[Axis]) -> tuple[Any, ...]:
 
 
 def _unit(name: str) -> str:
-    return str(FIELDS[name].metadata['unit']) if name in FIELDS else ''
+    return str(FIELDS[name].metadata['declared'].unit) if name in FIELDS else ''
 
 
 def _label(axis: Axis) -> str:

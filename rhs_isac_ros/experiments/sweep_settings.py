@@ -25,12 +25,8 @@ class Measure(NamedTuple):
 
     Attributes
     ----------
-    quantity
-        Name of the quantity, of which a position has one value.
     label
         Label of an axis without the unit.
-    unit
-        Unit of the measure.
     quantile
         The quantile, from 0 to 1; None for the mean.
     root
@@ -80,10 +76,9 @@ class Interval(NamedTuple):
 def measured(measure: Measure, results: np.ndarray) -> Interval:
     """Return a measure of results, float64 [codebooks, positions], with its interval.
 
-    The interval is that of the bootstrap over codebooks and positions. A share of a single
-    codebook or of equal results has the interval of Wilson, because the bootstrap of equal
-    results has no width. The value is NaN if a result is, and the interval of an infinite mean
-    is NaN.
+    The interval is a bootstrap over codebooks and positions. A share of a single codebook or of
+    equal results has Wilson's interval, because the bootstrap of equal results has no width. The
+    value is NaN if a result is, and the interval of an infinite mean is NaN.
     """
     if np.isnan(results).any():
         return Interval(np.nan, np.nan, np.nan)
@@ -109,10 +104,7 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
 def parse_measures(text: str) -> list[list[str]]:
     """Parse ``NAME,...``, where ``+`` joins measures of one unit that share a panel.
 
-    Raises
-    ------
-    ValueError
-        If a measure is unknown, occurs twice, or has another unit than those it is joined to.
+    Raise ValueError if a measure is unknown or occurs twice, or units in a panel differ.
     """
     panels = [panel.split('+') for panel in text.split(',')]
     names = names_of(panels)
@@ -135,34 +127,23 @@ def names_of(panels: Iterable[Iterable[str]]) -> list[str]:
     return [name for panel in panels for name in panel]
 
 
-# What can be varied besides the fields of the scenario.
+# Two names that can be varied like the fields of the scenario.
 CODEBOOK, ESTIMATOR = 'codebook', 'estimator'
 FIELDS = {field.name: field for field in dataclasses.fields(Scenario)}
 NAMES = (*FIELDS, CODEBOOK, ESTIMATOR)
 
 
 class Axis(NamedTuple):
-    """Values of a field, or of several fields that vary together.
+    """Values of a field, or of several fields that vary together: a tuple for each step.
 
-    Attributes
-    ----------
-    fields
-        Names of the fields; pictures show the first one.
-    values
-        Values of these fields, a tuple for each step.
+    Pictures show the first field.
     """
 
     fields: tuple[str, ...]
     values: tuple[tuple[Any, ...], ...]
 
     def along(self, other: 'Axis') -> 'Axis':
-        """Return an axis on which further fields vary together with these.
-
-        Raises
-        ------
-        ValueError
-            If the number of values differs.
-        """
+        """Return an axis on which the fields of another axis of the same length vary, too."""
         if len(other.values) != len(self.values):
             raise ValueError(
                 f'{other.fields[0]}: {len(other.values)} values, expected {len(self.values)} as '
@@ -187,18 +168,9 @@ class Axis(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """One combination of values.
+    """One combination of values, `varied` by name, and the scenario with these values.
 
-    Attributes
-    ----------
-    varied
-        Values of the varied fields by name.
-    scenario
-        Scenario with these values.
-    codebook
-        Kind or file of the codebook.
-    estimator
-        Name of the estimator.
+    `codebook` is a kind or a file.
     """
 
     varied: Mapping[str, Any]
@@ -208,13 +180,7 @@ class Setting(NamedTuple):
 
 
 def parse_axis(text: str) -> Axis:
-    """Parse ``FIELD=VALUE,...``, with values as in a scenario file.
-
-    Raises
-    ------
-    ValueError
-        If the field is unknown, or a value is invalid.
-    """
+    """Parse ``FIELD=VALUE,...``, with values as in a scenario file, or raise ValueError."""
     name, equals, listed = text.partition('=')
     if name not in NAMES:
         close = difflib.get_close_matches(name, NAMES) or NAMES
@@ -231,16 +197,10 @@ def parse_axis(text: str) -> Axis:
 
 def settings_of(
         base: Scenario, axes: Sequence[Axis], codebook: str, estimator: str) -> list[Setting]:
-    """List all combinations; codebook and estimator are those given unless an axis varies them.
+    """List all combinations; the last axis varies fastest.
 
-    The last axis varies fastest.
-
-    Raises
-    ------
-    ScenarioError
-        If values contradict each other.
-    ValueError
-        If a field is on two axes.
+    `codebook` and `estimator` apply unless an axis varies them. Raise ValueError if a field is on
+    two axes, or values contradict each other.
     """
     names = [name for axis in axes for name in axis.fields]
     for name in names:
@@ -257,7 +217,7 @@ def settings_of(
 
 
 def plain(value: Any) -> str:
-    """Return a value of a field as text, as scenario files hold it."""
+    """Return a value of a field as text, as in scenario files."""
     if isinstance(value, GainPattern | str):
         return str(value)
     return json.dumps(value)

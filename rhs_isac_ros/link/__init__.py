@@ -1,10 +1,10 @@
 """The transmission phase: capacity, beam steering and the choice of the band."""
 
-from rhs_isac_ros.link.beam_pattern import BeamPattern, beam_pattern
 from rhs_isac_ros.link.capacity import (
     Beam,
-    RunningQuartiles,
+    BeamPattern,
     actual_capacity,
+    beam_pattern,
     capacity,
     expected_capacity,
 )
@@ -19,7 +19,6 @@ from rhs_isac_ros.link.steering import (
 )
 
 __all__ = [
-    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'RunningQuartiles',
-    'actual_capacity', 'applied_beam',
+    'Beam', 'BeamPattern', 'CapacityReport', 'Choice', 'actual_capacity', 'applied_beam',
     'beam_pattern', 'capacity', 'capacity_report', 'choose_beam', 'expected_capacity',
     'prepare_steering', 'steer']

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.geometry import element_positions, feed_positions
 from rhs_isac_ros.model.los import los_gain_at
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 # Gains above this have finite reciprocals.
 _MIN_GAIN = 1e-300
@@ -42,7 +42,7 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
         # The channels above their floor are the first ones in the order of the floors.
         n_filled = np.sum(levels > ranked, axis=-1, keepdims=True)
         level = np.take_along_axis(levels, np.maximum(n_filled - 1, 0), axis=-1)
-        shares: np.ndarray = np.maximum(level - floors, 0.0)
+        shares = np.maximum(level - floors, 0.0)
     if n_filled.all():
         return shares
     # The gains are so small that the power is lost in the rounding of the level.
@@ -56,9 +56,8 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
 class BandLink:
     """The link between the surface and a user in one band, or the links in some bands.
 
-    With several bands, all arrays but `fixed` have a leading axis for the band. Configurations
-    then have leading axes for the band and for alternatives, float64 [N_B, n, N_E]; in one band,
-    they have any number of leading axes.
+    With several bands, all arrays but `fixed` have a leading axis for the band, and configurations
+    are float64 [N_B, n, N_E]. In one band, configurations have any number of leading axes.
 
     Attributes
     ----------
@@ -71,7 +70,7 @@ class BandLink:
     noise_power_w, power_w
         Noise power of a sub-band, and power of the digital part over all sub-bands [W].
     fixed
-        Elements that do not follow the configuration, bool [N_E]; theirs is 1.
+        Elements whose configuration is always 1, bool [N_E].
     """
 
     onboard: np.ndarray
@@ -87,23 +86,18 @@ class BandLink:
         """Return the links to a position, float64 [3] [m], in bands, counted from 0.
 
         The coefficients of an estimated surface become part of the propagation on the board.
-
-        Raises
-        ------
-        ValueError
-            If the position is not a finite [3] array.
+        Raise ValueError if the position is not a finite [3] array.
         """
         onboard, fixed = arrays(scenario, surface)
+        los = los_gain_at(scenario, position, [bands] if isinstance(bands, int) else bands)
         if isinstance(bands, int):
-            (los,) = los_gain_at(scenario, position, [bands])
-        else:
-            los = los_gain_at(scenario, position, bands)
+            los = los[0]
         index = band_index(bands)
         return cls(onboard[index], los, spatial_covariance(scenario)[index],
                    scenario.noise_power_w, scenario.max_power_w, fixed)
 
     def at_subbands(self, subbands: np.ndarray) -> 'BandLink':
-        """Return the links in some sub-bands, with the share of the power that is theirs."""
+        """Return the links in some sub-bands, with their share of the power."""
         share = len(subbands) / self.los.shape[-2]
         return dataclasses.replace(
             self, onboard=self.onboard[..., subbands, :, :], los=self.los[..., subbands, :],
@@ -112,8 +106,8 @@ class BandLink:
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
         """Return the best digital part for configurations, complex128 [..., N_SB, K] [sqrt(W)].
 
-        It follows the principal eigenvectors of the correlation matrices of the channels at the
-        feeds, with the power divided by water-filling.
+        It consists of the principal eigenvectors of the correlation matrices of the channels at
+        the feeds. Water-filling divides the power among them.
         """
         gains, directions = np.linalg.eigh(self.correlations(*self.feeds(analog)))
         power = water_filling(gains[..., -1] / self.noise_power_w, self.power_w)
@@ -121,10 +115,7 @@ class BandLink:
         return np.conj(directions[..., -1]) * np.sqrt(power)[..., None]
 
     def best_rate(self, analog: np.ndarray) -> np.ndarray:
-        """Return the capacity with the best digital part [nat/symbol], float64 [...].
-
-        It is the sum over the sub-bands.
-        """
+        """Return the capacity with the best digital part, summed over sub-bands [nat/symbol]."""
         correlations = self.correlations(*self.feeds(analog))
         gains = np.linalg.eigvalsh(correlations)[..., -1] / self.noise_power_w
         return np.log1p(gains * water_filling(gains, self.power_w)).sum(axis=-1)
@@ -145,9 +136,8 @@ class BandLink:
     def correlations(
             configured: np.ndarray, scattered: np.ndarray, direct: np.ndarray) -> np.ndarray:
         """Correlation matrices of the channels of `feeds`, complex128 [..., N_SB, K, K]."""
-        correlations: np.ndarray = direct * np.conj(np.swapaxes(direct, -1, -2))
-        correlations += np.matmul(scattered, np.conj(np.swapaxes(configured, -1, -2)))
-        return correlations
+        return (direct * np.conj(np.swapaxes(direct, -1, -2))
+                + np.matmul(scattered, np.conj(np.swapaxes(configured, -1, -2))))
 
 
 def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
@@ -161,10 +151,7 @@ def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
 @functools.lru_cache(maxsize=16)
 def arrays(scenario: Scenario, surface: SurfaceEstimate | None
            ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the arrays that do not depend on the position, both read-only.
-
-    These are `onboard` of all bands, and `fixed`.
-    """
+    """Compute `BandLink.onboard` of all bands, and `BandLink.fixed`, both read-only."""
     onboard, fixed = onboard_matrix(scenario), np.zeros(scenario.n_elements, bool)
     if surface:
         fixed = surface.failed

@@ -1,4 +1,4 @@
-"""Capacity of the transmission phase at known positions and over a posterior."""
+"""Capacity of a beam at known positions and over a posterior, and the pattern of a beam."""
 
 import dataclasses
 import functools
@@ -51,19 +51,17 @@ def capacity(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarra
     ValueError
         If `positions` is not a finite [N, 3] array, or the beam does not fit the scenario.
     """
-    (rates,) = capacities(scenario, [beam], positions)
-    return np.asarray(rates)
+    return capacities(scenario, [beam], positions)[0]
 
 
 def capacities(scenario: Scenario, beams: Sequence[Beam], positions: np.ndarray) -> np.ndarray:
-    """Compute `capacity` for several beams, float64 [n, N] [bit/s]; errors are the same."""
+    """Compute `capacity` for several beams, float64 [n, N] [bit/s]."""
     bands = [beam.band for beam in beams]
     radiation = np.stack([_radiation(scenario, beam) for beam in beams])
     direct = np.abs(los_sums(scenario, positions, bands, radiation))**2
     through = spatial_covariance(scenario)[band_index(bands)].scatter(radiation)
     scattered = np.sum((through * np.conj(radiation)).real, axis=-1)[:, None]
-    snr = (direct + scattered) / scenario.noise_power_w
-    return scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
+    return _rate(scenario, direct + scattered)
 
 
 @one_blas_thread
@@ -71,15 +69,13 @@ def actual_capacity(scenario: Scenario, beam: Beam, positions: np.ndarray,
                     blocked: np.ndarray | None = None) -> np.ndarray:
     """Compute the capacity on the paths of a channel file; without one, that of `capacity`.
 
-    Takes positions, float64 [N, 3] [m], and which users are blocked, bool [N], if there is a
-    channel file; returns float64 [N] [bit/s]. Errors are the same.
+    With a channel file, `blocked`, bool [N], marks the users without line of sight.
     """
     if not scenario.channel:
         return capacity(scenario, beam, positions)
     gains = direct_gain(scenario, positions, beam.band, blocked)
     signals = np.einsum('njm,jm->nj', gains, _radiation(scenario, beam))
-    snr = np.abs(signals)**2 / scenario.noise_power_w
-    return scenario.subband_width_hz * np.log2(1 + snr).sum(axis=1)
+    return _rate(scenario, np.abs(signals)**2)
 
 
 @one_blas_thread
@@ -101,19 +97,10 @@ def expected_capacity(
 def expected_capacities(
         scenario: Scenario, beams: Sequence[Beam], mean: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
-    """Compute `expected_capacity` for several beams, float64 [n] [bit/s]; errors are the same."""
+    """Compute `expected_capacity` for several beams, float64 [n] [bit/s]."""
     points, weights = posterior_points(scenario, mean, covariance)
     # One product for each beam, so that the others do not affect its rounding.
     return np.array([weights @ rates for rates in capacities(scenario, beams, points)])
-
-
-def direct_power_w(scenario: Scenario, beam: Beam, positions: np.ndarray) -> np.ndarray:
-    """Compute the power of the line-of-sight term of Eq. (10) at positions, float64 [N, 3] [m].
-
-    The result is the sum over the sub-bands, float64 [N] [W]. Errors are those of `capacity`.
-    """
-    (sums,) = los_sums(scenario, positions, [beam.band], _radiation(scenario, beam)[None])
-    return np.sum(np.abs(sums)**2, axis=1)
 
 
 def posterior_points(
@@ -121,12 +108,12 @@ def posterior_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the nodes and weights of a quadrature over a Gaussian posterior.
 
-    The quadrature is deterministic: a product of Gauss-Hermite rules along the principal axes of
-    the covariance, exact for polynomials up to the fifth degree in each axis. All weights are
-    positive, so that an average of capacities lies between the smallest and the largest of them.
-    An axis without variance has one node. Nodes closer to the surface than both the region of
-    interest and the mean are moved out to the closer of the two. Otherwise, a tail of the
-    Gaussian at or behind the surface would contribute capacities that cannot occur.
+    The quadrature is a product of Gauss-Hermite rules along the principal axes of the covariance,
+    exact for polynomials up to the fifth degree in each axis. All weights are positive, so that
+    an average of capacities lies between the smallest and the largest of them. An axis without
+    variance has one node. Nodes closer to the surface than both the region of interest and the
+    mean are moved out to the closer of the two. Otherwise, a tail of the Gaussian at or behind
+    the surface would contribute capacities that cannot occur.
 
     Parameters
     ----------
@@ -174,56 +161,83 @@ def _radiation(scenario: Scenario, beam: Beam) -> np.ndarray:
     check_shape('digital', beam.digital, 'N_SB K', scenario)
     if not 0 <= beam.band < scenario.n_bands:
         raise ValueError(f'band: {beam.band}, expected 0 to {scenario.n_bands - 1}')
-    feeds: np.ndarray = np.einsum('jk,jkm->jm', beam.digital, onboard_matrix(scenario)[beam.band])
+    feeds = np.einsum('jk,jkm->jm', beam.digital, onboard_matrix(scenario)[beam.band])
     return feeds * beam.analog
 
 
-class RunningQuartiles:
-    """Quartiles of the newest rows of values, exact over a bounded window.
+def _rate(scenario: Scenario, power_w: np.ndarray) -> np.ndarray:
+    """Sum of the rates [bit/s] of sub-bands, the last axis of the received power [W]."""
+    snr = power_w / scenario.noise_power_w
+    return scenario.subband_width_hz * np.log2(1 + snr).sum(axis=-1)
 
-    The window bounds memory and time, and lets the quartiles follow a changing network.
-    A row has `n_values` values; rows older than the last `window` are discarded.
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BeamPattern:
+    """Power of a beam over the directions in front of the surface, at one distance.
+
+    Attributes
+    ----------
+    directions
+        Unit vectors from the surface's centre, float64 [n_el, n_az, 3]; elevation grows along
+        the first axis, azimuth along the second, both from -90 to 90 degrees.
+    relative
+        Line-of-sight power relative to that of the peak, the strongest direction, float64
+        [n_el, n_az]; zeros if the beam is off.
+    """
+
+    directions: np.ndarray
+    relative: np.ndarray
+    distance_m: float
+
+    def azimuth_cut(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cut the pattern at the elevation of the peak: azimuths [rad] and power, both [n_az]."""
+        row, _ = self.peak
+        x, y, _ = self.directions[len(self.directions) // 2].T
+        return np.arctan2(y, x), self.relative[row]
+
+    def elevation_cut(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cut the pattern at the azimuth of the peak: elevations [rad] and power, both [n_el]."""
+        _, column = self.peak
+        return np.arcsin(self.directions[:, column, 2]), self.relative[:, column]
+
+    @property
+    def peak(self) -> tuple[int, int]:
+        """Row and column of the strongest direction in `relative`."""
+        row, column = np.unravel_index(np.argmax(self.relative), self.relative.shape)
+        return int(row), int(column)
+
+
+@one_blas_thread
+def beam_pattern(
+        scenario: Scenario, beam: Beam, distance_m: float, step_deg: float = 5.0) -> BeamPattern:
+    """Compute the pattern of a beam at a distance from the surface's centre, in the near field.
+
+    Neighbouring azimuths, and elevations, are at most `step_deg` apart.
 
     Raises
     ------
     ValueError
-        If a size is not positive.
+        If the distance or the step is not positive, or the beam does not fit the scenario.
     """
+    for name, value in (('distance_m', distance_m), ('step_deg', step_deg)):
+        if not value > 0:
+            raise ValueError(f'{name}: {value}, expected a positive number')
+    directions = _directions(step_deg)
+    (sums,) = los_sums(scenario, distance_m * directions.reshape(-1, 3), [beam.band],
+                       _radiation(scenario, beam)[None])
+    power_w = np.sum(np.abs(sums)**2, axis=1).reshape(directions.shape[:2])
+    max_power_w = power_w.max()
+    return BeamPattern(directions, power_w / max_power_w if max_power_w else power_w, distance_m)
 
-    def __init__(self, n_values: int, window: int = 1000) -> None:
-        if n_values < 1 or window < 1:
-            raise ValueError(f'n_values, window: {n_values}, {window}, expected at least 1 each')
-        self._rows = np.empty((window, n_values))
-        self._n_added = 0
 
-    def __len__(self) -> int:
-        """Return the number of rows in the window."""
-        return min(self._n_added, len(self._rows))
-
-    def add(self, row: np.ndarray) -> None:
-        """Add a row, float64 [n_values]; it replaces the oldest one if the window is full.
-
-        Raises
-        ------
-        ValueError
-            If the row has another shape or is not finite.
-        """
-        row = np.asarray(row, dtype=float)
-        if row.shape != self._rows.shape[1:] or not np.isfinite(row).all():
-            raise ValueError(f'row: {row}, expected {self._rows.shape[1]} finite values')
-        self._rows[self._n_added % len(self._rows)] = row
-        self._n_added += 1
-
-    def quartiles(self) -> np.ndarray:
-        """Return lower quartile, median and upper quartile of each value, float64 [n_values, 3].
-
-        Quartiles between two rows are interpolated linearly.
-
-        Raises
-        ------
-        ValueError
-            If no row has been added yet.
-        """
-        if not len(self):
-            raise ValueError('quartiles: no rows, expected at least one')
-        return np.quantile(self._rows[:len(self)], (0.25, 0.5, 0.75), axis=0).T
+@functools.lru_cache(maxsize=4)
+def _directions(step_deg: float) -> np.ndarray:
+    """Unit vectors over the half space x > 0, float64 [n_el, n_az, 3], read-only."""
+    n_half = max(1, int(np.ceil(90 / step_deg)))
+    # An odd number of angles, so that the middle ones are on boresight.
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 2 * n_half + 1)
+    elevation, azimuth = np.meshgrid(angles, angles, indexing='ij')
+    directions = np.stack([np.cos(elevation) * np.cos(azimuth),
+                           np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    directions.flags.writeable = False
+    return directions

@@ -1,15 +1,15 @@
 """Search for configurations from which to start an ascent, for all bands at a time."""
 
-import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.link import band_link
 from rhs_isac_ros.link.band_link import BandLink
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 # Largest share of the multipath power that the modes may omit, unless that takes more of them.
 # The ascent from the configurations that are found includes all of it.
@@ -24,14 +24,13 @@ _MAX_SUBBANDS = 16
 _N_STARTS = 256
 _N_DIRECT = 64
 # Number of steps with the strongest modes of the multipath, of these modes, and of configurations
-# that are then improved with all modes. A selection after fewer steps would lose the best starts
-# if the multipath is as strong as the line of sight.
+# that all modes then improve. Fewer steps would lose the best starts if the multipath is as strong
+# as the line of sight.
 _N_STEPS = 4
 _N_STRONGEST = 4
 _N_KEPT = 12
-# Number of configurations for the multipath alone, of their random starts and of steps.
+# Number of configurations for the multipath alone, and of steps from as many random starts.
 _N_SCATTERED = 8
-_N_SCATTERED_STARTS = 256
 _N_SCATTERED_STEPS = 8
 # Configurations of nearly equal capacity count as one.
 _MIN_DIFFERENCE = 1e-6
@@ -41,8 +40,7 @@ _AMPLITUDES = (1e-3, 1e4)
 _MIN_NORM = 1e-30
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Tables:
+class Tables(NamedTuple):
     """The arrays of the search that do not depend on the position, for all bands.
 
     Attributes
@@ -53,8 +51,8 @@ class Tables:
         Gains on the board, complex64 [N_B, N_E, J, K].
     paths
         Gains from each feed via each element to each wave in the air, complex64
-        [N_B, N_E, J, K, L]. The last waves are the strongest modes of the multipath, the columns
-        of G with G G^T close to V_i; the first one, the line of sight, is left zero.
+        [N_B, N_E, J, K, L]. The first wave, the line of sight, is left zero. The others are the
+        strongest modes of the multipath, the columns of G with G G^T close to V_i.
     starts
         Fixed waves on the board, with which the search starts, float32 [S, 2 J K].
     peaks
@@ -62,7 +60,7 @@ class Tables:
     scattered
         Configurations with a high capacity over the multipath alone, float32 [N_B, n, N_E].
     fixed
-        Elements that do not follow the configuration, bool [N_E]; None if all do.
+        Elements whose configuration is always 1, bool [N_E].
     """
 
     subbands: np.ndarray
@@ -71,31 +69,24 @@ class Tables:
     starts: np.ndarray
     peaks: np.ndarray
     scattered: np.ndarray
-    fixed: np.ndarray | None
+    fixed: np.ndarray
 
 
 def candidate_configurations(
         tables: Tables, link: BandLink, index: int | slice | list[int], n: int) -> np.ndarray:
     """Find configurations of high capacity, float64 [N_B, n, N_E], each entry 0 or 1.
 
-    By the holographic principle, a configuration enables those elements at which a wave on the
+    By the holographic principle, a configuration enables the elements at which a wave on the
     board, s B, and a wave in the air, G w, are in phase. The waves in the air are the line of
     sight and the modes of the multipath, the columns of G. Starting from fixed waves on the
     board, spread over all directions, the search improves waves and configuration in turn: the
     best pair of waves for a configuration belongs to the largest singular value of B diag(c) G.
-    It begins with the line of sight alone, for which the best wave on the board is known, and
-    continues with the best of the configurations found, with those that are best for the
-    multipath alone, and with the matched filter. All of them are improved with the strongest
-    modes, and the best then with all modes.
+    The search begins with the line of sight alone, for which the best wave on the board is known.
+    It continues with the best configurations found, those for the multipath alone, and the matched
+    filter. The strongest modes improve all of them, and all modes then the best.
 
-    The configurations of a band are in no particular order, and some may be equal.
-
-    Parameters
-    ----------
-    link
-        The links of the bands.
-    index
-        The bands among those of the tables.
+    `index` selects the bands of the link from the tables. The configurations of a band are in no
+    particular order, and some may be equal.
     """
     los = np.swapaxes(link.los[:, tables.subbands], 1, 2)[..., None]
     direct = tables.onboard[index] * los
@@ -113,16 +104,15 @@ def candidate_configurations(
     gains = np.ascontiguousarray(paths[..., :1 + _N_STRONGEST])
     waves = _Waves.at(gains, analog)
     for _ in range(_N_STEPS):
-        waves = _Waves.at(gains, waves.corner(gains, tables.fixed), waves.on_board)
-    waves = waves.best(_N_KEPT)
-    waves = _Waves.at(paths, waves.corner(gains, tables.fixed), waves.on_board)
+        waves = waves.improved(gains, gains, tables.fixed)
+    waves = waves.best(_N_KEPT).improved(gains, paths, tables.fixed)
     return waves.best(n).analog.astype(float)
 
 
 @functools.lru_cache(maxsize=16)
 def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     """Compute the tables for a scenario and a calibrated surface."""
-    onboard, failed = band_link.arrays(scenario, surface)
+    onboard, fixed = band_link.arrays(scenario, surface)
     subbands = band_link.representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS)
     on_board = np.moveaxis(onboard[:, subbands], -1, 1)
     modes = _modes(scenario)
@@ -134,7 +124,6 @@ def tables(scenario: Scenario, surface: SurfaceEstimate | None) -> Tables:
     # Each start begins with a single sub-band.
     starts[np.arange(_N_STARTS), np.arange(_N_STARTS) % n_subbands] = rng.normal(
         size=(_N_STARTS, 2 * n_feeds))
-    fixed = failed if failed.any() else None
     peaks = np.abs(paths).sum(axis=1).max(axis=(1, 2, 3)).astype(float) + _MIN_NORM
     scaled = paths * (_AMPLITUDES[1] / peaks)[:, None, None, None, None].astype(np.float32)
     return Tables(
@@ -154,8 +143,7 @@ def _modes(scenario: Scenario) -> np.ndarray:
     omitted = 1 - np.cumsum(powers, axis=1) / np.sum(spatial.power, axis=1, keepdims=True)
     n_modes = 1 + np.sum(omitted > _MAX_OMITTED, axis=1)
     powers[np.arange(powers.shape[1]) >= n_modes[:, None]] = 0
-    modes: np.ndarray = directions * np.sqrt(powers)[:, None]
-    return modes[:, :, :n_modes.max()]
+    return (directions * np.sqrt(powers)[:, None])[:, :, :n_modes.max()]
 
 
 def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
@@ -180,14 +168,14 @@ def _strongest(spatial: SpatialCovariance) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _scattered_configurations(
-        paths: np.ndarray, fixed: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
+        paths: np.ndarray, fixed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Search for configurations without a line of sight, from random waves in the air."""
-    shape = (len(paths), _N_SCATTERED_STARTS, *paths.shape[2:])
+    shape = (len(paths), _N_STARTS, *paths.shape[2:])
     on_board = _complex_normal((*shape[:-1], 1), rng)
     in_air = _complex_normal((*shape[:-2], 1, shape[-1]), rng)
-    waves = _Waves.at(paths, _corner(on_board * in_air, paths, fixed), on_board)
+    waves = _Waves.at(paths, _enabled(on_board * in_air, paths, fixed), on_board)
     for _ in range(_N_SCATTERED_STEPS):
-        waves = _Waves.at(paths, waves.corner(paths, fixed), waves.on_board)
+        waves = waves.improved(paths, paths, fixed)
     return waves.best(_N_SCATTERED).analog
 
 
@@ -196,42 +184,34 @@ def _complex_normal(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndar
 
 
 def _direct_configurations(tables: Tables, direct: np.ndarray) -> np.ndarray:
-    """Search over the line of sight, whose gains are complex64 [N_B, N_E, J, K].
-
-    Returns configurations, float32 [N_B, n, N_E].
-    """
+    """Return configurations, float32 [N_B, n, N_E], for gains complex64 [N_B, N_E, J, K]."""
     n_bands, n_elements, n_subbands, n_feeds = direct.shape
     # Real arithmetic suffices: configurations are real, and only the real part of the product of
     # the waves matters.
     gains = direct.reshape(n_bands, n_elements, -1).view(np.float32)
-    analog = _threshold(tables.starts @ np.swapaxes(gains, 1, 2), tables.fixed)
+    analog = _in_phase(tables.starts @ np.swapaxes(gains, 1, 2), tables.fixed)
     # The best wave on the board is the conjugate of the channels at the feeds.
     received = (analog @ gains).reshape(n_bands, -1, n_subbands, 2 * n_feeds)
     snr = np.einsum('bsjk,bsjk->bsj', received, received)
-    best = _best(np.log1p(snr).sum(axis=-1), _N_DIRECT)
+    rate = np.log1p(snr).sum(axis=-1)
+    best = np.argpartition(-rate, _N_DIRECT - 1, axis=1)[:, :_N_DIRECT]
     received /= (1 + snr)[..., None]
-    waves = received[best].reshape(n_bands, -1, 2 * n_subbands * n_feeds)
-    return _threshold(waves @ np.swapaxes(gains, 1, 2), tables.fixed)
+    waves = received[np.arange(n_bands)[:, None], best].reshape(n_bands, _N_DIRECT, -1)
+    return _in_phase(waves @ np.swapaxes(gains, 1, 2), tables.fixed)
 
 
 def _matched(tables: Tables, direct: np.ndarray) -> np.ndarray:
     """Return the matched filter for line-of-sight gains, float32 [N_B, 1, N_E]."""
     interference = direct.real.sum(axis=(2, 3))[:, None]
     peak = np.abs(interference).max(axis=-1, keepdims=True) + np.float32(_MIN_NORM)
-    matched: np.ndarray = (interference / peak + 1) / 2
-    if tables.fixed is not None:
-        matched[..., tables.fixed] = 1.0
-    return matched
+    return np.where(tables.fixed, np.float32(1), (interference / peak + 1) / 2)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Waves:
-    """Configurations with a pair of waves for each.
+class _Waves(NamedTuple):
+    """Configurations, float32 [N_B, n, N_E], with their capacities and a pair of waves for each.
 
     Attributes
     ----------
-    analog
-        Float32 [N_B, n, N_E].
     rate
         Capacities [nat/symbol], float32 [N_B, n].
     on_board
@@ -266,41 +246,31 @@ class _Waves:
         in_air /= (1 + snr)[..., None, None]
         return cls(analog, np.log1p(snr).sum(axis=-1), on_board, in_air)
 
-    def corner(self, paths: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
-        """Return the configurations that suit the waves, float32 [N_B, n, N_E]."""
-        return _corner(self.on_board * self.in_air, paths, fixed)
+    def improved(self, known: np.ndarray, paths: np.ndarray, fixed: np.ndarray) -> '_Waves':
+        """Return the configurations that suit these waves over known paths, and their waves."""
+        analog = _enabled(self.on_board * self.in_air, known, fixed)
+        return _Waves.at(paths, analog, self.on_board)
 
     def best(self, n: int) -> '_Waves':
-        """Return the `n` best of each band; of those with the same capacity, one goes first."""
+        """Return the `n` best of each band; repeated capacities come last."""
+        bands = np.arange(len(self.rate))[:, None]
         order = np.argsort(-self.rate, axis=1)
-        ranked = self.rate[np.arange(len(order))[:, None], order]
-        repeated = ranked[:, :-1] - ranked[:, 1:] <= _MIN_DIFFERENCE * ranked[:, :-1]
+        ranked = self.rate[bands, order]
         is_repeated = np.zeros(order.shape, np.int8)
-        is_repeated[:, 1:] = repeated
+        is_repeated[:, 1:] = (
+            ranked[:, :-1] - ranked[:, 1:] <= _MIN_DIFFERENCE * ranked[:, :-1])
         distinct = np.argsort(is_repeated, axis=1, kind='stable')[:, :n]
-        bands = np.arange(len(order))[:, None]
-        return self[bands, order[bands, distinct]]
-
-    def __getitem__(self, index: tuple[np.ndarray, ...]) -> '_Waves':
-        return _Waves(self.analog[index], self.rate[index], self.on_board[index],
-                      self.in_air[index])
+        chosen = bands, order[bands, distinct]
+        return _Waves(*(values[chosen] for values in self))
 
 
-def _corner(pairs: np.ndarray, paths: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
+def _enabled(pairs: np.ndarray, paths: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """Enable the elements where pairs of waves, complex64 [N_B, n, J, K, L], are in phase."""
     n_bands, n_elements = paths.shape[:2]
     weights = pairs.reshape(n_bands, -1, paths[0, 0].size).view(np.float32)
     gains = paths.reshape(n_bands, n_elements, -1).view(np.float32)
-    return _threshold(weights @ np.swapaxes(gains, 1, 2), fixed)
+    return _in_phase(weights @ np.swapaxes(gains, 1, 2), fixed)
 
 
-def _threshold(phases: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
-    analog = (phases > 0).astype(np.float32)
-    if fixed is not None:
-        analog[..., fixed] = 1.0
-    return analog
-
-
-def _best(rate: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the `n` highest rates of each band, in no order."""
-    return np.arange(len(rate))[:, None], np.argpartition(-rate, n - 1, axis=1)[:, :n]
+def _in_phase(products: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    return ((products > 0) | fixed).astype(np.float32)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from rhs_isac_ros.link.band_link import (
 from rhs_isac_ros.link.capacity import Beam, actual_capacity, expected_capacities
 from rhs_isac_ros.link.search import candidate_configurations, tables
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.support.threads import one_blas_thread
 
 # Maximum number of rounds; two or three are usual.
@@ -29,60 +30,48 @@ def ascend(link: BandLink, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Each round finds the best digital part and then, with that part fixed, a better configuration.
     The received power is convex in the configuration, so that it lies above its linear model at
-    any point. The corner of the box [0, 1]^N_E to which the gradient points therefore receives
-    more power, unless the point is that corner. The capacity usually increases with the power,
-    but not always, and is therefore compared. If the corner does not increase it, the round moves
-    one element to an end of its range: the one that increases it most. The capacity never falls
-    below that of the start.
+    any point. The vertex of the box [0, 1]^N_E to which the gradient points therefore receives
+    more power, unless the point is that vertex. The capacity usually increases with the power,
+    but not always, and is therefore compared. If the vertex does not increase it, the round moves
+    the one element to an end of its range that increases the capacity most. The capacity never
+    falls below the capacity of the start.
 
-    Parameters
-    ----------
-    link
-        The links of several bands.
-    analog
-        Starts, float64 [N_B, n, N_E], each entry in [0, 1].
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Configurations, float64 [N_B, n, N_E], each entry in [0, 1], and their capacities
-        [nat/symbol] summed over the sub-bands, float64 [N_B, n].
+    Takes links of several bands and starts, float64 [N_B, n, N_E], each entry in [0, 1]. Returns
+    configurations of the same shape and range, and their capacities [nat/symbol] summed over the
+    sub-bands, float64 [N_B, n].
     """
     # Power received from each element for unit radiation, float64 [N_B, 1, N_SB, N_E].
     spread = np.abs(link.los)**2 + link.spatial.power[:, None]
     spread = spread[:, None]
     point = _Point.at(link, spread, analog)
-    # Whether the corner remains to be tried.
+    # Whether the vertex remains to be tried.
     is_new = np.ones(point.rate.shape, bool)
     for _ in range(_MAX_ROUNDS):
-        to_corner = is_new & (point.corner != point.analog).any(axis=-1)
+        to_vertex = is_new & (point.vertex != point.analog).any(axis=-1)
         by_element, gain = point.element_step(link)
-        done = ~to_corner & (gain <= _MIN_GAIN * point.rate)
+        done = ~to_vertex & (gain <= _MIN_GAIN * point.rate)
         if done.all():
             break
         other = _Point.at(link, spread, np.where(
             done[..., None], point.analog,
-            np.where(to_corner[..., None], point.corner, by_element)))
+            np.where(to_vertex[..., None], point.vertex, by_element)))
         is_new = other.rate - point.rate > _MIN_GAIN * point.rate
         # An element that does not increase the capacity after all ends the ascent.
-        if not (is_new | to_corner).any():
+        if not (is_new | to_vertex).any():
             break
         point = other if (is_new | done).all() else other.where(is_new, point)
     return point.analog, point.rate
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Point:
-    """Configurations, and the local behaviour of the capacity with their best digital parts.
+class _Point(NamedTuple):
+    """Configurations, float64 [N_B, n, N_E], and the capacity with their best digital parts.
 
     Attributes
     ----------
-    analog
-        Float64 [N_B, n, N_E].
     rate
         Capacities [nat/symbol], float64 [N_B, n].
-    corner
-        The corner that the gradient points to, float64 [N_B, n, N_E].
+    vertex
+        The vertex that the gradient points to, float64 [N_B, n, N_E].
     snr
         Signal-to-noise ratios, float64 [N_B, n, N_SB].
     slope, curvature
@@ -92,7 +81,7 @@ class _Point:
 
     analog: np.ndarray
     rate: np.ndarray
-    corner: np.ndarray
+    vertex: np.ndarray
     snr: np.ndarray
     slope: np.ndarray
     curvature: np.ndarray
@@ -114,8 +103,8 @@ class _Point:
         slope = 2 * (weights * towards).real
         curvature = (weights.real**2 + weights.imag**2) * spread
         ascending = np.sum(slope / (1 + snr)[..., None], axis=-2) > 0
-        corner = np.where(link.fixed, 1.0, ascending)
-        return cls(analog, np.log1p(snr).sum(axis=-1), corner, snr, slope, curvature)
+        vertex = np.where(link.fixed, 1.0, ascending)
+        return cls(analog, np.log1p(snr).sum(axis=-1), vertex, snr, slope, curvature)
 
     def element_step(self, link: BandLink) -> tuple[np.ndarray, np.ndarray]:
         """Return the best change of one element to an end of its range, and its gain [nat]."""
@@ -130,23 +119,17 @@ class _Point:
         place = np.arange(n_bands)[:, None], np.arange(n_starts), rates.argmax(axis=-1)
         better = self.analog.copy()
         better[place] = high[place] > low[place]
-        gain: np.ndarray = rates[place] - self.rate
-        return better, gain
+        return better, rates[place] - self.rate
 
     def where(self, condition: np.ndarray, other: '_Point') -> '_Point':
         """Return these points where a condition, bool [N_B, n], holds, and others elsewhere."""
-        pairs = zip(self._fields(), other._fields(), strict=True)
         return _Point(*(np.where(condition.reshape(*condition.shape, *[1] * (new.ndim - 2)),
-                                 new, old) for new, old in pairs))
-
-    def _fields(self) -> list[np.ndarray]:
-        return [self.analog, self.rate, self.corner, self.snr, self.slope, self.curvature]
+                                 new, old) for new, old in zip(self, other, strict=True)))
 
 
 # Number of ascents in each band.
 _N_ASCENTS = 2
-# An ascent ignores drifts of the phases between sub-bands below this, unless that takes more
-# sub-bands than the limit.
+# Between the sub-bands of an ascent, phases drift by at most this, up to a number of sub-bands.
 _MAX_DRIFT_RAD = 0.05
 _MAX_SUBBANDS = 64
 
@@ -184,7 +167,7 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
 
     A search from many starts and the matched filter proposes configurations. The best few of them
     are then improved together with the digital part. Amplitudes of the beam are 0 or 1, which
-    every number of amplitude levels includes. It has the power P_max over all sub-bands. The same
+    are among any number of amplitude levels. The power over all sub-bands is P_max. The same
     position always gives the same beam. Bands are counted from 0. A calibrated surface applies
     its own coefficients to the configuration of the beam.
 
@@ -199,10 +182,7 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
 def steer_bands(
         scenario: Scenario, position: np.ndarray, bands: Sequence[int],
         surface: SurfaceEstimate | None = None) -> list[Beam]:
-    """Find the beam of `steer` for each of some bands, all of them together; errors are the same.
-
-    This takes hardly longer than a single band.
-    """
+    """Find the beams of `steer` for several bands, which takes hardly longer than for one."""
     if not len(bands):
         raise ValueError('bands: none, expected at least one')
     for band in bands:
@@ -220,10 +200,7 @@ def steer_bands(
 
 @one_blas_thread
 def prepare_steering(scenario: Scenario, surface: SurfaceEstimate | None = None) -> None:
-    """Compute the tables of a scenario and surface, for which the first beam would have to wait.
-
-    They are kept for the most recent 16 scenarios and surfaces.
-    """
+    """Compute the tables of a scenario and a surface, which delay the first beam otherwise."""
     choose_beam(scenario, np.array(scenario.roi_center_m), surface=surface)
 
 
@@ -239,11 +216,11 @@ def applied_beam(beam: Beam, surface: SurfaceEstimate | None) -> Beam:
 def choose_beam(
         scenario: Scenario, mean: np.ndarray, covariance: np.ndarray | None = None,
         bands: Sequence[int] | None = None, surface: SurfaceEstimate | None = None) -> Choice:
-    """Steer a beam of each band to the mean position and choose that of highest mean capacity.
+    """Steer a beam of each band to the mean position and choose the one of highest mean capacity.
 
     The capacity at the mean alone would mislead: a band with a stronger but narrower beam may
-    lose more capacity to the positioning error than its strength adds. If several are equal, the
-    first is chosen.
+    lose more capacity to the positioning error than its strength adds. The first of equal bands
+    is chosen.
 
     Parameters
     ----------
@@ -276,22 +253,29 @@ def capacity_report(
         scenario: Scenario, beam: Beam, position: np.ndarray,
         bands: Sequence[int] | None = None,
         surface: SurfaceEstimate | None = None) -> CapacityReport:
-    """Compare a beam with the one chosen with the true position, float64 [3] [m].
+    """Compare a beam with the beam that `choose_beam` finds for the true position.
 
-    Both transmit over the paths of a channel file, if the scenario has one. The latter is chosen
-    from `bands` for `surface`, as in `choose_beam`. The search for a beam ends slightly below the
-    maximum, so that the loss with an accurate estimate may be negative, typically by less than a
-    tenth of a per cent.
+    Both transmit over the paths of a channel file, if the scenario has one. The search for a beam
+    ends slightly below the maximum, so that the loss with an accurate estimate may be negative,
+    typically by less than a tenth of a per cent.
+
+    Parameters
+    ----------
+    position
+        The true position, float64 [3] [m].
+    bands, surface
+        As in `choose_beam`.
 
     Raises
     ------
     ValueError
         If the position is not a finite [3] array, or the beam does not fit the scenario.
     """
+    def actual_bps(beam: Beam) -> float:
+        place = np.asarray(position, dtype=float)[None]
+        return float(actual_capacity(scenario, applied_beam(beam, surface), place)[0])
+
     perfect = choose_beam(scenario, position, bands=bands, surface=surface)
-    used, place = applied_beam(beam, surface), np.asarray(position, dtype=float)
-    perfect_bps = perfect.expected_bps
-    if scenario.channel:
-        best = applied_beam(perfect.beam, surface)
-        perfect_bps = float(actual_capacity(scenario, best, place[None])[0])
-    return CapacityReport(float(actual_capacity(scenario, used, place[None])[0]), perfect_bps)
+    return CapacityReport(
+        actual_bps(beam),
+        actual_bps(perfect.beam) if scenario.channel else perfect.expected_bps)

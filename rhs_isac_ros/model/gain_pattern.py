@@ -5,11 +5,11 @@ direction. The line between them therefore has the same angle theta from both bo
 cos theta = x / d for a user at the distance x from the surface's plane and d from the element.
 """
 
-import hashlib
 from collections.abc import Callable
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import digest
 from rhs_isac_ros.support import plugins
 
 # Callable that takes angles [rad], float64 of any shape, and returns float64 of that shape.
@@ -29,13 +29,14 @@ class PatternError(ValueError):
 class GainPattern:
     """Amplitude gain that depends only on the angle from the boresight.
 
-    Patterns whose gains agree to seven digits are equal, even if they use different functions.
+    Patterns whose gains agree to seven digits are equal, even if they use different functions;
+    `digest`, 16 hexadecimal digits, identifies them in all processes.
 
     Parameters
     ----------
     amplitude
-        Callable that takes an array of angles from 0 to pi [rad] and returns the amplitude
-        gains, from 0 to 1e6, in the same shape. It must be deterministic.
+        Deterministic callable that takes an array of angles from 0 to pi [rad] and returns the
+        amplitude gains, from 0 to 1e6, in the same shape.
     slope
         Derivative of `amplitude` [1/rad], a callable of the same form. The default, fourth-order
         finite differences, is accurate to ten digits where the pattern is smooth over a few
@@ -43,32 +44,26 @@ class GainPattern:
     name
         Name of the plug-in; empty for other functions.
 
-    Attributes
-    ----------
-    digest
-        16 hexadecimal digits that identify the gains, the same in all processes.
-
     Raises
     ------
     PatternError
-        If a function returns another shape, or values that are not real or out of range. The
-        methods `amplitude` and `slope` check shape and type in the same way.
+        If a function fails, or returns another shape or values that are not real or out of range.
     """
 
     def __init__(self, amplitude: AngleFunction, slope: AngleFunction | None = None,
                  name: str = '') -> None:
         self._amplitude, self._slope, self.name = amplitude, slope, name
         gains = self.amplitude(_ANGLES)
-        bad = ~((gains >= 0) & (gains <= _MAX_GAIN))
-        if bad.any():
-            first = np.argmax(bad)
+        valid = (gains >= 0) & (gains <= _MAX_GAIN)
+        if not valid.all():
+            first = np.argmin(valid)
             raise PatternError(f'gain {gains[first]:g} at {_ANGLES[first]:.3f} rad, expected 0 to '
                                f'{_MAX_GAIN:g} at all angles from 0 to pi')
         if not gains[_ANGLES < np.pi / 2].any():
             raise PatternError('gain 0 at all angles below pi/2, expected a positive gain')
         content = gains if slope is None else np.concatenate([gains, self.slope(_ANGLES)])
         # Machines may round the last digit of a sine differently, hence single precision.
-        self.digest = hashlib.sha256(content.astype('<f4').tobytes()).hexdigest()[:16]
+        self.digest = digest(content.astype('<f4'))
 
     def amplitude(self, angles: np.ndarray) -> np.ndarray:
         """Return the amplitude gains, float64, at angles from the boresight [rad]."""
@@ -89,17 +84,11 @@ class GainPattern:
     def named(cls, text: str) -> 'GainPattern':
         """Load the pattern of a plug-in.
 
-        `text` is the name of an entry point of `plugins.GAIN_PATTERNS`, optionally with ``@`` and
-        the digest that the pattern must have, as `str` writes it.
-
-        Raises
-        ------
-        PatternError
-            If the digest differs, the name is empty, or the plug-in is not a gain pattern.
-        PluginError
-            If there is no such plug-in, or it cannot be loaded.
+        Takes the name of an entry point of `plugins.GAIN_PATTERNS`, optionally with ``@`` and the
+        digest that the pattern must have. Raises PatternError or PluginError if there is no such
+        pattern.
         """
-        name, _, digest = text.partition('@')
+        name, _, expected = text.partition('@')
         if not name:
             raise PatternError(
                 f'{text!r}: a function that is not a plug-in, expected a number or the name of a '
@@ -111,8 +100,8 @@ class GainPattern:
                        if isinstance(source, GainPattern) else cls(source, name=name))
         except PatternError as error:
             raise PatternError(f'{origin}: {error}') from None
-        if digest and pattern.digest != digest:
-            raise PatternError(f'{origin}: digest {pattern.digest}, expected {digest}: the '
+        if expected and pattern.digest != expected:
+            raise PatternError(f'{origin}: digest {pattern.digest}, expected {expected}: the '
                                'pattern has changed')
         return pattern
 
@@ -131,11 +120,6 @@ class GainPattern:
     def __hash__(self) -> int:
         """Hash the gains."""
         return hash(self.digest)
-
-
-def amplitude_of(gain: float | GainPattern, angles: np.ndarray) -> float | np.ndarray:
-    """Return a constant gain unchanged, or a pattern's gains at angles [rad], in their shape."""
-    return gain.amplitude(angles) if isinstance(gain, GainPattern) else gain
 
 
 def _evaluate(function: AngleFunction, angles: np.ndarray) -> np.ndarray:

@@ -9,45 +9,36 @@ BLOCKED_STD_DB = 10.0
 
 
 class Marginal(NamedTuple):
-    """The Gaussian of the first n of n + Q unknowns, after the maximum over the others.
+    """The Gaussian of the first n of n + Q unknowns, after the maximum over the others."""
 
-    Attributes
-    ----------
-    information
-        Schur complement of the information, float64 [N, n, n].
-    gradient
-        Gradient of the log-likelihood, float64 [N, n].
-    regression
-        Change of the other unknowns with the first ones, float64 [N, Q, n].
-    offset
-        Step of the other unknowns to their maximum, float64 [N, Q].
-    log_volume
-        Logarithm of the integral over the others relative to the maximum, without the factors
-        2 pi, float64 [N].
-    """
-
+    # Schur complement of the information [N, n, n], and gradient of the log-likelihood [N, n].
     information: np.ndarray
     gradient: np.ndarray
+    # Change of the other unknowns with the first ones [N, Q, n], and their step to the maximum
+    # [N, Q].
     regression: np.ndarray
     offset: np.ndarray
+    # Logarithm of the integral over the others relative to the maximum [N], without the factors
+    # 2 pi.
     log_volume: np.ndarray
 
 
-def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float) -> np.ndarray:
+def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: float = 0.0
+                          ) -> np.ndarray:
     """Average the likelihood of Gaussian numbers over their level, a log-normal power.
 
     Takes the energies of n complex numbers, relative to their variance at 0 dB, float64 [N], and
-    the standard deviation of the level. Returns the logarithm of the average, relative to the
-    density of zeros at 0 dB, float64 [N].
+    the standard deviation and the median of the level. Returns the logarithm of the average,
+    relative to the density of zeros at 0 dB, float64 [N].
     """
     std = np.log(10) / 10 * std_db
     # The likelihood of n numbers determines the level up to n**-0.5.
-    level = std * np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
-    exponents = -energy[:, None] * np.exp(-level) - n * level - level**2 / (2 * std**2)
+    normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
+    level, prior = np.log(10) / 10 * median_db + std * normal, -normal**2 / 2
+    exponents = -energy[:, None] * np.exp(-level) - n * level + prior
     highest = exponents.max(axis=1)
     total = np.exp(exponents - highest[:, None]).sum(axis=1)
-    return (
-        highest + np.log(total) - np.log(np.exp(-level**2 / (2 * std**2)).sum()))
+    return highest + np.log(total) - np.log(np.exp(prior).sum())
 
 
 def eliminate(
@@ -56,8 +47,8 @@ def eliminate(
     """Maximise a quadratic log-likelihood over nuisance parameters.
 
     Takes its curvature in these, float64 [N, Q, Q], their coupling with n other unknowns,
-    [N, Q, n], and its gradient, [N, Q]. Returns how the maximum moves with the other unknowns, the
-    negative coupling after a solution, [N, Q, n], and the step to the maximum, [N, Q].
+    [N, Q, n], and its gradient, [N, Q]. Returns how the maximum moves with the other unknowns,
+    [N, Q, n], and the step to the maximum, [N, Q].
     """
     both = np.linalg.solve(
         curvature, np.concatenate([-coupling, gradient[..., None]], axis=-1))

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
 
@@ -21,19 +22,14 @@ def element_interval_m(scenario: Scenario) -> float:
 def element_positions(scenario: Scenario) -> np.ndarray:
     """Compute the positions of the elements in the plane x = 0, centred on the origin.
 
-    Returns
-    -------
-    numpy.ndarray
-        Float64 [N_E, 3] [m], read-only. The index of an element is row * n_columns + column; a
-        row runs along y, a column along z.
+    Returns float64 [N_E, 3] [m], read-only. The index of an element is row * n_columns + column;
+    a row runs along y, a column along z.
     """
     y, z = ((np.arange(n) - (n - 1) / 2) * element_interval_m(scenario)
             for n in (scenario.n_columns, scenario.n_rows))
     lattice = np.zeros((scenario.n_rows, scenario.n_columns, 3))
     lattice[..., 1], lattice[..., 2] = y, z[:, None]
-    positions: np.ndarray = lattice.reshape(-1, 3)
-    positions.flags.writeable = False
-    return positions
+    return read_only(lattice.reshape(-1, 3))
 
 
 def feed_positions(scenario: Scenario) -> np.ndarray:
@@ -55,6 +51,4 @@ def subband_frequencies_hz(scenario: Scenario) -> np.ndarray:
     """Compute the sub-bands' centre frequencies f_{i,j}, float64 [N_B, N_SB] [Hz], read-only."""
     centers = np.array(scenario.center_frequencies_hz)[:, None]
     offsets = np.arange(scenario.n_subbands) - (scenario.n_subbands - 1) / 2
-    frequencies: np.ndarray = centers + offsets * scenario.subband_width_hz
-    frequencies.flags.writeable = False
-    return frequencies
+    return read_only(centers + offsets * scenario.subband_width_hz)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rhs_isac_ros.model.gain_pattern import GainPattern, amplitude_of
+from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
@@ -24,19 +24,19 @@ def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray
     return _gain(scenario, distances, band, _amplitude(scenario, offsets))
 
 
-def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray | None:
-    """Draw whether n users lack the direct path, bool [n]; None if the scenario has none."""
+def draw_blocked(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw whether n users lack the direct path, bool [n]."""
     if not scenario.blocked_probability:
-        return None
+        return np.zeros(n, bool)
     return rng.spawn(1)[0].random(n) < scenario.blocked_probability
 
 
 def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
                 blocked: np.ndarray | None = None) -> np.ndarray:
-    """Compute the gains without random multipath in the shape of `los_gain`.
+    """Compute the gains without random multipath, complex128 [N, N_SB, N_E].
 
-    They are those of `los_gain`, or with a channel file the sums over the paths of the users
-    nearest to the positions; without direct paths for users that are `blocked`, bool [N].
+    These are the gains of `los_gain`, or with a channel file the sums over the paths of the users
+    nearest to the positions. Users that are `blocked`, bool [N], have no direct path.
     """
     channel = scenario.channel
     blocked = np.zeros(len(positions), bool) if blocked is None else blocked
@@ -57,10 +57,7 @@ def direct_gain(scenario: Scenario, positions: np.ndarray, band: int,
 
 
 def los_gain_at(scenario: Scenario, position: np.ndarray, bands: Sequence[int]) -> np.ndarray:
-    """Compute `los_gain` at one position, float64 [3] [m], in some bands.
-
-    The bands share the distances. Returns complex128 [n, N_SB, N_E].
-    """
+    """Compute `los_gain` at one position [3] [m] in n bands, complex128 [n, N_SB, N_E]."""
     offsets, distances = _separation(scenario, np.asarray(position)[None])
     amplitude = _amplitude(scenario, offsets)
     return np.concatenate([_gain(scenario, distances, band, amplitude) for band in bands])
@@ -68,15 +65,10 @@ def los_gain_at(scenario: Scenario, position: np.ndarray, bands: Sequence[int]) 
 
 def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
-    """Sum the gains of `los_gain` over the elements in some bands, complex128 [n, N, N_SB].
+    """Sum the gains of `los_gain` over the elements in n bands, complex128 [n, N, N_SB].
 
-    The gains of all elements and sub-bands are not stored, and the bands share their
-    exponentials. The weights are complex128 [n, N_SB, N_E], the positions float64 [N, 3] [m].
-
-    Raises
-    ------
-    ValueError
-        If `positions` is not a finite [N, 3] array.
+    The weights are complex128 [n, N_SB, N_E]. The gains of all elements and sub-bands are not
+    stored, and the bands share their exponentials.
     """
     offsets, distances = _separation(scenario, positions)
     amplitudes = _amplitude(scenario, offsets) / distances
@@ -120,11 +112,9 @@ def los_derivative_terms(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Compute `los_gain` and the factors of its derivative.
 
-    The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. A
-    weighted sum over the elements is therefore p times the sum of a, minus the sum of a p_m, plus
-    that of b e_x. The boresight term b exists only with a gain pattern, which adds
-    (dh/dtheta) (dtheta/dp) for the angle theta from the boresight, with
-    dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
+    The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b e_x. The
+    boresight term b exists only with a gain pattern, which adds (dh/dtheta) (dtheta/dp) for the
+    angle theta from the boresight: dtheta/dp = ((p - p_m) cos theta / d - e_x) / (d sin theta).
 
     Returns h^LoS, complex128 [N, N_SB, N_E], and of the same shape the radial factor a [1/m^2]
     and the boresight term b [1/m], which is None without a gain pattern.
@@ -137,7 +127,7 @@ def los_derivative_terms(
     radial.real = -inverse**2
     radial.imag = -wavenumbers[:, None] * inverse
     radial *= gain
-    if not _has_pattern(scenario):
+    if constant_gain(scenario) is not None:
         return gain, radial, None
     by_angle = _gain(scenario, distances, band, _amplitude(scenario, offsets, slope=True))
     # On boresight, where dtheta/dp has no direction, a smooth pattern has zero slope.
@@ -149,14 +139,8 @@ def los_derivative_terms(
 
 
 def checked_positions(positions: ArrayLike) -> np.ndarray:
-    """Convert positions to float64 [N, 3] [m] and check them.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or a value is not finite.
-    """
-    array: np.ndarray = np.asarray(positions, dtype=float)
+    """Convert positions to float64 [N, 3] [m]; raise ValueError if they are not finite [N, 3]."""
+    array = np.asarray(positions, dtype=float)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f'positions: shape {array.shape}, expected [N, 3]')
     if not np.isfinite(array).all():
@@ -170,22 +154,26 @@ def _separation(scenario: Scenario, positions: np.ndarray) -> tuple[np.ndarray, 
     return offsets, np.sqrt(np.einsum('nmu,nmu->nm', offsets, offsets))
 
 
-def _has_pattern(scenario: Scenario) -> bool:
-    return any(isinstance(gain, GainPattern)
-               for gain in (scenario.element_gain, scenario.user_gain))
+def constant_gain(scenario: Scenario) -> float | None:
+    """Return the product of the gains of elements and users; None if one is a pattern."""
+    element, user = scenario.element_gain, scenario.user_gain
+    if isinstance(element, GainPattern) or isinstance(user, GainPattern):
+        return None
+    return element * user
 
 
 def _amplitude(
         scenario: Scenario, offsets: np.ndarray, *, slope: bool = False) -> float | np.ndarray:
-    """Gain times distance and frequency: a number, or float64 [N, N_E] [m Hz].
+    """Gain times distance and frequency [m Hz], or its derivative by the angle [m Hz/rad].
 
-    On request, its derivative with respect to the angle from the boresight instead [m Hz/rad].
+    Returns a number, or float64 [N, N_E] if there is a gain pattern.
     """
     gains = scenario.element_gain, scenario.user_gain
-    angles: np.ndarray = np.zeros(())
-    if _has_pattern(scenario):
+    angles = np.zeros(())
+    if constant_gain(scenario) is None:
         angles = np.arctan2(np.hypot(offsets[..., 1], offsets[..., 2]), offsets[..., 0])
-    element, user = (amplitude_of(gain, angles) for gain in gains)
+    element, user = (
+        gain.amplitude(angles) if isinstance(gain, GainPattern) else gain for gain in gains)
     if slope:
         by_element, by_user = (
             gain.slope(angles) if isinstance(gain, GainPattern) else 0.0 for gain in gains)

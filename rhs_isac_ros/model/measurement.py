@@ -1,4 +1,4 @@
-"""Gaussian model of the signals received in a positioning phase.
+"""Distribution and simulation of the signals received in a positioning phase.
 
 The signals of band i are complex Gaussian with a mean that depends on the user's position and a
 covariance Lambda_i that does not. Bands are independent of each other. Element errors that the
@@ -11,12 +11,18 @@ from typing import TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model.gain_pattern import GainPattern
+from rhs_isac_ros.model.arrays import blocks, read_only
+from rhs_isac_ros.model.elements import (
+    DeclaredElements,
+    ElementErrors,
+    SurfaceEstimate,
+    SurfaceModel,
+)
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
-from rhs_isac_ros.model.impairments.elements import DeclaredElements, ElementErrors, SurfaceModel
-from rhs_isac_ros.model.impairments.factors import draw_impairments
+from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import (
     checked_positions,
+    constant_gain,
     direct_gain,
     draw_blocked,
     los_derivative,
@@ -25,27 +31,107 @@ from rhs_isac_ros.model.los import (
 )
 from rhs_isac_ros.model.multipath import (
     complex_normal,
+    draw_multipath,
     scattered_covariance,
     square_root,
 )
-from rhs_isac_ros.model.receive import received_signal
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
-from rhs_isac_ros.model.surface import Beamforming, radiation_matrix
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.surface import Beamforming, combine, radiation_matrix
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
 # Knowledge of the elements of one surface: their errors, or an estimate of them.
 Surface = ElementErrors | SurfaceEstimate
-# Largest number of positions evaluated at a time, and of gains of all elements and sub-bands.
+# Largest number of positions evaluated at a time, and of gains of all elements and sub-bands. The
+# random numbers of `simulate_received` depend on the former.
 _BLOCK, _MAX_GAINS = 256, 1 << 21
 # Gain, radial factor, and boresight term or None, complex128 [N_SB, N, N_E].
 _Terms: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 # Number of unit phasors in the table of `_phasors`.
 _N_PHASORS = 512
+_TABLE = np.exp(2j * np.pi * np.arange(_N_PHASORS) / _N_PHASORS)
 # Memory for an array of all elements and sub-bands. Larger arrays leave the cache, and each call
 # gets new pages for them from the system.
 _ARRAY_BYTES = 3 << 18
 _MIN_BLOCK = 8
+
+
+def received_signal(
+        los: np.ndarray, multipath: np.ndarray | float, radiation: np.ndarray,
+        noise: np.ndarray | float, symbol: complex | np.ndarray = 1.0) -> np.ndarray:
+    """Implements Eq. (8). Received signals y_i of one band, complex128 [..., N_SB F].
+
+    Parameters
+    ----------
+    los
+        Line-of-sight gains H^LoS, complex128 [..., N_SB, N_E]; one row serves all F frames.
+    multipath
+        Multipath gains H^MP, complex128 [..., N_SB F, N_E] (sub-band-major), or 0.
+    radiation
+        T_i, complex128 [N_SB F, N_E].
+    noise
+        Thermal noise e, complex128 [..., N_SB F], or 0.
+    symbol
+        The user's symbol x, or one for each measurement, complex128 [..., N_SB F].
+    """
+    n_subbands = los.shape[-2]
+    frames = radiation.reshape(n_subbands, -1, radiation.shape[-1])
+    # Only the diagonal of H T^T is needed: the F rows of T of each sub-band with its gains.
+    direct = np.matmul(los[..., None, :], np.swapaxes(frames, -1, -2))
+    combined = direct.reshape(*los.shape[:-2], -1)
+    if np.ndim(multipath):
+        combined = combined + np.einsum('...rm,rm->...r', multipath, radiation)
+    return combined * symbol + noise
+
+
+@one_blas_thread
+def simulate_received(
+        scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
+        rng: np.random.Generator, surface: ElementErrors | None = None) -> np.ndarray:
+    """Simulate signals of independent positioning phases by Eq. (8), element by element.
+
+    Takes the user's position in each phase, float64 [N, 3] [m], and returns complex128
+    [N, N_B, N_SB F], sub-band-major. Impairments that the scenario declares are drawn too: a new
+    user and a new cycle for each position, and one surface for all of them, unless `surface` is
+    given. With a channel file, the users are the file's nearest to the positions.
+
+    Raises
+    ------
+    ValueError
+        If `positions` is not a finite [N, 3] array, or a size differs from the scenario's.
+    """
+    positions = checked_positions(positions)
+    drawn, factors = draw_impairments(scenario, len(positions), rng)
+    blocked = draw_blocked(scenario, len(positions), rng)
+    surface = surface or drawn
+    radiation = radiation_matrix(
+        scenario, surface.applied_beams(codebook) if surface else codebook)
+    n_bands, n_measurements, _ = radiation.shape
+    received = np.empty((len(positions), n_bands, n_measurements), complex)
+    for block in blocks(len(positions), _BLOCK):
+        for band in range(n_bands):
+            los = direct_gain(scenario, positions[block], band, blocked[block])
+            gains = 0.0 if scenario.channel else draw_multipath(scenario, band, len(los), rng)
+            noise = _thermal_noise(scenario, (len(los), n_measurements), rng)
+            symbol = 1.0 if factors is None else factors[block, band]
+            received[block, band] = received_signal(los, gains, radiation[band], noise, symbol)
+    return received
+
+
+def receive_feeds(
+        scenario: Scenario, codebook: Beamforming, feeds: np.ndarray,
+        rng: np.random.Generator | None) -> np.ndarray:
+    """Combine the feed signals of a phase by Eq. (7), complex128 [N_B, N_SB, F].
+
+    Takes the signals at the feeds, complex128 [N_B, F, N_SB, K], and the source of the thermal
+    noise; None if the signals already contain noise.
+    """
+    noise = 0.0 if rng is None else _thermal_noise(scenario, codebook.digital.shape[:3], rng)
+    return combine(codebook.digital, np.swapaxes(feeds, 1, 2), noise)
+
+
+def _thermal_noise(
+        scenario: Scenario, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    return np.sqrt(scenario.noise_power_w) * complex_normal(shape, rng)
 
 
 def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
@@ -61,15 +147,8 @@ def signal_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarray:
 def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
     """Implements Eq. (13). Derivative of one band's mean signal with respect to the position.
 
-    Returns complex128 [N, G, N_SB F] [1/m], sub-band-major.
-
-    Parameters
-    ----------
-    slopes
-        Derivative of the line-of-sight gains, complex128 [N, G, N_SB, N_E] [1/m]; G is 3. Any
-        other linear functions of the gains may take its place.
-    radiation
-        T_i of the band, complex128 [N_SB F, N_E].
+    Takes the derivative of the line-of-sight gains, complex128 [N, 3, N_SB, N_E] [1/m], and T_i of
+    the band, complex128 [N_SB F, N_E]. Returns complex128 [N, 3, N_SB F] [1/m], sub-band-major.
     """
     n, n_rows, n_subbands, n_elements = slopes.shape
     frames = radiation.reshape(n_subbands, -1, n_elements)
@@ -81,8 +160,8 @@ def mean_derivative(slopes: np.ndarray, radiation: np.ndarray) -> np.ndarray:
 
 def position_blocks(scenario: Scenario, n: int) -> list[slice]:
     """Split n positions into blocks whose line-of-sight gains need little memory."""
-    size = max(min(_BLOCK, _MAX_GAINS // (scenario.n_subbands * scenario.n_elements)), 1)
-    return [slice(start, start + size) for start in range(0, n, size)]
+    return blocks(
+        n, max(min(_BLOCK, _MAX_GAINS // (scenario.n_subbands * scenario.n_elements)), 1))
 
 
 class MeasurementModel:
@@ -91,8 +170,8 @@ class MeasurementModel:
     Immutable. Construction computes the radiation matrices only; the factors of the covariance
     and the weights of `mean_and_jacobian` are computed at first use, or by `prepare`.
 
-    Positions are those of the user, float64 [N, 3] [m]. Methods that take them raise ValueError
-    if the shape is wrong or a value is not finite. Measurements are sub-band-major.
+    Methods take positions of the user, float64 [N, 3] [m], and raise ValueError if the shape is
+    wrong or a value is not finite. Measurements are sub-band-major.
 
     Parameters
     ----------
@@ -120,7 +199,7 @@ class MeasurementModel:
                  surface: Surface | None = None) -> None:
         self.scenario, self.beams, self.surface = scenario, beamforming, surface
         self.elements: SurfaceModel = surface or DeclaredElements(scenario)
-        self.radiation = _read_only(
+        self.radiation = read_only(
             radiation_matrix(scenario, self.elements.applied_beams(beamforming)))
 
     @property
@@ -146,7 +225,7 @@ class MeasurementModel:
         It depends on the position through unknown errors of the elements only.
         """
         positions = checked_positions(positions)
-        covariance: np.ndarray = np.repeat(
+        covariance = np.repeat(
             signal_covariance(self.scenario, self.radiation)[None], len(positions), axis=0)
         if not self.elements.is_exact:
             covariance += self.elements.error_covariance_at(
@@ -156,12 +235,12 @@ class MeasurementModel:
     @functools.cached_property
     def root(self) -> np.ndarray:
         """Cholesky factor L_i of Lambda_i, complex128 [N_B, N_SB F, N_SB F], read-only."""
-        return _read_only(np.linalg.cholesky(self.covariance()))
+        return read_only(np.linalg.cholesky(self.covariance()))
 
     @functools.cached_property
     def whitener(self) -> np.ndarray:
         """L_i^-1, lower triangular, complex128 [N_B, N_SB F, N_SB F], read-only."""
-        return _read_only(np.linalg.inv(self.root))
+        return read_only(np.linalg.inv(self.root))
 
     @one_blas_thread
     def prepare(self, jacobian: bool = False) -> 'MeasurementModel':
@@ -180,7 +259,7 @@ class MeasurementModel:
         """Compute the mean signals, complex128 [N, N_B, N_SB F]: Eq. (8) for the direct path."""
         # A change of this kernel or its block size would change the simulated signals of all
         # seeds.
-        def of_band(positions: np.ndarray, band: int) -> np.ndarray:
+        def of_band(positions: np.ndarray, _: slice, band: int) -> np.ndarray:
             los = los_gain(self.scenario, positions, band)
             return received_signal(los, 0.0, self.radiation[band], 0.0)
 
@@ -196,17 +275,18 @@ class MeasurementModel:
 
     def jacobian(self, positions: np.ndarray) -> np.ndarray:
         """Compute the derivative of the mean signals, complex128 [N, 3, N_B, N_SB F] [1/m]."""
-        return self._of_bands(positions, (3,), self.band_jacobian)
+        return self._of_bands(
+            positions, (3,), lambda positions, _, band: self.band_jacobian(positions, band))
 
     def _of_bands(self, positions: np.ndarray, rows: tuple[int, ...],
-                  of_band: Callable[[np.ndarray, int], np.ndarray]) -> np.ndarray:
-        """Evaluate a function of positions and band, [N, *rows, N_B, N_SB F], in blocks."""
+                  of_band: Callable[[np.ndarray, slice, int], np.ndarray]) -> np.ndarray:
+        """Evaluate a function of positions, block and band, [N, *rows, N_B, N_SB F]."""
         positions = checked_positions(positions)
         result = np.empty((len(positions), *rows, *self.shape), complex)
 
         def fill(block: slice) -> None:
             for band in range(len(self.radiation)):
-                result[block, ..., band, :] = of_band(positions[block], band)
+                result[block, ..., band, :] = of_band(positions[block], block, band)
 
         map_blocks(fill, position_blocks(self.scenario, len(positions)))
         return result
@@ -216,13 +296,8 @@ class MeasurementModel:
             whitened: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute `mean` and `jacobian` together, much faster, but with different rounding.
 
-        Parameters
-        ----------
-        by_coordinate
-            Derivatives of the positions with respect to other coordinates, float64 [N, 3, Q],
-            for the derivatives of the mean with respect to these, [N, Q, N_B, N_SB F].
-        whitened
-            Whether to `whiten` both.
+        Both may be `whitened`. With derivatives of the positions with respect to Q other
+        coordinates, float64 [N, 3, Q], the derivatives of the mean are with respect to these.
         """
         positions, weights = checked_positions(positions), self._weights
         n, (n_bands, n_rows) = len(positions), self.shape
@@ -232,8 +307,7 @@ class MeasurementModel:
         mean = np.empty((n, n_bands, n_rows), complex)
         jacobian = np.empty((n, by_term.shape[1], n_bands, n_rows), complex)
 
-        def fill(start: int) -> None:
-            block = slice(start, start + weights.block)
+        def fill(block: slice) -> None:
             terms = weights.terms(positions[block])
             if whitened:
                 shape = terms.shape
@@ -243,7 +317,7 @@ class MeasurementModel:
             parts = np.matmul(by_term[block], terms[:, :, 1:].view(float))
             jacobian[block] = np.moveaxis(parts.view(complex), 0, 2)
 
-        map_blocks(fill, range(0, n, weights.block))
+        map_blocks(fill, blocks(n, weights.block))
         return mean, jacobian
 
     @one_blas_thread
@@ -255,42 +329,28 @@ class MeasurementModel:
         a hundred times as long. Impairments that the scenario declares are drawn as described
         there, and so are the signals of a channel file.
         """
-        surface, factors = draw_impairments(self.scenario, len(positions), rng)
-        blocked = draw_blocked(self.scenario, len(positions), rng)
+        scenario = self.scenario
+        surface, factors = draw_impairments(scenario, len(positions), rng)
+        blocked = draw_blocked(scenario, len(positions), rng)
+        model = self
         if surface is not None and self.surface is None:
-            return MeasurementModel(self.scenario, self.beams, surface)._sample(
-                positions, rng, factors, blocked)
-        return self._sample(positions, rng, factors, blocked)
+            model = MeasurementModel(scenario, self.beams, surface)
 
-    def _sample(self, positions: np.ndarray, rng: np.random.Generator,
-                factors: np.ndarray | None, blocked: np.ndarray | None) -> np.ndarray:
-        if self.scenario.channel:
-            return self._traced(positions, rng, factors, blocked)
-        signals = self.mean(positions)
-        if blocked is not None:
-            signals[blocked] = 0
-        white = complex_normal(signals.shape, rng)
-        if factors is None:
-            for band, root in enumerate(self.root):
-                signals[:, band] += white[:, band] @ root.T
-            return signals
-        # Factors act on the multipath, but not on the noise.
-        noise = np.sqrt(self.scenario.noise_power_w) * complex_normal(signals.shape, rng)
-        for band, scattered in enumerate(scattered_covariance(self.scenario, self.radiation)):
-            root = square_root(scattered)
-            signals[:, band] += white[:, band, :root.shape[1]] @ root.T
-        return signals * factors + noise
+        def of_band(positions: np.ndarray, block: slice, band: int) -> np.ndarray:
+            los = direct_gain(scenario, positions, band, blocked[block])
+            return received_signal(los, 0.0, model.radiation[band], 0.0)
 
-    def _traced(self, positions: np.ndarray, rng: np.random.Generator,
-                factors: np.ndarray | None, blocked: np.ndarray | None) -> np.ndarray:
-        signals = self._of_bands(positions, (), lambda block, band: received_signal(
-            direct_gain(self.scenario, block, band), 0.0, self.radiation[band], 0.0))
-        if blocked is not None and blocked.any():
-            for band, radiation in enumerate(self.radiation):
-                signals[blocked, band] = received_signal(
-                    direct_gain(self.scenario, positions[blocked], band, np.ones(
-                        int(blocked.sum()), bool)), 0.0, radiation, 0.0)
-        noise = np.sqrt(self.scenario.noise_power_w) * complex_normal(signals.shape, rng)
+        signals = model._of_bands(positions, (), of_band)
+        if not scenario.channel:
+            white = complex_normal(signals.shape, rng)
+            # Factors act on the multipath, but not on the noise.
+            roots = model.root if factors is None else map(
+                square_root, scattered_covariance(scenario, model.radiation))
+            for band, root in enumerate(roots):
+                signals[:, band] += white[:, band, :root.shape[1]] @ root.T
+            if factors is None:
+                return signals
+        noise = _thermal_noise(scenario, signals.shape, rng)
         return signals * (1.0 if factors is None else factors) + noise
 
     @functools.cached_property
@@ -298,26 +358,12 @@ class MeasurementModel:
         return ElementSums(self.scenario, self.radiation)
 
 
-def _read_only(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
-    return array
-
-
 class ElementSums:
     """Weights of the elements for the mean signals and their derivative.
 
     Each sum over elements of a T_i (p - p_m) is p times the sum of a T_i, minus the sum of
-    a T_i p_m: sums of N_E terms that need no array of N_E by 3.
-
-    Parameters
-    ----------
-    radiation
-        T_i, complex128 [N_B, N_SB F, N_E].
-
-    Attributes
-    ----------
-    block
-        Number of positions to evaluate at a time.
+    a T_i p_m: sums of N_E terms that need no array of N_E by 3. `block` is the number of positions
+    to evaluate at a time.
     """
 
     def __init__(self, scenario: Scenario, radiation: np.ndarray) -> None:
@@ -325,15 +371,14 @@ class ElementSums:
         shape = scenario.n_bands, scenario.n_subbands, scenario.n_frames, scenario.n_elements
         self.block = max(_ARRAY_BYTES // (16 * shape[1] * shape[3]), _MIN_BLOCK)
         self._wavenumbers = 2 * np.pi * subband_frequencies_hz(scenario) / SPEED_OF_LIGHT_MPS
-        element, user = scenario.element_gain, scenario.user_gain
-        self._has_pattern = isinstance(element, GainPattern) or isinstance(user, GainPattern)
+        gain = constant_gain(scenario)
+        self._has_pattern = gain is None
         # T_i, complex128 [N_B, N_SB, N_E, F]; without a pattern, times the constant part of the
         # gain.
-        frames = np.ascontiguousarray(np.swapaxes(radiation.reshape(shape), 2, 3))
-        if not isinstance(element, GainPattern) and not isinstance(user, GainPattern):
-            # Not in place: with one frame, the array is that of the caller.
-            frames = frames * (element * user / 2 / self._wavenumbers)[..., None, None]
-        self._frames = frames
+        self._frames = np.ascontiguousarray(np.swapaxes(radiation.reshape(shape), 2, 3))
+        if gain is not None:
+            # Not in place: with one frame, the array belongs to the caller.
+            self._frames = self._frames * (gain / 2 / self._wavenumbers)[..., None, None]
         self._elements = element_positions(scenario)
         # Coordinates in which the elements differ from the origin; a plane has two.
         self._axes = np.flatnonzero(self._elements.any(axis=0))
@@ -403,19 +448,16 @@ def _phasors(phases: np.ndarray) -> np.ndarray:
     """Compute exp(i phase), complex128, for phases [rad] of moderate size.
 
     The nearest phasor of a table is rotated by the rest of the phase with the Taylor series, which
-    takes a third of the time of an exponential. The error is below 1e-15, and below that of the
-    phase for large phases.
+    takes a third of the time of an exponential. The error is below 1e-15, or below the rounding
+    of a large phase.
     """
     turns = phases * (_N_PHASORS / (2 * np.pi))
     nearest = np.rint(turns)
     rest = (turns - nearest) * (2 * np.pi / _N_PHASORS)
     square = rest * rest
-    phasors: np.ndarray = _TABLE[nearest.astype(np.intp) & (_N_PHASORS - 1)]
+    phasors = _TABLE[nearest.astype(np.intp) & (_N_PHASORS - 1)]
     rotation = np.empty(phases.shape, complex)
     rotation.real = 1 - square * (0.5 - square * (1 / 24))
     rotation.imag = rest * (1 - square * (1 / 6 - square * (1 / 120)))
     phasors *= rotation
     return phasors
-
-
-_TABLE = np.exp(2j * np.pi * np.arange(_N_PHASORS) / _N_PHASORS)

@@ -7,8 +7,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.los import checked_positions
-from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
 
@@ -27,17 +27,7 @@ class Mobility(Protocol):
 
 
 class Leg(NamedTuple):
-    """A straight part of a path at constant velocity.
-
-    Attributes
-    ----------
-    origin
-        Position at the departure, float64 [3] [m].
-    velocity
-        Float64 [3] [m/s].
-    departure_s, end_s
-        Times of departure and of the end of the leg [s].
-    """
+    """A part of a path at constant velocity [3] [m/s], from a position [3] [m], between times."""
 
     origin: np.ndarray
     velocity: np.ndarray
@@ -60,7 +50,7 @@ class StraightMobility(Mobility, Protocol):
 
 
 class Crowd:
-    """The paths of many users; those of straight legs are evaluated with one array operation."""
+    """The paths of many users; one array operation evaluates all straight legs."""
 
     def __init__(self, mobilities: Sequence[Mobility]) -> None:
         self._mobilities = mobilities
@@ -166,9 +156,9 @@ class RandomWalk(StraightMobility):
 
 
 class Traced:
-    """User on traced positions: the one nearest to the position of another mobility.
+    """User of a channel file who is nearest to the position of another mobility.
 
-    Positions are those of a channel file; the velocity is that of the other mobility.
+    The velocity is the one of the other mobility.
     """
 
     def __init__(self, mobility: Mobility, channel: PathChannel) -> None:
@@ -185,14 +175,9 @@ def make_plugin(
         start: Sequence[float] | None = None) -> Mobility:
     """Create the mobility of another package.
 
-    `name` is an entry point of the group `plugins.MOBILITIES`. The object of the entry point is
-    called with the other arguments, like `RandomWalk`. If `start` is None, the object chooses the
-    first position.
-
-    Raises
-    ------
-    PluginError
-        If there is no such entry point, it cannot be loaded, fails, or does not return a mobility.
+    Calls the object of an entry point of the group `plugins.MOBILITIES` with the other arguments,
+    like `RandomWalk`. If `start` is None, the object chooses the first position. Raises
+    PluginError if there is no such entry point, or it does not return a mobility.
     """
     mobility: Mobility = plugins.make(plugins.MOBILITIES, name, scenario, speed_mps, rng, start)
     if not callable(getattr(mobility, 'state', None)):

@@ -2,9 +2,10 @@
 
 Indices of bands, sub-bands and frames start at 0. Bands are independent. Fields of a scenario
 declare the covariance of the gains; a measured one adds a term of the rank of its measurements to
-it, see `multipath_estimate`.
+it, see `hall`.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Iterator, Sequence
@@ -12,9 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.geometry import element_interval_m, subband_frequencies_hz
-from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
+from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario
 
 # Gauss-Legendre nodes on an interval of angles in which the profile is smooth, and the largest
@@ -33,15 +35,16 @@ def multipath_covariance(scenario: Scenario) -> np.ndarray:
     """Implements Eq. (2). Covariance of the multipath gains of the elements that fields declare.
 
     The power-angle profile is a product of two Laplacians of `angular_spread_deg` about
-    `multipath_direction_deg`, normalised over the half space in front of the surface and scaled by
-    the mean line-of-sight power in the region of interest times ``multipath_to_los_db``. The paper
-    leaves the scale open; that both powers are equal by default is the reading of this package. A
-    gain pattern of the elements weights the profile. Returns V_i, complex128 [N_B, N_E, N_E].
+    `multipath_direction_deg`, normalised over the half space in front of the surface, weighted by
+    a gain pattern of the elements, and scaled by the mean line-of-sight power in the region of
+    interest times ``multipath_to_los_db``. The paper leaves the scale open; equal powers by
+    default are the reading of this package. Returns V_i, complex128 [N_B, N_E, N_E];
     `declared_covariance` needs less memory for many elements.
     """
     return _matrix(_lattice(scenario), scenario)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class SpatialCovariance:
     """V_i of Eq. (2) for products with it, in one band or in several with a leading axis.
 
@@ -51,43 +54,47 @@ class SpatialCovariance:
 
     Attributes
     ----------
-    power
-        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
+    shape
+        Numbers of rows and columns of the elements.
     is_real
         Whether V_i is real, as for an even profile that is not measured.
+    power
+        Power of the gain of each element, float64 [N_E] or [N_B, N_E].
     matrix
         V_i [..., N_E, N_E]; None for many elements.
     """
 
-    def __init__(self, shape: tuple[int, int], is_real: bool, power: np.ndarray,
-                 matrix: np.ndarray | None, spectrum: np.ndarray | None,
-                 excess: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-        self._shape, self.is_real, self.power = shape, is_real, power
-        self.matrix, self._spectrum, self._excess = matrix, spectrum, excess
+    shape: tuple[int, int]
+    is_real: bool
+    power: np.ndarray
+    matrix: np.ndarray | None = None
+    # Fourier transform over the offsets of the elements; None for few elements.
+    spectrum: np.ndarray | None = None
+    # W F and F of the term of low rank, without a matrix.
+    excess: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def n_elements(self) -> int:
         """Number of elements N_E."""
-        return math.prod(self._shape)
+        return math.prod(self.shape)
 
     def __getitem__(self, bands: int | slice | list[int]) -> 'SpatialCovariance':
         """Return V_i of some bands."""
         return SpatialCovariance(
-            self._shape, self.is_real, self.power[bands],
+            self.shape, self.is_real, self.power[bands],
             None if self.matrix is None else self.matrix[bands],
-            None if self._spectrum is None else self._spectrum[bands],
-            self._excess and (self._excess[0][bands], self._excess[1][bands]))
+            None if self.spectrum is None else self.spectrum[bands],
+            self.excess and (self.excess[0][bands], self.excess[1][bands]))
 
     def plus(self, weights: np.ndarray, factor: np.ndarray) -> 'SpatialCovariance':
         """Return the sum with F^H W F, of W [N_B, R, R] and F [N_B, R, N_E]; W is Hermitian."""
         through = np.matmul(weights, factor)
         power = self.power + np.sum(np.conj(factor) * through, axis=-2).real
+        total = dataclasses.replace(self, is_real=False, power=power)
         if self.matrix is None:
-            return SpatialCovariance(
-                self._shape, False, power, None, self._spectrum, (through, factor))
-        matrix = self.matrix + np.matmul(np.conj(np.swapaxes(factor, -2, -1)), through)
-        matrix.flags.writeable = False
-        return SpatialCovariance(self._shape, False, power, matrix, None)
+            return dataclasses.replace(total, excess=(through, factor))
+        return dataclasses.replace(
+            total, matrix=read_only(self.matrix + np.matmul(adjoint(factor), through)))
 
     def scatter(self, weights: np.ndarray) -> np.ndarray:
         """Multiply weights of the elements, complex128 [..., N_E], by V_i; same shape."""
@@ -106,19 +113,17 @@ class SpatialCovariance:
     def _convolve(self, rows: np.ndarray, result: np.ndarray) -> None:
         from scipy import fft
 
-        assert self._spectrum is not None
-        lattice = rows.reshape(*rows.shape[:-1], *self._shape)
-        (n_rows, n_columns), sizes = self._shape, self._spectrum.shape[-2:]
-        block = max(_BLOCK_NUMBERS // math.prod(sizes), 1)
-        for start in range(0, rows.shape[-2], block):
-            part = slice(start, start + block)
+        assert self.spectrum is not None
+        lattice = rows.reshape(*rows.shape[:-1], *self.shape)
+        (n_rows, n_columns), sizes = self.shape, self.spectrum.shape[-2:]
+        for part in blocks(rows.shape[-2], max(_BLOCK_NUMBERS // math.prod(sizes), 1)):
             waves = fft.fft2(lattice[..., part, :, :], sizes)
-            waves *= self._spectrum[..., None, :, :]
+            waves *= self.spectrum[..., None, :, :]
             found = fft.ifft2(waves, overwrite_x=True)[..., :n_rows, :n_columns]
             result[..., part, :] = found.reshape(result[..., part, :].shape)
-        if self._excess:
-            through, factor = self._excess
-            result += np.matmul(rows @ np.conj(np.swapaxes(factor, -2, -1)), through)
+        if self.excess:
+            through, factor = self.excess
+            result += np.matmul(rows @ adjoint(factor), through)
 
 
 @functools.lru_cache(maxsize=16)
@@ -141,22 +146,20 @@ def declared_covariance(scenario: Scenario) -> SpatialCovariance:
     power = np.repeat(lattice[:, shape[0] - 1, shape[1] - 1, None].real, scenario.n_elements, 1)
     if scenario.n_elements <= _MAX_MATRIX:
         matrix = _matrix(lattice.real if is_real else lattice, scenario)
-        return SpatialCovariance(shape, is_real, power, matrix, None)
+        return SpatialCovariance(shape, is_real, power, matrix)
     from scipy import fft
 
     # A circle long enough that nothing wraps around; the offset 0 comes first.
     kernel = np.zeros((len(lattice), *(fft.next_fast_len(2 * n - 1) for n in shape)), complex)
     kernel[:, :2 * shape[0] - 1, :2 * shape[1] - 1] = np.conj(lattice)
     kernel = np.roll(kernel, (1 - shape[0], 1 - shape[1]), axis=(1, 2))
-    return SpatialCovariance(shape, is_real, power, None, fft.fft2(kernel).real)
+    return SpatialCovariance(shape, is_real, power, spectrum=fft.fft2(kernel).real)
 
 
 def _matrix(lattice: np.ndarray, scenario: Scenario) -> np.ndarray:
     row, column = np.divmod(np.arange(scenario.n_elements), scenario.n_columns)
-    matrix: np.ndarray = lattice[:, row[:, None] - row + scenario.n_rows - 1,
-                                 column[:, None] - column + scenario.n_columns - 1]
-    matrix.flags.writeable = False
-    return matrix
+    return read_only(lattice[:, row[:, None] - row + scenario.n_rows - 1,
+                             column[:, None] - column + scenario.n_columns - 1])
 
 
 @functools.lru_cache(maxsize=16)
@@ -187,22 +190,14 @@ def _lattice(scenario: Scenario) -> np.ndarray:
 
 
 class _PlaneWaves(NamedTuple):
-    """Plane waves from E elevations and A azimuths.
+    """Plane waves from E elevations and A azimuths."""
 
-    Attributes
-    ----------
-    elevation_weights, azimuth_weights
-        Shares of the power, float64 [E] and [A].
-    gain
-        Gain of an element in their directions, a number or float64 [E, A].
-    along_z, along_y
-        Phasors at the rows [E, rows] and at the columns [E, A, columns]; their real parts alone
-        if the profile is even.
-    """
-
+    # Shares of the power [E] and [A], and gain of an element, a number or [E, A].
     elevation_weights: np.ndarray
     azimuth_weights: np.ndarray
     gain: float | np.ndarray
+    # Phasors at the rows [E, rows] and at the columns [E, A, columns]; their real parts alone if
+    # the profile is even.
     along_z: np.ndarray
     along_y: np.ndarray
 
@@ -226,12 +221,11 @@ def _plane_waves(
         for mean, even, length in zip(
             scenario.multipath_direction_deg, is_even, lengths, strict=True))
     phasors = [np.cos if even else lambda phase: np.exp(1j * phase) for even in is_even]
-    step = max(_BLOCK_NUMBERS // (len(azimuth) * max(len(columns), n_draws)), 1)
-    for start in range(0, len(elevations), step):
-        elevation = elevations[start:start + step]
+    size = max(_BLOCK_NUMBERS // (len(azimuth) * max(len(columns), n_draws)), 1)
+    for block in blocks(len(elevations), size):
+        elevation = elevations[block]
         # Direction (cos el cos az, cos el sin az, sin el).
         across = np.cos(elevation)[:, None] * np.sin(azimuth)
-        gain: float | np.ndarray
         if isinstance(scenario.element_gain, GainPattern):
             # The cosine of the angle from the boresight is cos el cos az.
             gain = scenario.element_gain.amplitude(
@@ -239,7 +233,7 @@ def _plane_waves(
         else:
             gain = np.full((1, 1), scenario.element_gain)
         yield _PlaneWaves(
-            elevation_weights[start:start + step], azimuth_weights, gain,
+            elevation_weights[block], azimuth_weights, gain,
             phasors[1](wavenumber * np.sin(elevation)[:, None] * rows),
             phasors[0](wavenumber * across[..., None] * columns))
 
@@ -255,7 +249,7 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
     This is the mean of (v_0 g^U / (4 pi f_c,i r))^2, with the distance r from the surface's
     centre. A gain pattern g^U is evaluated at the angle from the boresight there.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ROI_NODES)
+    nodes, weights = gauss_legendre(_ROI_NODES)
     low, high = scenario.roi_bounds_m
     x, y, z = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
     squares = x[:, None, None]**2 + y[:, None]**2 + z**2
@@ -299,8 +293,7 @@ def correlation_matrices(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     over_frequency = np.stack(
         [frequency_correlation(scenario, i, subbands[:, None], subbands) for i in bands])
     over_time = np.stack([time_correlation(scenario, i, frames[:, None], frames) for i in bands])
-    over_frequency.flags.writeable = over_time.flags.writeable = False
-    return over_frequency, over_time
+    return read_only(over_frequency), read_only(over_time)
 
 
 @functools.lru_cache(maxsize=16)
@@ -310,9 +303,7 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
     Rows and columns are sub-band-major; the array is read-only.
     """
     pairs = zip(*correlation_matrices(scenario), strict=True)
-    correlation = np.stack([np.kron(over_f, over_t) for over_f, over_t in pairs])
-    correlation.flags.writeable = False
-    return correlation
+    return read_only(np.stack([np.kron(over_f, over_t) for over_f, over_t in pairs]))
 
 
 def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -320,8 +311,7 @@ def coupling(scenario: Scenario, radiation: np.ndarray, other: np.ndarray) -> np
 
     Returns complex128 [N_B, N_SB F, N_SB F] for matrices T_i, complex128 [N_B, N_SB F, N_E].
     """
-    scattered = np.matmul(declared_covariance(scenario).scatter(radiation),
-                          np.conj(np.swapaxes(other, 1, 2)))
+    scattered = np.matmul(declared_covariance(scenario).scatter(radiation), adjoint(other))
     return measurement_correlation(scenario) * scattered
 
 
@@ -330,8 +320,7 @@ def scattered_covariance(scenario: Scenario, radiation: np.ndarray) -> np.ndarra
     covariance = coupling(scenario, radiation, radiation)
     if measured := scenario.multipath:
         to_survey = coupling(scenario, radiation, measured.radiation)
-        covariance += np.matmul(
-            to_survey @ measured.excess, np.conj(np.swapaxes(to_survey, 1, 2)))
+        covariance += np.matmul(to_survey @ measured.excess, adjoint(to_survey))
     return covariance
 
 
@@ -359,7 +348,7 @@ def draw_multipath(
         drawn = _draw_plane_waves(scenario, band, n * n_draws, rng).reshape(n, n_draws, -1)
     else:
         drawn = complex_normal((n, n_draws, spatial.shape[1]), rng) @ spatial.T
-    gains: np.ndarray = over_rows @ drawn
+    gains = over_rows @ drawn
     if measured := scenario.multipath:
         stretch, factor = _stretches(scenario)[band]
         signals = np.sum(gains * measured.radiation[band], axis=-1) @ stretch.T
@@ -386,7 +375,7 @@ def _stretches(scenario: Scenario) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Compute how a measured covariance changes gains with the declared one.
 
     For each band, these are A and T V_0, so that gains g become g + C_0 T^H A T g. With the
-    covariance S of the signals T g, and R = S^(1/2), it follows from `multipath_estimate` that
+    covariance S of the signals T g, and R = S^(1/2), it follows from `hall` that
     R A R = (1 + R M R)^(1/2) - 1.
     """
     assert scenario.multipath
@@ -421,7 +410,7 @@ def _profile_quadrature(spread_deg: float, mean_deg: float, is_even: bool, phase
     The phase [rad] over the elements determines the number. Of an even profile, only the positive
     angles are included.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_ANGLE_NODES)
+    nodes, weights = gauss_legendre(_ANGLE_NODES)
     mean, spread = np.deg2rad(mean_deg), np.deg2rad(spread_deg)
     angles, density = [], []
     signs = (1,) if is_even else (-1, 1)
@@ -442,6 +431,4 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
     """Return R with R R^H = matrix, without eigenvectors that are due to rounding alone."""
     values, vectors = np.linalg.eigh(matrix)
     keep = values > values[-1] * len(values) * np.finfo(float).eps
-    root: np.ndarray = vectors[:, keep] * np.sqrt(values[keep])
-    root.flags.writeable = False
-    return root
+    return read_only(vectors[:, keep] * np.sqrt(values[keep]))

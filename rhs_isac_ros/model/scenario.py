@@ -1,25 +1,26 @@
 """The scenario: all parameters of the model, with their ranges and units."""
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
 import itertools
 import json
-import math
-import numbers
+import operator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import read_only
 from rhs_isac_ros.model.gain_pattern import GainPattern, PatternError
-from rhs_isac_ros.model.multipath_estimate import MultipathEstimate
-from rhs_isac_ros.model.path_channel import PathChannel
+from rhs_isac_ros.model.hall import SPEED_OF_LIGHT_MPS as SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.hall import MultipathEstimate, PathChannel
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import ArchiveError, ArrayFile, read_yaml
 from rhs_isac_ros.support.plugins import PluginError
 
-SPEED_OF_LIGHT_MPS = 299_792_458.0
 # Relative rounding of differences between frequencies.
 _ROUNDING = 1e-9
 
@@ -37,9 +38,9 @@ def declare(
     from which its model is taken, if that is not the paper. `label` is the name on an axis, with
     the symbol as mathtext and without the unit.
     """
-    meta = {'low': low, 'high': high, 'text': text, 'unit': unit, 'source': source,
-            'label': label}
-    return dataclasses.field(default=default, metadata=meta)
+    kind = int if isinstance(default, int) else float
+    return dataclasses.field(default=default, metadata={
+        'declared': Field(kind, text, unit, low, high), 'source': source, 'label': label})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,12 +260,7 @@ class Scenario(Extensions, Table1):
         """Read a scenario from a YAML file that maps field names to values.
 
         Fields that are not in the file have their defaults. Paths in the file are relative to its
-        folder.
-
-        Raises
-        ------
-        ScenarioError
-            If the file cannot be read, is not a mapping, or has an unknown field or invalid value.
+        folder. Raises ScenarioError if the file is invalid.
         """
         try:
             content = read_yaml(path)
@@ -348,9 +344,7 @@ class Scenario(Extensions, Table1):
     def roi_bounds_m(self) -> np.ndarray:
         """Lower and upper corner of the region of interest, float64 [2, 3] [m], read-only."""
         center, size = np.array(self.roi_center_m), np.array(self.roi_size_m)
-        bounds = np.stack([center - size / 2, center + size / 2])
-        bounds.flags.writeable = False
-        return bounds
+        return read_only(np.stack([center - size / 2, center + size / 2]))
 
     def sample_positions(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw positions from the region of interest, float64 [n, 3] [m].
@@ -364,13 +358,7 @@ class Scenario(Extensions, Table1):
 
 
 def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) -> None:
-    """Check the shape of an array against `symbols`: keys of `Scenario.sizes`, blanks between.
-
-    Raises
-    ------
-    ValueError
-        If the shape differs. The message gives the actual and the expected shape.
-    """
+    """Raise ValueError unless the shape is that of `symbols`, keys of `Scenario.sizes`."""
     expected = tuple(scenario.sizes[symbol] for symbol in symbols.split())
     if np.shape(array) != expected:
         listed = ', '.join(symbols.split())
@@ -384,13 +372,7 @@ def _plain(value: Any) -> Any:
 
 
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
-    """Convert a field's value to its declared type.
-
-    Raises
-    ------
-    ScenarioError
-        If the type is wrong or the value is out of range.
-    """
+    """Convert a field's value to its declared type; raise ScenarioError if it is invalid."""
     name = field.name
     if name == 'feed_positions_m':
         return None if value is None else tuple(
@@ -404,22 +386,25 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     if name == 'elements_per_side' and isinstance(value, list | tuple | np.ndarray):
         if len(value) != 2:
             raise ScenarioError(f'{name}: {value!r}, expected an integer or two')
-        along_y, along_z = (_integer(field, entry) for entry in value)
+        along_y, along_z = (_number(field, entry) for entry in value)
         # A square is the same scenario in either notation.
         return along_y if along_y == along_z else (along_y, along_z)
-    if isinstance(field.default, int):
-        return _integer(field, value)
     if isinstance(field.default, tuple):
         length = None if name == 'center_frequencies_hz' else len(field.default)
         return _numbers(field, value, length)
     return _number(field, value)
 
 
-def _integer(field: dataclasses.Field[Any], value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-        raise ScenarioError(f'{field.name}: {value!r}, expected an integer')
-    _check_range(field, int(value))
-    return int(value)
+def _number(field: dataclasses.Field[Any], value: Any) -> Any:
+    declared = field.metadata['declared']
+    # YAML reads 28e9 as a string, so that strings must be accepted for numbers.
+    convert = operator.index if declared.kind is int else float
+    if not isinstance(value, bool):
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            value = convert(value)
+    if problem := declared.problem(value):
+        raise ScenarioError(f'{field.name}: {problem}')
+    return value
 
 
 def _gain(field: dataclasses.Field[Any], value: Any) -> float | GainPattern:
@@ -481,25 +466,3 @@ def _numbers(field: dataclasses.Field[Any], value: Any, length: int | None) -> t
     if len(_entries(field, value, expected)) != (length or len(value)):
         raise ScenarioError(f'{field.name}: {len(value)} values, expected a list of {expected}')
     return tuple(_number(field, entry) for entry in value)
-
-
-def _number(field: dataclasses.Field[Any], value: Any) -> float:
-    # YAML reads 28e9 as a string, so that strings must be accepted.
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise ScenarioError(f'{field.name}: {value!r}, expected a number') from None
-    if isinstance(value, bool) or not math.isfinite(number):
-        raise ScenarioError(f'{field.name}: {value!r}, expected a finite number')
-    _check_range(field, number)
-    return number
-
-
-def _check_range(field: dataclasses.Field[Any], value: float) -> None:
-    low, high = field.metadata['low'], field.metadata['high']
-    if not low <= value <= high:
-        unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''
-        # Integers may be too large for a float.
-        shown = value if isinstance(value, int) else f'{value:g}'
-        raise ScenarioError(
-            f'{field.name}: {shown}{unit}, expected {low:g} to {high:g}{unit}')

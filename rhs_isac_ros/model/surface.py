@@ -1,15 +1,12 @@
 """The surface: from signals at its elements to those at its feeds and at the base station."""
 
 import functools
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rhs_isac_ros.model.geometry import (
-    element_positions,
-    feed_positions,
-    subband_frequencies_hz,
-)
+from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.geometry import element_positions, feed_positions, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import SPEED_OF_LIGHT_MPS, Scenario, check_shape
 
 
@@ -27,6 +24,13 @@ class Beamforming(Protocol):
         ...
 
 
+class AppliedBeams(NamedTuple):
+    """Beamforming whose coefficients need not be real, or levels of the surface."""
+
+    analog: np.ndarray
+    digital: np.ndarray
+
+
 def element_signals(los: np.ndarray, multipath: np.ndarray, symbol: complex) -> np.ndarray:
     """Implements Eq. (1). Element signals tau for line-of-sight and multipath gains.
 
@@ -39,19 +43,11 @@ def feed_signals(
         scenario: Scenario, band: int, analog: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """Implements Eq. (5). Signals that the feeds receive from the elements, [N_SB, K].
 
-    The elements apply their radiation coefficients here; the paper introduces them with Eq. (9).
-
-    Parameters
-    ----------
-    band
-        Index of the band, from 0.
-    analog
-        Configuration c of the frame, float64 [N_E].
-    elements
-        Element signals tau, complex128 [N_SB, N_E].
+    Takes the configuration c of the frame, float64 [N_E], and the element signals tau, complex128
+    [N_SB, N_E]. The elements apply their radiation coefficients here; the paper introduces them
+    with Eq. (9).
     """
-    return np.einsum(
-        'jm,jkm->jk', analog * elements, onboard_matrix(scenario)[band])
+    return np.einsum('jm,jkm->jk', analog * elements, onboard_matrix(scenario)[band])
 
 
 def onboard_gain(
@@ -69,12 +65,8 @@ def onboard_gain(
 def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
     """Implements Eq. (7). Combined signal of the feeds, complex128 [...].
 
-    Parameters
-    ----------
-    digital, feeds
-        Combining vectors s and signals at the feeds, complex128 [..., K].
-    noise
-        Thermal noise e, complex128 [...], or 0.
+    Takes combining vectors s and signals at the feeds, complex128 [..., K], and the thermal noise
+    e, complex128 [...] or 0.
     """
     return np.einsum('...k,...k->...', digital, feeds) + noise
 
@@ -82,18 +74,18 @@ def combine(digital: np.ndarray, feeds: np.ndarray, noise: np.ndarray | float) -
 def radiation_matrix(scenario: Scenario, beams: Beamforming) -> np.ndarray:
     """Implements Eq. (9). Weight of every element in every measurement.
 
-    Returns T_i, complex128 [N_B, N_SB F, N_E], rows sub-band-major (row j F + q).
-
-    Raises
-    ------
-    ValueError
-        If the beamforming does not have the sizes of the scenario.
+    Returns T_i, complex128 [N_B, N_SB F, N_E], rows sub-band-major (row j F + q). Raises
+    ValueError if the beamforming does not have the sizes of the scenario.
     """
     check_shape('analog', beams.analog, 'N_B F N_E', scenario)
     check_shape('digital', beams.digital, 'N_B N_SB F K', scenario)
-    weights = np.matmul(beams.digital, onboard_matrix(scenario))
-    radiation: np.ndarray = beams.analog[:, None] * weights
-    return radiation.reshape(scenario.n_bands, -1, scenario.n_elements)
+    return (beams.analog[:, None] * feed_weights(scenario, beams)).reshape(
+        scenario.n_bands, -1, scenario.n_elements)
+
+
+def feed_weights(scenario: Scenario, beams: Beamforming) -> np.ndarray:
+    """Compute S B, the weights of elements with the coefficient 1 [N_B, N_SB, F, N_E]."""
+    return np.matmul(beams.digital, onboard_matrix(scenario))
 
 
 @functools.lru_cache(maxsize=16)
@@ -104,9 +96,7 @@ def onboard_matrix(scenario: Scenario) -> np.ndarray:
     """
     frequencies = subband_frequencies_hz(scenario)[:, :, None, None]
     elements, feeds = element_positions(scenario), feed_positions(scenario)
-    matrix = onboard_gain(scenario, frequencies, elements, feeds[:, None, :])
-    matrix.flags.writeable = False
-    return matrix
+    return read_only(onboard_gain(scenario, frequencies, elements, feeds[:, None, :]))
 
 
 def on_levels(scenario: Scenario, analog: np.ndarray) -> np.ndarray:
@@ -118,15 +108,9 @@ def on_levels(scenario: Scenario, analog: np.ndarray) -> np.ndarray:
 def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
     """Compute a configuration by the holographic principle, float64 [N_E], entries in [0, 1].
 
-    An element radiates strongly where the wave on the board and the path to the user are in
-    phase. If all gains are 0, all entries are 0.5.
-
-    Parameters
-    ----------
-    los
-        Line-of-sight gains, complex128 [N_SB, N_E].
-    onboard
-        B_j, complex128 [N_SB, K, N_E].
+    Takes line-of-sight gains, complex128 [N_SB, N_E], and B_j, complex128 [N_SB, K, N_E]. An
+    element radiates strongly where the wave on the board and the path to the user are in phase.
+    If all gains are 0, all entries are 0.5.
     """
     interference = np.einsum('jm,jkm->m', los, onboard).real
     return (interference / (np.abs(interference).max() or 1.0) + 1) / 2

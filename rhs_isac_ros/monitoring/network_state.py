@@ -9,7 +9,8 @@ import numpy as np
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS, State
+from rhs_isac_ros.protocol.base_station import State
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 
 RESTING = 'resting'
 # The rate of cycles is averaged over this time [s].

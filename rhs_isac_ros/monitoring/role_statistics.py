@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import Action, CodebookOffered, Event, Outcome, Send, kind_of
 
 # Percentiles are computed over this number of latest durations.

@@ -1,35 +1,21 @@
 """The executable ``bs``: the base station."""
 
 import functools
-import sys
 import time
-import types
 from typing import Any
 
 import numpy as np
 from std_srvs.srv import Trigger
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.model.measurement import receive_feeds
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
-from rhs_isac_ros.protocol.events import (
-    Action,
-    Event,
-    LocateRequested,
-    PauseRequested,
-    Reply,
-    Resumed,
-    ResumeRequested,
-    StepRequested,
-    StoodBy,
-)
-from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import create_or_refuse
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.locate import LocateServer
-from rhs_isac_ros.ros.parameters import settings_of
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import streams
@@ -50,28 +36,28 @@ class BsNode(RoleNode[BaseStation]):
             values.first_cycle or _cycle_from_clock()))
         frame = Frame.of(self, values)
         self._make_locate = functools.partial(
-            LocateServer, self, lambda user: self.dispatch(LocateRequested(user)),
+            LocateServer, self, lambda user: self.dispatch(events.LocateRequested(user)),
             lambda found: convert.pose(found, convert.stamp_of(found, self), frame),
             values.max_users)
         self._locate: LocateServer | None = self._make_locate()
-        self._reply = Reply(False, '')
-        for name, event in ((topics.PAUSE, PauseRequested()), (topics.RESUME, ResumeRequested()),
-                            (topics.STEP, StepRequested())):
-            answer = functools.partial(self._on_request, event)
+        self._reply = events.Reply(False, '')
+        for name, request in ((topics.PAUSE, events.PauseRequested()),
+                              (topics.RESUME, events.ResumeRequested()),
+                              (topics.STEP, events.StepRequested())):
             create_or_refuse(self, f'service {name}', functools.partial(
-                self.create_service, Trigger, name, answer))
+                self.create_service, Trigger, name, functools.partial(self._on_request, request)))
 
     def stand_by(self) -> None:
         """Abandon the cycle, and wait."""
         self._end_locate(_FAREWELL_S)
-        self.dispatch(StoodBy())
+        self.dispatch(events.StoodBy())
 
     def resume(self) -> None:
         """Begin cycles once the other nodes are known to be present."""
-        self.dispatch(Resumed(_cycle_from_clock()))
+        self.dispatch(events.Resumed(_cycle_from_clock()))
         self._locate = self._make_locate()
 
-    def dispatch(self, event: Event) -> None:
+    def dispatch(self, event: events.Event) -> None:
         """Pass an event to the role, and to the action."""
         super().dispatch(event)
         if self._locate and isinstance(event, m.PositionEstimate | m.NoFix):
@@ -94,32 +80,16 @@ class BsNode(RoleNode[BaseStation]):
             self._locate.destroy(delay_s)
         self._locate = None
 
-    def make_settings(self, values: types.SimpleNamespace) -> BaseStationSettings:
-        """Return the settings for parameter values.
-
-        Raises
-        ------
-        ParameterError
-            If ``allowed_users`` is not a list of users.
-        """
-        return settings_of(BaseStationSettings, values)
-
-    def execute(self, action: Action) -> None:
-        """Store a reply for the service that requested it.
-
-        Raises
-        ------
-        TypeError
-            If the action is not a `Reply`.
-        """
-        if isinstance(action, Reply):
+    def execute(self, action: events.Action) -> None:
+        """Store a reply for the service that requested it."""
+        if isinstance(action, events.Reply):
             self._reply = action
         else:
             super().execute(action)
 
     def _on_request(
-            self, event: PauseRequested | ResumeRequested | StepRequested, _: Trigger.Request,
-            response: Trigger.Response) -> Trigger.Response:
+            self, event: events.Event, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         self.dispatch(event)
         response.success, response.message = self._reply.success, self._reply.text
         return response
@@ -139,7 +109,3 @@ def _cycle_from_clock() -> int:
 
 
 main = entry('bs', lambda: [BsNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,7 +1,6 @@
 """The executable ``network``: all nodes composed in one process."""
 
 import importlib
-import sys
 
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -24,11 +23,6 @@ def make_network() -> list[Node]:
     """Create all nodes, with users numbered from 1.
 
     More than `MAX_USER_NODES` users share the node ``users``.
-
-    Raises
-    ------
-    ParameterError
-        If a parameter is invalid.
     """
     head = Node('network')
     users = parameters.declare(head, 'network').users
@@ -44,7 +38,3 @@ def _user_node(name: str, first: int, count: int) -> UserNode:
 
 
 main = entry('network', make_network)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

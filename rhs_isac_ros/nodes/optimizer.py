@@ -3,7 +3,7 @@
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,36 +21,27 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
-from rhs_isac_ros.codebook.command import ERRORS, INTERRUPTED, add_options, check
-from rhs_isac_ros.codebook.command import run as run_command
+from rhs_isac_ros.codebook.__main__ import ERRORS, add_options, check
+from rhs_isac_ros.codebook.__main__ import run as run_command
+from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.ros import convert, parameters, qos, topics
-from rhs_isac_ros.ros.command_line import check_parameters, parameter_help, parse
+from rhs_isac_ros.ros import convert, parameters, topics
 from rhs_isac_ros.ros.diagnostics import Diagnostics
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import create_publisher
-from rhs_isac_ros.ros.parameterized_node import ParameterizedNode, same_value
-from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX
+from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
+from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, ParameterizedNode, same_value
 from rhs_isac_ros.ros.peers import Peers, new_instance
-from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
+from rhs_isac_ros.ros.run import check_parameters, parameter_help, parse, run
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES, SecurityError, one_line, prepare
 from rhs_isac_ros.support.arguments import ArgumentParser, HelpFormatter, input_file
 
 
 class GroupParameterService(ParameterService):
     """The parameter services of a node of which some parameters belong together.
 
-    The service ``set_parameters`` of rclpy sets the parameters of a request one by one. ``ros2
-    param load`` uses this service. Here, the parameters of the group in one request are set
-    together, or not at all.
-
-    Parameters
-    ----------
-    node
-        A node that was created with ``start_parameter_services=False``.
-    prefix
-        Prefix of the names of the group.
+    The service ``set_parameters`` of rclpy, which ``ros2 param load`` uses, sets the parameters of
+    a request one by one. Here, those whose names begin with a prefix are set together, or not at
+    all. The node is created with ``start_parameter_services=False``.
     """
 
     def __init__(self, node: Node, prefix: str) -> None:
@@ -75,22 +66,18 @@ class GroupParameterService(ParameterService):
             return SetParametersResult(successful=False, reason=str(error))
 
 
-TIMEOUT_S = 10.0
+def _ros_parameters(values: Mapping[str, Any]) -> list[Parameter]:
+    return [Parameter(name, value=value) for name, value in values.items()]
 
 
 class PushError(RuntimeError):
     """The optimizer did not accept a codebook."""
 
 
-def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
+def push(node: Node, codebook: Codebook, timeout_s: float = 10.0) -> None:
     """Set a codebook as the parameters of the optimizer in the namespace of the node.
 
     This function blocks and spins the node, so it must not be called from a callback.
-
-    Parameters
-    ----------
-    timeout_s
-        Maximum time to wait for the optimizer and for its response [s].
 
     Raises
     ------
@@ -99,22 +86,17 @@ def push(node: Node, codebook: Codebook, timeout_s: float = TIMEOUT_S) -> None:
     """
     optimizer = f'{node.get_namespace().rstrip("/")}/{topics.OPTIMIZER_NODE}'
     client = AsyncParameterClient(node, topics.OPTIMIZER_NODE)
-    parameters = [Parameter(name, value=value)
-                  for name, value in codebook.to_parameters().items()]
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
     end_s, future = time.monotonic() + timeout_s, None
-    try:
-        while future is None or not future.done():
-            if time.monotonic() > end_s:
-                reason = 'no response' if future else 'not found'
-                raise PushError(f'{optimizer}: {reason} within {timeout_s:g} s')
-            if future is None and client.services_are_ready():
-                future = client.set_parameters_atomically(parameters)
-            executor.spin_once(timeout_sec=0.1)
-    finally:
-        executor.remove_node(node)
+    if client.wait_for_services(timeout_s):
+        future = client.set_parameters_atomically(
+            _ros_parameters(codebook.to_parameters()))
+        executor = SingleThreadedExecutor(context=node.context)
+        rclpy.spin_until_future_complete(
+            node, future, executor, max(end_s - time.monotonic(), 0.0))
         executor.shutdown()
+    if future is None or not future.done():
+        reason = 'no response' if future else 'not found'
+        raise PushError(f'{optimizer}: {reason} within {timeout_s:g} s')
     result = future.result().result
     if not result.successful:
         raise PushError(f'{optimizer}: codebook rejected: {result.reason}')
@@ -141,8 +123,7 @@ class OptimizerNode(ParameterizedNode):
         self._codebook_id, self._refused = '', 0
         # A file of an earlier version contains another provenance, and may lack the id.
         self.set_parameters_atomically(
-            [Parameter(name, value=value)
-             for name, value in self._first_codebook(file).to_parameters().items()])
+            _ros_parameters(self._first_codebook(file).to_parameters()))
         self._announce(False)
         self._peers = Peers(
             self, topics.OPTIMIZER_NODE, self._instance, self._scenario, lambda missing: None,
@@ -220,16 +201,16 @@ class OptimizerNode(ParameterizedNode):
             self._publisher = None
         if not stands_by:
             self._publisher = self._publisher or create_publisher(
-                self, ros.Codebook, topics.CODEBOOK, qos.LATCHED)
+                self, ros.Codebook, topics.CODEBOOK, LATCHED)
             self._publish(self._codebook_of(self._codebook_values()))
 
     def _publish(self, codebook: Codebook) -> None:
         self._codebook_id = codebook.id
         if self._publisher is None:
             return
-        stamp = self.get_clock().now().to_msg()
-        self._publisher.publish(convert.codebook_to_ros(
-            codebook, stamp, self._instance, self._scenario.id))
+        self._publisher.publish(convert.to_bytes(
+            convert.CodebookMessage.of(codebook, self._instance, self._scenario.id),
+            self.get_clock().now().nanoseconds))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 
@@ -239,22 +220,12 @@ def _given_codebook_values(changes: list[Parameter]) -> dict[str, Any]:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the executable.
+    """Run the executable, and return its exit code.
 
     Without options, this holds a codebook. With options, it first optimises a codebook, writes it
     to a file and holds it; with ``--push``, it instead sends the codebook to the optimizer of a
-    running network.
-
-    Parameters
-    ----------
-    args
-        Command line; by default that of the process.
-
-    Returns
-    -------
-    int
-        Exit code: 0 on success or after a signal; 1 if a network did not accept the codebook; 2 if
-        an argument or a file is invalid.
+    running network. The exit code is 0 on success or after a signal; 1 if a network did not accept
+    the codebook; 2 if an argument or a file is invalid.
     """
     args = sys.argv if args is None else [topics.OPTIMIZER_NODE, *args]
     parser = _parser()
@@ -276,9 +247,9 @@ def main(args: Sequence[str] | None = None) -> int:
         return _push(codebook, args)
     if reason == INTERRUPTED:
         return 0
-    files = {'codebook_file': options.output, 'scenario_file': options.scenario or ''}
-    return run(lambda: [OptimizerNode(parameter_overrides=[
-        Parameter(name, value=str(file)) for name, file in files.items()])], args)
+    overrides = _ros_parameters({'codebook_file': str(options.output),
+                                 'scenario_file': str(options.scenario or '')})
+    return run(lambda: [OptimizerNode(parameter_overrides=overrides)], args)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -289,11 +260,10 @@ def _parser() -> argparse.ArgumentParser:
                     'offline, write it to a file and hold it.')
     add_options(parser)
     parser.add_argument('--push', action='store_true',
-                        help='send the codebook to the optimizer of a running network '
-                              'and exit')
+                        help='send the codebook to the optimizer of a running network and exit')
     parser.add_argument('--push-file', type=input_file, metavar='FILE',
-                        help='send this codebook to a running network without '
-                              'optimising, and exit')
+                        help='send this codebook to a running network without optimising, '
+                             'and exit')
     return parser
 
 
@@ -315,7 +285,3 @@ def _push(codebook: Codebook, args: Sequence[str]) -> int:
         try_shutdown()
     print(f'codebook {codebook.id} is set')
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import sys
 import time
 import types
 from pathlib import Path
@@ -12,35 +11,19 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 
+from rhs_isac_ros import positioning
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
-from rhs_isac_ros.positioning import (
-    ESTIMATORS,
-    REGION_ESTIMATORS,
-    Estimator,
-    ModelError,
-    Network,
-    NeuralEstimator,
-    file_options,
-    make_estimator,
-)
 from rhs_isac_ros.positioning.store import default_folder
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    Action,
-    BuildEstimator,
-    EstimatorFailed,
-    EstimatorReady,
-    PublishTrack,
-)
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.background import BackgroundWorker
-from rhs_isac_ros.ros.endpoints import UserTopics, create_publisher
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, BackgroundWorker, UserTopics, create_publisher
 from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
+from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
@@ -55,29 +38,23 @@ class PositionerNode(RoleNode[Positioner]):
         self._worker = BackgroundWorker(self)
         self._frame = Frame.of(self, self.values)
         self._pose = create_publisher(
-            self, PoseWithCovarianceStamped, topics.POSITION, qos.EXCHANGE, overridable=True)
+            self, PoseWithCovarianceStamped, topics.POSITION, EXCHANGE, overridable=True)
         limit = self.values.user_topics
         self._user_poses = UserTopics(self, {topics.POSE: PoseWithCovarianceStamped}, limit)
         self._user_odometry = UserTopics(self, {topics.ODOMETRY: Odometry}, limit)
         self.start(Positioner(self.scenario, time.perf_counter, settings), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
-        """Return the settings for parameter values.
+        """Return the settings for parameter values, with files and plug-ins that can be loaded.
 
         Whether a model fits the codebook is only checked when the estimator is built.
-
-        Raises
-        ------
-        ParameterError
-            If the estimator cannot be loaded, needs a model that is missing or unreadable, or
-            cannot use the calibration.
         """
-        settings = settings_of(PositionerSettings, values)
+        settings: PositionerSettings = super().make_settings(values)
         calibrated_surface(values, self.scenario)
-        if settings.estimator not in ESTIMATORS:
+        if settings.estimator not in positioning.ESTIMATORS:
             self._check_plugin(settings.estimator)
             return settings
-        if settings.estimator != NeuralEstimator.name:
+        if settings.estimator != positioning.NeuralEstimator.name:
             # Other estimators do not use the file. Clear it, so that a change of the file does not
             # rebuild them.
             return dataclasses.replace(settings, model_file='')
@@ -89,8 +66,8 @@ class PositionerNode(RoleNode[Positioner]):
             raise ParameterError(
                 "model_file: '', expected a trained model for the estimator neural")
         try:
-            Network.load(settings.model_file)
-        except ModelError as error:
+            positioning.Network.load(settings.model_file)
+        except positioning.ModelError as error:
             raise ParameterError(f'model_file: {error}') from None
         return settings
 
@@ -102,43 +79,38 @@ class PositionerNode(RoleNode[Positioner]):
         except plugins.PluginError as error:
             raise ParameterError(f'estimator: {error}') from None
 
-    def _make_estimator(self, settings: PositionerSettings, codebook: Codebook) -> Estimator:
+    def _make_estimator(
+            self, settings: PositionerSettings, codebook: Codebook) -> positioning.Estimator:
         folder = self.values.table_folder
-        options = file_options(
+        options = positioning.file_options(
             settings.estimator, Path(folder) if folder else default_folder(),
             settings.model_file)
-        if settings.estimator in REGION_ESTIMATORS:
+        if settings.estimator in positioning.REGION_ESTIMATORS:
             options['reject_outside'] = settings.reject_outside
         if settings.calibration_file:
             options['surface'] = load_surface(settings.calibration_file, self.scenario)
-        estimator = make_estimator(settings.estimator, self.scenario, codebook, **options)
+        estimator = positioning.make_estimator(
+            settings.estimator, self.scenario, codebook, **options)
         # The first estimate takes longer than all others. A user does not wait for it.
         center = np.array([self.scenario.roi_center_m])
         estimator.estimate(simulate_received(
             self.scenario, codebook, center, np.random.default_rng(0))[0])
         return estimator
 
-    def execute(self, action: Action) -> None:
-        """Build an estimator in the background, or publish the odometry of a track.
+    def execute(self, action: events.Action) -> None:
+        """Build an estimator in the background, or publish the odometry of a track."""
+        match action:
+            case events.PublishTrack():
+                self._publish_track(action)
+            case events.BuildEstimator(codebook, settings):
+                make = functools.partial(self._make_estimator, settings)
+                self._worker.run(
+                    functools.partial(build_estimator, codebook, make, time.perf_counter),
+                    self._on_estimator)
+            case _:
+                super().execute(action)
 
-        Raises
-        ------
-        TypeError
-            If the action is another one.
-        """
-        if isinstance(action, PublishTrack):
-            self._publish_track(action)
-            return
-        if not isinstance(action, BuildEstimator):
-            super().execute(action)
-            return
-        self._worker.run(
-            functools.partial(
-                build_estimator, action.codebook,
-                functools.partial(self._make_estimator, action.settings), time.perf_counter),
-            self._on_estimator)
-
-    def _publish_track(self, track: PublishTrack) -> None:
+    def _publish_track(self, track: events.PublishTrack) -> None:
         if self.is_standing_by:
             return
         odometry = convert.odometry(
@@ -146,9 +118,9 @@ class PositionerNode(RoleNode[Positioner]):
         for publisher in self._user_odometry.publishers(track.user):
             publisher.publish(odometry)
 
-    def _on_estimator(self, event: EstimatorReady | EstimatorFailed) -> None:
+    def _on_estimator(self, event: events.EstimatorBuilt) -> None:
         self.dispatch(event)
-        if isinstance(event, EstimatorReady):
+        if event.estimator is not None:
             self.subscribe()
 
     def publish(self, message: m.Message) -> bool:
@@ -167,7 +139,3 @@ class PositionerNode(RoleNode[Positioner]):
 
 
 main = entry('positioner', lambda: [PositionerNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

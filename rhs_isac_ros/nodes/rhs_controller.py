@@ -1,6 +1,5 @@
 """The executable ``rhs_controller``: the controller of the surface."""
 
-import sys
 from typing import Any
 
 from rhs_isac_ros.protocol.rhs_controller import RhsController
@@ -17,7 +16,3 @@ class RhsControllerNode(RoleNode[RhsController]):
 
 
 main = entry('rhs_controller', lambda: [RhsControllerNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,14 +1,12 @@
 """The executable ``transmission``: steers the beam and reports the capacity."""
 
-import sys
 import types
 from typing import Any
 
 from rhs_isac_ros.link import prepare_steering
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.protocol.settings import TransmissionSettings
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface, settings_of
+from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 
@@ -24,14 +22,8 @@ class TransmissionNode(RoleNode[Transmission]):
         self.start(Transmission(self.scenario, settings, self._surfaces.__getitem__),
                    needs_codebook=True)
 
-    def make_settings(self, values: types.SimpleNamespace) -> TransmissionSettings:
-        """Return the settings for parameter values.
-
-        Raises
-        ------
-        ParameterError
-            If the scenario does not have the band, or the calibration cannot be used.
-        """
+    def make_settings(self, values: types.SimpleNamespace) -> Any:
+        """Return the settings for parameter values, with a band and a calibration that fit."""
         n_bands = self.scenario.n_bands
         if values.band >= n_bands:
             raise ParameterError(
@@ -39,11 +31,7 @@ class TransmissionNode(RoleNode[Transmission]):
         surface = calibrated_surface(values, self.scenario)
         self._surfaces[values.calibration_file] = surface
         prepare_steering(self.scenario, surface)
-        return settings_of(TransmissionSettings, values)
+        return super().make_settings(values)
 
 
 main = entry('transmission', lambda: [TransmissionNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,14 +1,13 @@
 """The executable ``user``: one or many users of the system."""
 
 import functools
-import sys
 from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
 
 from rhs_isac_ros.model import mobility
-from rhs_isac_ros.protocol.user import User, timeouts
+from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import UserTopics, create_timer, steady_timer
 from rhs_isac_ros.ros.frames import Frame
@@ -34,8 +33,8 @@ class UserNode(RoleNode[User]):
         self._frame = Frame.of(self, values)
         mobilities = self._mobilities()
         self.start(User(
-            mobilities, timeouts(values.step_timeout_s, values.beacon_timeout_s),
-            self.instance, self.clocks.world_s))
+            mobilities, values.step_timeout_s, values.beacon_timeout_s, self.instance,
+            self.clocks.world_s))
         self._true_odometry = UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
         # On the clock of ROS, as the mobilities.
@@ -131,7 +130,3 @@ class UserNode(RoleNode[User]):
 
 
 main = entry('user', lambda: [UserNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

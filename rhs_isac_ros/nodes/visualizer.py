@@ -2,7 +2,6 @@
 
 import copy
 import math
-import sys
 import time
 from typing import Any
 
@@ -15,8 +14,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from rhs_isac_ros.link import Beam, beam_pattern
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, UserState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, markers, parameters, qos, topics, transforms
+from rhs_isac_ros.ros import convert, parameters, scene, topics
 from rhs_isac_ros.ros.endpoints import (
+    EXCHANGE,
     UserTopics,
     create_publisher,
     steady_timer,
@@ -24,7 +24,7 @@ from rhs_isac_ros.ros.endpoints import (
 )
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.run import entry
-from rhs_isac_ros.ros.transforms import TransformPublisher
+from rhs_isac_ros.ros.scene import TransformPublisher
 
 
 class VisualizerNode(Node):
@@ -40,7 +40,7 @@ class VisualizerNode(Node):
         # The latest beam and its marker, cached because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         self._shown: set[tuple[str, int]] = set()
-        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, qos.EXCHANGE,
+        self._publisher = create_publisher(self, MarkerArray, topics.MARKERS, EXCHANGE,
                                            overridable=True)
         self._paths = UserTopics(self, {topics.PATH: Path, topics.TRUE_PATH: Path},
                                  values.user_topics)
@@ -57,7 +57,7 @@ class VisualizerNode(Node):
         self._scene.add(message, time.monotonic())
         # As for the topics, the number of frames is bounded: tf2 keeps every frame.
         if isinstance(message, m.PositionEstimate) and self._paths.publishers(message.user):
-            self._transforms.publish(transforms.user(
+            self._transforms.publish(scene.user_transform(
                 self._frame, message.user, message.position, convert.stamp_of(message, self)))
 
     def _show(self) -> None:
@@ -75,22 +75,22 @@ class VisualizerNode(Node):
         # Without publishers, the zip is empty.
         for publisher, path in zip(self._paths.publishers(user.user), paths, strict=False):
             if path and publisher.get_subscription_count():
-                publisher.publish(markers.path(path, stamp, self._frame))
+                publisher.publish(scene.path(path, stamp, self._frame))
 
     def _show_markers(self, stamp: Time) -> None:
-        scene = self._scene
-        array = [markers.region(self._scenario, stamp), markers.board(
-            self._scenario, scene.configuration.analog if scene.configuration else None, stamp)]
-        for user in scene.users.values():
+        state = self._scene
+        array = [scene.region(self._scenario, stamp), scene.board(
+            self._scenario, state.configuration.analog if state.configuration else None, stamp)]
+        for user in state.users.values():
             if user.truth:
-                array.append(markers.truth(user.truth, stamp))
+                array.append(scene.truth(user.truth, stamp))
             if user.estimate:
-                array.append(markers.estimate(user.estimate, stamp))
-        if scene.beam:
-            array.append(self._beam_marker(scene.beam, stamp))
-        array = [markers.place(marker, self._frame) for marker in array]
+                array.append(scene.estimate(user.estimate, stamp))
+        if state.beam:
+            array.append(self._beam_marker(state.beam, stamp))
+        array = [scene.place(marker, self._frame) for marker in array]
         shown = {(marker.ns, marker.id) for marker in array}
-        array += [markers.deletion(*key, stamp) for key in sorted(self._shown - shown)]
+        array += [scene.deletion(*key, stamp) for key in sorted(self._shown - shown)]
         self._shown = shown
         self._publisher.publish(MarkerArray(markers=array))
 
@@ -100,14 +100,10 @@ class VisualizerNode(Node):
             pattern = beam_pattern(
                 self._scenario, Beam(message.analog, message.digital, message.band),
                 math.hypot(*self._scenario.roi_center_m))
-            self._drawn = message, markers.beam(pattern, message.user, stamp)
+            self._drawn = message, scene.beam(pattern, message.user, stamp)
         drawn = copy.copy(self._drawn[1])
         drawn.header = Header(stamp=stamp, frame_id=drawn.header.frame_id)
         return drawn
 
 
 main = entry('visualizer', lambda: [VisualizerNode()])
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,16 +1,21 @@
 """Estimators of the user's position from the received signals.
 
-An estimator is an object with the interface of `Estimator`: a string ``name``, and a method
-``estimate`` that takes received signals and returns an `Estimate`. `make_estimator` creates it
-from a scenario and a codebook. There are two ways to add one:
+`make_estimator` creates an estimator for a scenario and a codebook: an object with the interface
+of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. It is
+a class of `ESTIMATORS` below, or an entry point of the group `plugins.ESTIMATORS` in another
+package. `simulate_pairs` draws signals to try it, and a `Tracker` combines successive positioning
+phases of a user that moves.
 
-* In another package, without changes here: name a class, or a function that returns an
-  estimator, in an entry point of the group ``rhs_isac_ros.estimators`` (`plugins.ESTIMATORS`).
-* In this package: add the class to `ESTIMATORS` below.
+The modules, in the order in which they are best read:
 
-`estimate_each` checks the shape of the signals and handles one positioning phase as well as many.
-
-A `Tracker` combines successive positioning phases of a user that moves.
+* `estimate`, the interface, and `estimators`, the whole way of `bayes` and `ml`
+* `coordinates` and `lattice`, the coordinates and lengths in which signals differ
+* `likelihood`, of positions and nuisance parameters
+* `grid`, which finds starts; `search`, which ascends from them to the modes; and `failures`, which
+  finds the modes if elements have failed
+* `posterior`, from modes to samples; `alternatives` to a user in the region; and `diagnosis`,
+  whether the signals fit the model
+* `tracking`; `neural`, the paper's network; and `store`, which keeps tables in files
 """
 
 from collections.abc import Callable, Mapping
@@ -28,13 +33,9 @@ from rhs_isac_ros.positioning.estimators import (
     surface_of,
     weighted_modes,
 )
-from rhs_isac_ros.positioning.motion import Motion
-from rhs_isac_ros.positioning.network import ModelError, Network
-from rhs_isac_ros.positioning.neural import NeuralEstimator
-from rhs_isac_ros.positioning.reference import exhaustive_posterior
+from rhs_isac_ros.positioning.neural import ModelError, Network, NeuralEstimator, train
 from rhs_isac_ros.positioning.simulate import simulate_pairs
-from rhs_isac_ros.positioning.tracking import Tracker, TrackEstimate
-from rhs_isac_ros.positioning.training import train
+from rhs_isac_ros.positioning.tracking import Motion, Tracker, TrackEstimate
 from rhs_isac_ros.support import plugins
 
 ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
@@ -45,8 +46,8 @@ REGION_ESTIMATORS = (BayesEstimator.name, MlEstimator.name)
 __all__ = [
     'ESTIMATORS', 'REGION_ESTIMATORS', 'BayesEstimator', 'Estimate', 'Estimator', 'MlEstimator',
     'ModelError', 'Motion', 'Network', 'NeuralEstimator', 'SearchEstimator', 'SignalError',
-    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'exhaustive_posterior',
-    'file_options', 'make_estimator', 'simulate_pairs', 'surface_of', 'train', 'weighted_modes',
+    'TrackEstimate', 'Tracker', 'WeightedModes', 'estimate_each', 'file_options',
+    'make_estimator', 'simulate_pairs', 'surface_of', 'train', 'weighted_modes',
 ]
 
 
@@ -54,15 +55,10 @@ def make_estimator(
         name: str, scenario: Scenario, codebook: Codebook, **options: Any) -> Estimator:
     """Create an estimator by its name.
 
-    Parameters
-    ----------
-    name
-        A key of `ESTIMATORS`, or an entry point of the group `plugins.ESTIMATORS`.
-    **options
-        ``table_folder``, a folder for tables, and ``reject_outside``, whether users outside of
-        the region get no fix, and ``surface``, what is known of the surface, for
-        `REGION_ESTIMATORS`; ``model_file``, a `Network` or its file, for `neural`. Plug-ins define
-        their own options.
+    The options of `REGION_ESTIMATORS` are ``table_folder``, a folder for tables,
+    ``reject_outside``, whether users outside of the region get no fix, and ``surface``, what is
+    known of the surface. `neural` requires ``model_file``, a `Network` or its file. Plug-ins
+    define their own options.
 
     Raises
     ------

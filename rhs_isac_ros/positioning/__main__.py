@@ -1,19 +1,17 @@
 """Train the network of the estimator `neural` for a codebook and write it as a model file."""
 
 import argparse
-import contextlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning.network import INPUTS
-from rhs_isac_ros.positioning.training import (
+from rhs_isac_ros.positioning.neural import (
     DEFAULT_EPOCHS,
     DEFAULT_HIDDEN,
     DEFAULT_PAIRS,
-    Epoch,
+    INPUTS,
     train,
 )
 from rhs_isac_ros.support.arguments import (
@@ -26,22 +24,11 @@ from rhs_isac_ros.support.arguments import (
     seed,
 )
 from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.support.progress import progress_bar
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
-
-    Parameters
-    ----------
-    arguments
-        Command-line arguments; those of the process if None.
-
-    Returns
-    -------
-    int
-        Exit code: 0; 2 if an argument or a file is invalid; 130 after Ctrl-C, with no file
-        written.
-    """
+    """Run the command; return 0, 2 if an argument or a file is invalid, or 130 after Ctrl-C."""
     parser = ArgumentParser(
         prog='python -m rhs_isac_ros.positioning', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
@@ -81,36 +68,16 @@ def _run(options: argparse.Namespace) -> None:
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     codebook = Codebook.load(options.codebook)
     codebook.check(scenario)
-    with _progress(options) as show:
-        network = train(scenario, codebook, options.pairs, options.seed, options.hidden,
-                        options.epochs, show, options.inputs)
+    with progress_bar(options.epochs, 'epoch', quiet=options.quiet) as show:
+        network = train(
+            scenario, codebook, options.pairs, options.seed, options.hidden, options.epochs,
+            show and (lambda epoch: show(epoch.number, f'{epoch.validation_mse_m2:.3f} m^2')),
+            options.inputs)
     network.save(output)
     about = network.about
     print(f'{output}: codebook {codebook.id}, {about["epochs"]} epochs; mean squared error '
           f'{about["validation_mse_m2"]:.3f} m^2 in validation, {about["test_mse_m2"]:.3f} m^2 '
           'in the test')
-
-
-@contextlib.contextmanager
-def _progress(options: argparse.Namespace) -> Iterator[Callable[[Epoch], None] | None]:
-    """Yield a callable that shows progress: as a bar, or as lines if tqdm is not installed."""
-    if options.quiet:
-        yield None
-        return
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        yield lambda epoch: print(_describe(epoch), file=sys.stderr)
-        return
-    with tqdm(total=options.epochs, unit='epoch') as bar:
-        def show(epoch: Epoch) -> None:
-            bar.set_description(_describe(epoch), refresh=False)
-            bar.update(epoch.number - bar.n)
-        yield show
-
-
-def _describe(epoch: Epoch) -> str:
-    return f'epoch {epoch.number}: {epoch.validation_mse_m2:.3f} m^2'
 
 
 if __name__ == '__main__':

@@ -7,96 +7,208 @@ users are inside, and none of them should lose a fix.
 """
 
 import math
+from collections.abc import Iterable, Mapping
 from typing import Protocol
 
 import numpy as np
 
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_evidence_of_level
+from rhs_isac_ros.model.geometry import element_positions
+from rhs_isac_ros.positioning.coordinates import carrier_wavenumbers, log_sum, to_positions
+from rhs_isac_ros.positioning.lattice import Resolution, groups
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
-from rhs_isac_ros.positioning.outside import Outside
 
-# Largest level of multipath without a direct path that explains signals, in standard deviations.
-_REACH = 3.0
-# Probability of a blocked user above which there is no fix.
+# Probabilities of a user outside, and of a blocked one, above which there is no fix.
+OUTSIDE_LIMIT = 0.99
 BLOCKED_LIMIT = 0.5
+# Largest level of multipath without a direct path that explains signals, in standard deviations.
+_LEVEL_REACH = 3.0
 _DB_PER_NEPER = 20 / math.log(10)
 _MIN_PROBABILITY = 1e-12
+# Smallest probability of an alternative that is worth a word.
+_MIN_DOUBT = 0.01
+# Relative to the nearest range of the region: distance from it up to which a user may be located
+# at its border, and nearest range outside.
+_BORDER = 0.1
+_NEAREST = 0.3
+# The nearest range is at least this multiple of the radius of the aperture.
+_MIN_APERTURES = 4.0
+# Farthest range in units of the farthest range of the region, and ratio of successive ranges.
+_MAX_RANGE_FACTOR = 3.0
+_RANGE_RATIO = 1.15
+# Phase error of a template at the edge of the aperture from which another direction takes over,
+# and number of templates above which it is larger: large apertures distinguish more directions
+# than a comparison of two hypotheses needs.
+_DIRECTION_RAD = 0.25
+_MAX_TEMPLATES = 40_000
+# Quadrature over the gain: spacing [nepers], and reach in standard deviations.
+_GAIN_STEP = 0.04
+_GAIN_REACH = 4.0
+# Largest phase error of a template at the ends of the ranges that share it [rad].
+_MAX_PHASE_ERROR = 0.5
+# Error of a residual due to the grid, as a share of the template's energy.
+_GRID_ERROR = 0.25
+# Largest sine of the angle from boresight on the grid.
+_MAX_SINE = 0.998
+# Directions in which the log-likelihood is lower by more at all ranges do not matter.
+_MARGIN = 30.0
 
 
 class Alternative(Protocol):
-    """An alternative to a user in the region with a direct path.
+    """An alternative to a user in the region with a direct path."""
 
-    Attributes
-    ----------
-    name
-        Name and reason; `Estimate` has the field ``<name>_probability``.
-    reason
-        Why there is no fix.
-    limit
-        Largest probability with a fix, if there are no other alternatives.
-    log_odds
-        Logarithm of the prior probability relative to that of a user in the region in sight.
-    """
+    name: str  # `Estimate` has the field ``<name>_probability``.
+    reason: str  # Why there is no fix.
+    limit: float  # Largest probability with a fix, if there are no other alternatives.
+    log_odds: float  # Logarithm of the prior odds against a user in the region in sight.
 
-    name: str
-    reason: str
-    limit: float
-    log_odds: float
-
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
-                        ) -> float:
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
+                        prior: NuisancePrior) -> float:
         """Compute the logarithm of the evidence with the nuisance parameters integrated out.
 
-        Parameters
-        ----------
-        whitened
-            Whitened signals of one phase without the aligned parameters, complex128
-            [N_B, N_SB F].
-        aligned
-            Parameters that the signals alone reveal, float64 [Q]; 0 for the others.
+        Takes whitened signals of one phase, complex128 [N_B, N_SB F], without the aligned
+        parameters, which the signals alone reveal, float64 [Q]; they are 0 for the others. The
+        residual is the whitened energy that the best position in the region leaves.
         """
         ...
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
-        """Return whether the alternative explains the whitened signals of a phase at all."""
+        """Return whether the alternative explains the signals, up to this residual energy."""
         ...
 
 
 class Blocked:
-    """A user without a direct path, whose signals are multipath of an unknown level."""
+    """A user without a direct path, whose signals are multipath of an unknown level.
+
+    A survey inflates the covariance of the multipath, and its level differs among users in sight.
+    Their evidence is that of the inflated covariance, in which weak residuals are improbable, so
+    the evidence of a blocked user is divided by the change that the actual levels would make.
+    """
 
     name, reason, limit = 'blocked', 'blocked', BLOCKED_LIMIT
 
     def __init__(self, scenario: Scenario) -> None:
         share = scenario.blocked_probability
         self.log_odds = math.log(share / max(1 - share, _MIN_PROBABILITY))
+        self._median_db, self._std_db = (
+            scenario.multipath.level_db if scenario.multipath else (0.0, 0.0))
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
-                        ) -> float:
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
+                        prior: NuisancePrior) -> float:
         """Compute the evidence, as `Alternative` describes; phases have no effect."""
-        energy = np.array([np.sum(np.abs(whitened)**2)])
+        energy = np.array([residual, np.sum(np.abs(whitened)**2)])
         # The gain of the user is a part of the level.
-        std_db = math.hypot(BLOCKED_STD_DB, _DB_PER_NEPER * prior.gain_std)
-        level = log_evidence_of_level(energy, whitened.size, std_db)
-        return float(level[0]) + prior.log_evidence_of_aligned(aligned)
+        std_db = math.hypot(BLOCKED_STD_DB, self._std_db, _DB_PER_NEPER * prior.gain_std)
+        in_sight, blocked = (
+            float(log_evidence_of_level(energy[[index]], whitened.size, std, self._median_db)[0])
+            for index, std in enumerate((self._std_db, std_db)))
+        return blocked - (in_sight + residual) + prior.log_evidence_of_aligned(aligned)
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some level explains the signals, as `Alternative` describes."""
         energy = float(np.sum(np.abs(whitened)**2))
-        return energy <= max_residual * 10**(_REACH * BLOCKED_STD_DB / 10)
+        return energy <= max_residual * 10**(_LEVEL_REACH * BLOCKED_STD_DB / 10)
+
+
+def tabulate_outside(model: MeasurementModel) -> dict[str, np.ndarray]:
+    """Compute the arrays of `Outside`: templates of the half space in front of the surface.
+
+    A template is a whitened mean times range and carrier, which depends on the direction and, via
+    the curvature of the wavefront and the delays of the sub-bands, slowly on the range. For T
+    template ranges, R ranges and V directions, the arrays are ``outer_filters``, the conjugate
+    templates, complex64 [N_B, T V, N_SB F]; ``outer_energy`` of these [m^2], float32 [T, V];
+    ``outer_index``, the template of each range, int64 [R]; and ``outer_weights``, the prior
+    probability of ranges and directions, 0 inside the region, float64 [R, V].
+    """
+    scenario = model.scenario
+    ranges, directions = _ranges(scenario), _directions(scenario)
+    nodes, index = _template_ranges(scenario, ranges)
+    weights = _prior(scenario, ranges, directions)
+    points = _points(nodes, directions).reshape(-1, 3)
+    carrier = np.exp(1j * carrier_wavenumbers(scenario) * points[:, :1]) * points[:, :1]
+    # With its derivative, the mean takes less time than without.
+    templates = model.whiten(model.mean_and_jacobian(to_positions(points))[0])
+    templates *= carrier[..., None]
+    energy = np.sum(np.abs(templates)**2, axis=(1, 2)).reshape(len(nodes), -1)
+    return {
+        'outer_filters': np.swapaxes(templates, 0, 1).conj().astype(np.complex64),
+        'outer_energy': energy.astype(np.float32),
+        'outer_index': index,
+        'outer_weights': weights,
+    }
+
+
+class Outside:
+    """A user in front of the surface but outside of the region of interest.
+
+    Range ambiguities repeat every few wavelengths, so that signals from outside often fit some
+    position of the region. The prior is uniform in range and solid angle, up to a multiple of the
+    region's farthest range. The carrier phases of the bands turn within centimetres of range; the
+    average over them has a closed form, the product over the bands of ``I_0(2 |t_i^H y_i|)``. The
+    rest is smooth, so that a coarse grid suffices: the arrays of `tabulate_outside`.
+    """
+
+    name, reason, limit = 'outside', 'position outside of the region', OUTSIDE_LIMIT
+    # As many users are outside as inside.
+    log_odds = 0.0
+
+    def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
+        self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
+        ranges = _ranges(scenario)[:, None]
+        self._scale = (2 / ranges).astype(np.float32)
+        self._node_energy = np.maximum(arrays['outer_energy'], np.finfo(np.float32).tiny)
+        self._energy = (arrays['outer_energy'][self._index] / ranges**2).astype(np.float32)
+        self._possible = arrays['outer_weights'] > 0
+        log_prior = np.log(arrays['outer_weights'], where=self._possible,
+                           out=np.full(self._possible.shape, -np.inf))
+        self._offset = (log_prior - self._energy).astype(np.float32)
+
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residual: float,
+                        prior: NuisancePrior) -> float:
+        """Compute the evidence, as `Alternative` describes; phases have no effect."""
+        gain = np.zeros(1)
+        if prior.gain_std:
+            n_points = 2 * int(np.ceil(_GAIN_REACH * prior.gain_std / _GAIN_STEP)) + 3
+            gain = prior.gain_std * np.linspace(-_GAIN_REACH, _GAIN_REACH, n_points)
+        evidence = self.log_evidence(whitened, np.exp(-gain)) - 2 * whitened.size * gain
+        weights = -gain**2 / (2 * (prior.gain_std or 1.0)**2)
+        return (log_sum(evidence + weights) - log_sum(weights)
+                + prior.log_evidence_of_aligned(aligned))
+
+    def log_evidence(self, whitened: np.ndarray, scales: Iterable[float] = (1.0,)) -> np.ndarray:
+        """Average the likelihood ``exp(-|y - t|^2)`` over the prior, for scales of the signals."""
+        filtered, energy = self._filter(whitened), float(np.sum(np.abs(whitened)**2))
+        # Whatever the range, the log-likelihood is at most that of outputs in phase.
+        bound = (np.sum(filtered, axis=0)**2 / self._node_energy).max(axis=0)
+        values = []
+        for scale in scales:
+            # Small factors make directions more alike.
+            chosen = np.flatnonzero(bound >= bound.max() - _MARGIN / scale**2)
+            argument = filtered[:, :, chosen][:, self._index] * (np.float32(scale) * self._scale)
+            log_likelihood = np.sum(_log_bessel(argument), axis=0) + self._offset[:, chosen]
+            values.append(log_sum(log_likelihood) - scale**2 * energy)
+        return np.array(values)
+
+    def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
+        """Return whether some position explains the signals, as `Alternative` describes."""
+        amplitude = np.sum(self._filter(whitened), axis=0)[self._index] * self._scale
+        residual = np.sum(np.abs(whitened)**2) - amplitude + self._energy
+        tolerated = max_residual + _GRID_ERROR * self._energy
+        return bool((self._possible & (residual <= tolerated)).any())
+
+    def _filter(self, whitened: np.ndarray) -> np.ndarray:
+        """Magnitude of the filtered signals for templates and directions, [N_B, T, V] [m]."""
+        signals = whitened.astype(np.complex64)[..., None]
+        filtered = np.abs(np.matmul(self._filters, signals)[..., 0])
+        return filtered.reshape(len(filtered), -1, self._energy.shape[1])
 
 
 ALTERNATIVES: tuple[type[Outside] | type[Blocked], ...] = (Outside, Blocked)
-# Smallest probability of an alternative that is worth a word.
-_MIN_DOUBT = 0.01
 
 
 def probabilities_of(estimate: object) -> dict[str, float]:
-    """Return the probabilities in an `Estimate` or a message, by the names of the alternatives.
-
-    Those that the estimator does not consider are absent.
-    """
+    """Return the known probabilities in an `Estimate` or a message, by names of alternatives."""
     values = {kind.name: float(getattr(estimate, f'{kind.name}_probability'))
               for kind in ALTERNATIVES}
     return {name: value for name, value in values.items() if not math.isnan(value)}
@@ -116,11 +228,78 @@ def shares(log_weights: np.ndarray) -> np.ndarray:
 
 
 def rejection(alternative: Alternative, probability: float) -> str:
-    """Reject signals that are explained by an alternative with this probability.
-
-    It is that compared with a user in the region in sight alone.
-    """
+    """Reject signals for the probability of an alternative alone, or return an empty text."""
     if probability <= alternative.limit:
         return ''
     return (f'{alternative.reason}: probability {probability:.6g}, expected at most '
             f'{alternative.limit:g}')
+
+
+def _log_bessel(argument: np.ndarray) -> np.ndarray:
+    """Approximate log I_0 of non-negative numbers; the error is below 0.04."""
+    # Exact to first order at 0 and to the leading order for large arguments.
+    growth = 1 + (np.pi - 1) * argument / (1.364 + argument)
+    return argument - np.log(1 + 2 * argument * growth) / 2
+
+
+def _ranges(scenario: Scenario) -> np.ndarray:
+    """Ranges of the grid in geometric progression, float64 [R] [m]."""
+    resolution = Resolution.of(scenario)
+    aperture_m = np.linalg.norm(element_positions(scenario), axis=1).max()
+    nearest_m = max(_NEAREST * resolution.nearest_m, _MIN_APERTURES * aperture_m)
+    ratio = _MAX_RANGE_FACTOR * resolution.farthest_m / nearest_m
+    n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(_RANGE_RATIO))))
+    return nearest_m * _RANGE_RATIO**np.arange(n_ranges)
+
+
+def _directions(scenario: Scenario) -> np.ndarray:
+    """Direction cosines (u, v) over the half space, float64 [V, 2]."""
+    direction = Resolution.of(scenario).direction
+    n_ranges = len(_template_ranges(scenario, _ranges(scenario))[0])
+    fewest = np.sqrt(np.pi / 4 * n_ranges / (np.prod(direction) * _MAX_TEMPLATES))
+    counts = np.ceil(0.5 / (max(_DIRECTION_RAD, fewest) * direction)).astype(int)
+    lines = [(np.arange(2 * n) + 0.5) / n - 1 for n in counts.tolist()]
+    grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
+    return grid[np.hypot(*grid.T) < _MAX_SINE]
+
+
+def _points(ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Every range in every direction, (r [m], u, v), float64 [R, V, 3]."""
+    points = np.empty((len(ranges), len(directions), 3))
+    points[..., 0] = ranges[:, None]
+    points[..., 1:] = directions
+    return points
+
+
+def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    positions = to_positions(_points(ranges, directions))
+    distance = np.linalg.norm(positions - np.clip(positions, *scenario.roi_bounds_m), axis=-1)
+    solid_angle = 1 / np.sqrt(1 - np.sum(directions**2, axis=1))
+    border_m = _BORDER * Resolution.of(scenario).nearest_m
+    weights = np.where(distance > border_m, ranges[:, None] * solid_angle, 0.0)
+    total = weights.sum()
+    return weights / total if total > 0 else weights
+
+
+def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges of the templates [T] [m], and for each range of the grid its template, [R].
+
+    The phase of a template errs by the curvature of the wavefront, proportional to 1 / r, and by
+    the delay across the sub-bands, proportional to r.
+    """
+    resolution = Resolution.of(scenario)
+
+    def node(first: int, end: int) -> float:
+        # Halfway in 1 / r, both ends have the same error from the curvature.
+        return float(2 / (1 / ranges[first] + 1 / ranges[end - 1]))
+
+    def fits(first: int, end: int) -> bool:
+        ends_m, node_m = ranges[[first, end - 1]], node(first, end)
+        errors = (resolution.curvature_m * np.abs(1 / ends_m - 1 / node_m)
+                  + np.abs(ends_m - node_m) / resolution.delay_m)
+        return bool(errors.max() <= _MAX_PHASE_ERROR)
+
+    shared = groups(len(ranges), fits)
+    index = np.repeat(np.arange(len(shared), dtype=np.int64),
+                      [end - first for first, end in shared])
+    return np.array([node(*ends) for ends in shared]), index

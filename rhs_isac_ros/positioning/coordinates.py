@@ -5,12 +5,18 @@ surface. The signals determine the range to a fraction of a wavelength, but the 
 a fraction of a beam. In Cartesian coordinates, the modes of the likelihood are therefore curved.
 """
 
+from typing import Any, TypeVar
+
 import numpy as np
 
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 
 # Alternating projections onto the region and onto a sphere.
 _N_PROJECTIONS = 4
+# A named tuple of arrays with equal first dimensions.
+_Rows = TypeVar('_Rows', bound=tuple[np.ndarray, ...])
+
+
 def to_positions(points: np.ndarray) -> np.ndarray:
     """Convert points (r [m], u, v), float64 [..., 3], to positions, float64 [..., 3] [m].
 
@@ -52,10 +58,7 @@ def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
 
 
 def is_inside(positions: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Return whether positions, float64 [..., 3] [m], are in the region, bool [...].
-
-    The bounds are those of `offset_to_roi`.
-    """
+    """Return which positions, [..., 3] [m], are between the bounds [2, 3] of the region."""
     low, high = bounds
     inside = np.ones(positions.shape[:-1], bool)
     # A reduction over the coordinates takes several times as long.
@@ -71,18 +74,9 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
     """Compute the offsets from modes to the nearest points of the region of interest.
 
     The offset follows the sphere of the mode's range, the coordinate that the signals determine
-    best. The range then changes with the direction so that the likelihood is highest.
-
-    Parameters
-    ----------
-    points
-        Modes (r [m], u, v), float64 [M, 3]; the offsets, 0 inside, have the same form.
-    curvature
-        Curvature of the log-likelihood at each mode, float64 [M, 3, 3].
-    bounds
-        Lower and upper vertex of the region, float64 [2, 3] [m].
-    tolerance_m
-        Distance from the sphere that counts as zero.
+    best. The range then changes with the direction so that the likelihood is highest. Takes modes
+    (r [m], u, v), float64 [M, 3], the curvature of the log-likelihood there, the bounds of the
+    region, float64 [2, 3], and the distance from the sphere that counts as zero.
     """
     positions = to_positions(points)
     result = np.zeros_like(points)
@@ -105,8 +99,24 @@ def offset_to_roi(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
 
 
 def likelihood_loss(offset: np.ndarray, curvature: np.ndarray) -> np.ndarray:
-    """Compute the decrease of the log-likelihood over offsets from modes, float64 [M].
-
-    The arguments have the shapes of `offset_to_roi`.
-    """
+    """Compute the decrease of the log-likelihood over offsets [M, n] from modes, float64 [M]."""
     return np.einsum('mp,mpq,mq->m', offset, curvature, offset) / 2
+
+
+def log_sum(values: np.ndarray) -> float:
+    """Return the logarithm of the sum of exponentials."""
+    highest = float(values.max())
+    if np.isneginf(highest):
+        return highest
+    return highest + float(np.log(np.sum(np.exp(values - highest))))
+
+
+def symmetric(covariances: np.ndarray) -> np.ndarray:
+    """Remove the rounding errors by which matrices [..., n, n] are not symmetric."""
+    return (covariances + np.swapaxes(covariances, -1, -2)) / 2
+
+
+def concatenate(*parts: _Rows) -> _Rows:
+    """Concatenate the fields of named tuples of arrays."""
+    kind: Any = type(parts[0])
+    return kind(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))

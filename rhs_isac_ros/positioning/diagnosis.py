@@ -1,20 +1,56 @@
-"""The likely reason why signals give no position, from the estimates of the latest cycles.
+"""Whether the model explains received signals: those of one phase, and of the latest cycles.
 
-The mean residual alone cannot tell a wrong level of the multipath from a wrong spread: both make
-it larger or smaller. A level scales all residuals, so that their relative variance remains that of
-the model. A wrong spread concentrates the energy in a few directions of the signals, and levels
-that differ between users or places differ from cycle to cycle: the relative variance grows.
+Whitened signals y from a position with the whitened mean t differ from t by noise of unit
+variance: ``2 |y - t|^2`` has a chi-square distribution with two degrees of freedom per
+measurement. Signals beyond its quantiles do not fit any position of the region (`FitTest`).
+Possible causes are a user elsewhere, another codebook, or a silent or defective receiver.
+
+Only gross errors of the model exceed this test. The mean energy of many residuals reveals small
+ones, such as a wrong delay spread, which leave the positions plausible but their covariances too
+small. Its variance reveals deviations that differ from phase to phase, such as unknown gains of
+the users, of which the best position absorbs the larger part (`InnovationTest`).
+
+The mean alone does not distinguish a wrong level of the multipath from a wrong spread: both change
+it in either direction. A level scales all residuals, so that their relative variance remains. A
+wrong spread concentrates the energy in a few directions of the signals, and levels that differ
+between users or places differ from cycle to cycle: the relative variance grows (`Diagnosis`).
 """
 
 import collections
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.positioning.alternatives import ALTERNATIVES, probabilities_of
 from rhs_isac_ros.positioning.estimate import Estimate
-from rhs_isac_ros.positioning.innovation_test import MIN_FIXES, WINDOW
 
+# Share of valid signals that each test of one phase may reject.
+FALSE_ALARM = 1e-9
+# Probability that the mean residual of a correct model causes a warning, and that their variance
+# does, for which the approximation is less accurate.
+FALSE_WARNING = 1e-6
+FALSE_SPREAD_WARNING = 1e-7
+# Probability of the latest residuals from which a warning ends: high, so that a small deviation
+# does not end and begin again and again.
+RETURN = 0.9
+SPREAD_RETURN = 0.5
+# Number of residuals in the mean, of those that end a warning, and the smallest number that is
+# judged.
+WINDOW = 400
+MIN_RETURN = 100
+MIN_FIXES = 10
+# Tolerated error of an expectation, and relative excess of the variance, from modes that are not
+# Gaussian.
+_TOLERANCE = 0.5
+_SPREAD_TOLERANCE = 0.15
+# Larger deviations from the expectation count as this many standard deviations, and larger squares
+# as this one, so that no single signal causes a warning, and few do not dominate.
+_MAX_DEVIATIONS = 6.0
+_MAX_SQUARE = 9.0
+# Subjects of the reasons.
+_ENERGY = 'energy of the whitened signals'
+_RESIDUAL = 'residual energy at the best position'
+# Causes of signals without a position.
 LEVEL = 'level of the multipath or of the users'
 SPREAD = 'spread of delays, angles or levels'
 # Relative variance of the residuals, in units of the model's, above which a level does not explain
@@ -22,63 +58,197 @@ SPREAD = 'spread of delays, angles or levels'
 _MAX_DISPERSION = 1.2
 
 
-@dataclasses.dataclass(frozen=True)
-class _Cycle:
-    """Subject of the reason, empty with a fix; residual and expectation; and probabilities."""
+class FitTest:
+    """Tests of the energy of N_B N_SB F whitened signals; each returns a reason, or ''."""
 
-    subject: str
-    residual: float
+    def __init__(self, n_measurements: int) -> None:
+        # Half a chi-square variable of 2 n degrees of freedom is a gamma variable of shape n.
+        from scipy.special import gammainccinv, gammaincinv
+
+        self.min_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
+        # With an unknown level of the multipath, the ratio of the likelihoods with and without a
+        # direct path is that of residual and energy to the power of n.
+        self._weak_share = FALSE_ALARM**(1 / n_measurements)
+        self.max_residual = float(gammainccinv(n_measurements, FALSE_ALARM))
+
+    def min_energy_test(self, energy: float) -> str:
+        """Reject signals that are weaker than noise; the energy is relative to it."""
+        if energy >= self.min_energy:
+            return ''
+        return (f'{_ENERGY}: {energy:.3g}, expected at least {self.min_energy:.3g}, '
+                'the energy of noise')
+
+    def max_energy_test(self, energy: float, max_mean_energy: float) -> str:
+        """Reject signals stronger than noise plus the strongest whitened mean in the region."""
+        # The norm of a sum is at most the sum of the norms.
+        return _excess(_ENERGY, energy, (max_mean_energy**0.5 + self.max_residual**0.5)**2)
+
+    def weak_test(self, energy: float, residual: float) -> str:
+        """Reject signals that are weaker than the multipath, unless they are a direct path."""
+        # Multipath may be weaker than in the model. The direct path at the best position then
+        # explains most of the energy.
+        excess = _excess(_RESIDUAL, residual, self._weak_share * energy)
+        if energy >= self.min_energy or not excess:
+            return ''
+        return f'{excess} of signals weaker than the multipath'
+
+    def residual_test(self, residual: float) -> str:
+        """Reject signals whose residual at the best position has more energy than noise."""
+        return _excess(_RESIDUAL, residual, self.max_residual)
+
+
+def _excess(subject: str, value: float, limit: float) -> str:
+    return '' if value <= limit else f'{subject}: {value:.3g}, expected at most {limit:.3g}'
+
+
+class InnovationTest:
+    """Mean and variance of the energy of the last residuals, compared with the expectation.
+
+    Twice an energy has approximately a chi-square distribution; `Estimate.expected_residual` is
+    half its mean. `ValueError` if the window is shorter than `MIN_RETURN`: no warning would end.
+
+    Attributes
+    ----------
+    drifts
+        Whether the residuals deviate from the model. This begins when the mean or the variance
+        over the window is improbable, and ends when those of the latest `MIN_RETURN` are not.
+    """
+
+    def __init__(self, window: int = WINDOW) -> None:
+        if window < MIN_RETURN:
+            raise ValueError(f'window: {window}, expected at least {MIN_RETURN}')
+        self._window = window
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove all residuals, for example after a change of the scenario or codebook."""
+        self._residuals: collections.deque[_Residual] = collections.deque()
+        self._sum = _Residual(0.0, 0.0, 0.0, 0.0)
+        self.drifts = False
+
+    def add(self, energy: float, expected: float) -> None:
+        """Add the energy of a residual and its expectation; if one of them is NaN, do nothing."""
+        if np.isnan(energy) or np.isnan(expected):
+            return
+        scale = max(expected, 1.0)
+        deviation = (energy - expected) / scale**0.5
+        deviation = min(max(deviation, -_MAX_DEVIATIONS), _MAX_DEVIATIONS)
+        self._append(_Residual(
+            expected + deviation * scale**0.5, expected, min(deviation**2, _MAX_SQUARE),
+            2 + 6 / scale))
+        if self.drifts:
+            latest = list(self._residuals)[-MIN_RETURN:]
+            total = _Residual(*np.sum(latest, axis=0).tolist())
+            if len(latest) == MIN_RETURN and (
+                    _probability(total, MIN_RETURN) >= RETURN
+                    and _spread_probability(total, MIN_RETURN) >= SPREAD_RETURN):
+                self.clear()
+                for residual in latest:
+                    self._append(residual)
+        elif len(self._residuals) >= MIN_FIXES:
+            n = len(self._residuals)
+            self.drifts = (_probability(self._sum, n) < FALSE_WARNING
+                           or _spread_probability(self._sum, n) < FALSE_SPREAD_WARNING)
+
+    def _append(self, residual: '_Residual') -> None:
+        if len(self._residuals) == self._window:
+            self._sum = self._sum.plus(self._residuals.popleft(), -1)
+        self._residuals.append(residual)
+        self._sum = self._sum.plus(residual, 1)
+
+    @property
+    def n_fixes(self) -> int:
+        """Number of residuals in the window."""
+        return len(self._residuals)
+
+    @property
+    def ratio(self) -> float:
+        """Mean energy relative to the expectation; NaN without residuals."""
+        return self._sum.energy / max(self._sum.expected, 0.5) if self._residuals else np.nan
+
+    @property
+    def spread(self) -> float:
+        """Variance of the energy about the expectation, relative to the model's, or NaN."""
+        return self._sum.square / len(self._residuals) if self._residuals else np.nan
+
+
+class _Residual(NamedTuple):
+    """A residual, or a sum of several."""
+
+    energy: float
     expected: float
-    probabilities: dict[str, float]
+    square: float  # Of the normalised deviation.
+    square_variance: float
+
+    def plus(self, other: '_Residual', factor: int) -> '_Residual':
+        return _Residual(*(one + factor * two for one, two in zip(self, other, strict=True)))
+
+
+def _probability(total: _Residual, n: int) -> float:
+    """Probability of a sum at least as far from the expected sum of `n` energies, on either side.
+
+    Below it, the assumed multipath is too strong in some directions, and too weak in others.
+    """
+    # Every node imports this package, and SciPy takes longer to load than ROS.
+    from scipy.special import gammainc, gammaincc
+
+    # With few measurements and many modes, an expectation may be negative.
+    expected, slack = max(total.expected, 0.5 * n), _TOLERANCE * n
+    return 2 * float(min(gammainc(expected, total.energy + slack),
+                         gammaincc(expected, max(total.energy - slack, 0.0))))
+
+
+def _spread_probability(total: _Residual, n: int) -> float:
+    """Probability of a sum of `n` squared deviations that is at least as large."""
+    from scipy.special import gammaincc
+
+    # The sum is approximately a gamma variable. The square of a normalised gamma variable of
+    # shape k has the mean 1 and the variance 2 + 6 / k.
+    mean = n * (1 + _SPREAD_TOLERANCE)
+    variance = total.square_variance * (1 + _SPREAD_TOLERANCE)**2
+    return float(gammaincc(mean**2 / variance, max(total.square, 0.0) * mean / variance))
 
 
 class Diagnosis:
     """Fixes, residuals and probabilities of the latest cycles."""
 
     def __init__(self) -> None:
-        self._cycles: collections.deque[_Cycle] = collections.deque(maxlen=WINDOW)
+        self._estimates: collections.deque[Estimate] = collections.deque(maxlen=WINDOW)
 
     def add(self, estimate: Estimate) -> None:
         """Add the estimate of a cycle."""
-        self._cycles.append(_Cycle(
-            str(estimate.reason).partition(':')[0], float(estimate.residual),
-            float(estimate.expected_residual), probabilities_of(estimate)))
+        self._estimates.append(estimate)
 
     def clear(self) -> None:
         """Forget all cycles."""
-        self._cycles.clear()
+        self._estimates.clear()
 
     def status(self, deviates: bool) -> dict[str, str]:
-        """Return the values for the diagnostics.
+        """Return the values for the diagnostics, as texts.
 
-        Parameters
-        ----------
-        deviates
-            Whether the residuals deviate from the scenario, so that the probabilities are wrong.
-
-        Returns
-        -------
-        dict
-            ``probability.<alternative>``, the mean over the cycles, which is the share of such
-            users; and if there are cycles without a fix, ``no_fix.share`` and ``no_fix.cause``.
+        They are ``probability.<alternative>``, the share of such users; and if there are cycles
+        without a fix, ``no_fix.share`` and ``no_fix.cause``. If the residuals deviate from the
+        scenario, the probabilities are wrong.
         """
         values = {}
+        probabilities = [probabilities_of(one) for one in self._estimates]
         for kind in ALTERNATIVES:
-            found = [cycle.probabilities[kind.name] for cycle in self._cycles
-                     if kind.name in cycle.probabilities]
+            found = [each[kind.name] for each in probabilities if kind.name in each]
             if found:
                 values[f'probability.{kind.name}'] = f'{np.mean(found):.3f}'
-        subjects = collections.Counter(one.subject for one in self._cycles if one.subject)
+        # What precedes the colon is the subject of a reason.
+        subjects = collections.Counter(
+            str(one.reason).partition(':')[0] for one in self._estimates if one.reason)
         if subjects:
-            values['no_fix.share'] = f'{sum(subjects.values())} of {len(self._cycles)}'
+            values['no_fix.share'] = f'{sum(subjects.values())} of {len(self._estimates)}'
             values['no_fix.cause'] = self._cause(subjects.most_common(1)[0][0], deviates)
         return values
 
     def _cause(self, subject: str, deviates: bool) -> str:
         """Return the likely cause, given the most frequent subject of the reasons."""
         residual, expected = np.array([
-            (one.residual, one.expected) for one in self._cycles
-            if one.residual > 0 and one.expected > 0]).reshape(-1, 2).T
+            (one.residual, one.expected_residual) for one in self._estimates
+            if one.residual > 0 and one.expected_residual > 0]).reshape(-1, 2).T
         is_alternative = subject in {kind.reason for kind in ALTERNATIVES}
         if len(residual) < MIN_FIXES or is_alternative and not deviates:
             return subject

@@ -12,10 +12,10 @@ from rhs_isac_ros.model import Scenario
 # Far above any received amplitude [sqrt(W)]; after whitening, its square is still finite in single
 # precision.
 _MAX_MAGNITUDE = 1e3
-# Mean [3], covariance [3, 3], reason, and optionally the energy of the residual, the expected
-# energy, and the probabilities that the user is outside of the region and blocked.
+# The fields of an `Estimate` of one phase: mean [3], covariance [3, 3] and reason, and optionally
+# those that follow.
 Located: TypeAlias = (
-    tuple[np.ndarray, np.ndarray, str] | tuple[np.ndarray, np.ndarray, str, float]
+    tuple[np.ndarray, np.ndarray, str]
     | tuple[np.ndarray, np.ndarray, str, float, float, float, float])
 
 
@@ -36,8 +36,7 @@ class Estimate:
     reason
         Reason why there is no position, empty if there is one; a string, or N of them.
     residual
-        Energy of the whitened residual at the best position, float64 [] or [N]; NaN from
-        estimators that compute none.
+        Energy of the whitened residual at the best position, float64 [] or [N]; or NaN.
     expected_residual
         Its mean for signals that match the model, given the modes of the posterior, float64 [] or
         [N]; NaN without a residual, and if the user may be outside of the region or blocked.
@@ -84,21 +83,17 @@ def estimate_each(
         locate: Callable[[np.ndarray], Iterable[Located]]) -> Estimate:
     """Check received signals, locate every phase, and match the result to the signals' shape.
 
-    Parameters
-    ----------
-    received
-        Complex128 [N_B, N_SB F] or [N, N_B, N_SB F]; the codebook determines the sizes.
-    locate
-        Callable that takes checked signals [N, N_B, N_SB F] and yields mean [3], covariance
-        [3, 3] and reason for each phase, and optionally the further values of `Located`. If the
-        reason is not empty, mean and covariance are ignored.
+    Takes signals, complex128 [N_B, N_SB F] or [N, N_B, N_SB F], and a function that yields the
+    values of `Located` for each phase of checked signals [N, N_B, N_SB F]: mean [3], covariance
+    [3, 3] and reason, and optionally the other fields of an `Estimate`. If the reason is not
+    empty, mean and covariance are ignored.
 
     Raises
     ------
     SignalError
         If the shape is wrong, a value is not finite, or a magnitude exceeds 1000.
     """
-    batch = checked_received(scenario, codebook, received)
+    batch = checked_received(codebook, received)
     mean, covariance = np.full((len(batch), 3), np.nan), np.full((len(batch), 3, 3), np.nan)
     reasons, residuals = [], np.full((4, len(batch)), np.nan)
     for row, (position, spread, reason, *energy) in enumerate(locate(batch)):
@@ -111,8 +106,8 @@ def estimate_each(
     return Estimate(mean, covariance, tuple(reasons), *residuals)
 
 
-def checked_received(scenario: Scenario, codebook: Codebook, received: np.ndarray) -> np.ndarray:
-    """Return received signals as complex128 [N, N_B, N_SB F]; arguments as in `estimate_each`."""
+def checked_received(codebook: Codebook, received: np.ndarray) -> np.ndarray:
+    """Return received signals as complex128 [N, N_B, N_SB F], or raise `SignalError`."""
     try:
         received = np.asarray(received, dtype=complex)
     except (TypeError, ValueError) as error:
@@ -129,12 +124,3 @@ def checked_received(scenario: Scenario, codebook: Codebook, received: np.ndarra
         raise SignalError(
             f'received: {np.abs(received).max():g}, expected magnitudes up to {_MAX_MAGNITUDE:g}')
     return received.reshape(-1, *expected)
-
-
-def stack_parts(signals: np.ndarray) -> np.ndarray:
-    """Flatten complex signals [N, N_B, N_SB F] to float64 [N, 2 N_B N_SB F].
-
-    All real parts come first, then all imaginary parts.
-    """
-    flat = signals.reshape(len(signals), -1)
-    return np.hstack([flat.real, flat.imag])

@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.impairments.elements import (
+from rhs_isac_ros.model.elements import (
     DeclaredElements,
     ElementErrors,
     element_correlation,
@@ -27,9 +27,9 @@ from rhs_isac_ros.model.impairments.elements import (
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import onboard_matrix
-from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
-from rhs_isac_ros.positioning.expansion import Means
+from rhs_isac_ros.positioning.coordinates import concatenate, jacobian, to_positions
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
+from rhs_isac_ros.positioning.lattice import Means
 from rhs_isac_ros.positioning.likelihood import (
     Likelihood,
     Local,
@@ -77,8 +77,9 @@ _MAX_GROWTH = 6
 # Number of sets whose covariance is kept.
 _MAX_SURFACES = 256
 
-# A set of failed elements and the index of a site.
-Key: TypeAlias = tuple[tuple[int, ...], int]
+# A set of failed elements, in ascending order; and with the index of a site.
+Failed: TypeAlias = tuple[int, ...]
+Key: TypeAlias = tuple[Failed, int]
 
 
 def can_enumerate(scenario: Scenario) -> bool:
@@ -87,14 +88,9 @@ def can_enumerate(scenario: Scenario) -> bool:
 
 
 class FailedElements:
-    """The posterior of positions if a few elements of the surface may have failed.
+    """The posterior of positions if a few elements of the surface may have failed."""
 
-    Attributes
-    ----------
-    search_margin
-        Extra margin of the search for modes, whose average over sets misjudges each set.
-    """
-
+    # Extra margin of the search for modes, whose average over sets misjudges each set.
     search_margin = 10.0
 
     def __init__(self, likelihood: Likelihood, grid: TemplateTable) -> None:
@@ -108,11 +104,9 @@ class FailedElements:
     def refine(self, modes: Modes, signals: Signals) -> tuple[Modes, list['FailedSet']]:
         """Return a mode of one phase for every probable set, and the likelihoods of the sets.
 
-        The most likely comes first. Likelihoods are relative to those of the search. The modes
-        are those of the search, and the signals those of the phase, N = 1.
+        Takes the modes of the search, and the signals of the phase, N = 1.
         """
-        search = self._search(modes, signals)
-        return self._converge(search, signals)
+        return self._converge(self._search(modes, signals), signals)
 
     def _search(self, modes: Modes, signals: Signals) -> 'FailureSearch':
         """Search for probable sets at the modes and elsewhere."""
@@ -159,41 +153,27 @@ class FailedElements:
         values, best = search.values, max(search.values.values())
         keys = sorted((key for key in values if values[key] >= best - _MARGIN),
                       key=lambda key: -values[key])[:_MAX_HYPOTHESES]
-        # The most probable sets are tried at the other sites, too.
         sets = list(dict.fromkeys(failed for failed, _ in keys))
-        everywhere = range(len(search.sites))
-        parts, conditionals = [], []
+        conditionals = [self._model.failed_set(failed) for failed in sets]
+        parts = []
         for number, failed in enumerate(sets):
-            own = [index for one, index in keys if one == failed]
-            tried = everywhere if number < _N_SETS else own
-            sites = [search.sites[index] for index in tried]
+            # The most probable sets are tried at the other sites, too.
+            sites = search.sites if number < _N_SETS else [
+                search.sites[index] for one, index in keys if one == failed]
             starts = Starts(np.zeros(len(sites), int), np.stack([one.point for one in sites]),
                             np.stack([one.values for one in sites]))
-            conditional = self._model.failed_set(failed)
-            conditionals.append(conditional)
-            parts.append(ascend(conditional, self._likelihood, starts, signals, _N_STEPS,
+            parts.append(ascend(conditionals[number], self._likelihood, starts, signals, _N_STEPS,
                                 _FIRST_MARGIN, number))
-        modes = Modes(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+        modes = concatenate(*parts)
         order = np.argsort(-modes.roi_log_likelihood)[:_MAX_HYPOTHESES]
         return modes.select(order), conditionals
 
 
 class Surface(NamedTuple):
-    """A set of failed elements.
+    """A surface with failed elements."""
 
-    Attributes
-    ----------
-    failed
-        The elements, in ascending order.
-    scattered
-        T V, complex128 [N_B, N_SB F, N_E].
-    covariance
-        Covariance of the signals given the amplitudes of the direct path, complex128
-        [N_B, N_SB F, N_SB F].
-    """
-
-    failed: tuple[int, ...]
-    scattered: np.ndarray
+    scattered: np.ndarray  # T V, complex128 [N_B, N_SB F, N_E].
+    # Of the signals given the amplitudes of the direct path, complex128 [N_B, N_SB F, N_SB F].
     covariance: np.ndarray
 
     def whitening(self, prior: NuisancePrior) -> 'Whitening':
@@ -205,97 +185,63 @@ class Surface(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """Factors of the covariances of H sets.
+    """Factors of the covariances of H sets."""
 
-    Attributes
-    ----------
-    whitener
-        Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
-    log_volume
-        Logarithms of the determinants, float64 [H].
-    information
-        Information of a covariance about the nuisance parameters, float64 [Q, Q].
-    """
-
-    whitener: np.ndarray
-    log_volume: np.ndarray
-    information: np.ndarray
+    whitener: np.ndarray  # Inverse Cholesky factors, complex128 [N_B, H, N_SB F, N_SB F].
+    log_volume: np.ndarray  # Logarithms of the determinants, float64 [H].
+    information: np.ndarray  # Of one covariance about the nuisance parameters, float64 [Q, Q].
 
 
 class Site(NamedTuple):
-    """The signals of a phase at a point.
+    """The signals of a phase at a point."""
 
-    Attributes
-    ----------
-    point, values
-        (r [m], u, v), float64 [3], and nuisance parameters, float64 [Q].
-    columns
-        Residual of an intact surface, and derivatives of the mean with respect to the point and
-        the parameters, complex128 [4 + Q, N_B, N_SB F].
-    changes
-        Changes of the columns if an element fails, complex128 [N_E, 4 + Q, N_B, N_SB F].
-    amplitudes
-        Derivatives with respect to the scaled amplitude of a failed element, complex128
-        [N_E, N_B, N_SB F].
-    """
-
-    point: np.ndarray
-    values: np.ndarray
+    point: np.ndarray  # (r [m], u, v), float64 [3].
+    values: np.ndarray  # Nuisance parameters, float64 [Q].
+    # Residual of an intact surface, and derivatives of the mean with respect to the point and the
+    # parameters, complex128 [4 + Q, N_B, N_SB F]; and their changes if an element fails.
     columns: np.ndarray
-    changes: np.ndarray
+    changes: np.ndarray  # Complex128 [N_E, 4 + Q, N_B, N_SB F].
+    # Derivatives by the scaled amplitude of a failed element, complex128 [N_E, N_B, N_SB F].
     amplitudes: np.ndarray
+
+    def columns_of(self, failed: Failed) -> np.ndarray:
+        """Return the columns of a surface with failed elements."""
+        return self.columns + self.changes[[*failed]].sum(axis=0)
 
 
 class FailedSet:
     """The likelihood of positions for a set of failed elements: a `Conditional`.
 
-    Its value includes the prior of the set, and is relative to that of `Likelihood`.
+    Its value includes the prior of the set, and is relative to the value of `Likelihood`.
     """
 
-    def __init__(self, likelihood: Likelihood, surface: Surface, log_prior: float) -> None:
+    def __init__(self, likelihood: Likelihood, failed: Failed, whitening: Whitening,
+                 amplitudes: np.ndarray, log_prior: float) -> None:
         self._likelihood, scenario = likelihood, likelihood.scenario
-        self._failed = list(surface.failed)
+        self._failed = list(failed)
         stuck = np.full(scenario.n_elements, np.nan)
         stuck[self._failed] = 0.5
         self._means = Means(MeasurementModel(
             scenario, likelihood.codebook, ElementErrors(np.ones(len(stuck)), stuck)))
-        whitening = surface.whitening(likelihood.nuisance)
         self._whitener, self._information = whitening.whitener[:, 0], whitening.information
         self._offset = log_prior + likelihood.log_volume - whitening.log_volume[0]
-        self._amplitudes = _amplitude_weights(likelihood)[self._failed]
+        self._amplitudes = amplitudes[self._failed]
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
-        prior, positions, n = self._likelihood.nuisance, to_positions(points), len(points)
+        prior, positions = self._likelihood.nuisance, to_positions(points)
         mean, slopes = self._means(points)
-        divided = prior.divide(signals.received, values)
         gains = np.stack([
             np.repeat(los_gain(self._likelihood.scenario, positions, band)[:, :, self._failed],
                       self._likelihood.scenario.n_frames, axis=1)
             for band in range(mean.shape[1])])
         amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
-        columns = np.concatenate([
-            (divided - mean)[:, None], slopes, prior.patterns * prior.sources(mean, divided),
-            amplitudes,
-            prior.patterns * divided[:, None]], axis=1)
+        columns = prior.columns(values, signals.received, mean, slopes, amplitudes)
         white = np.einsum('irs,mcis->mcir', self._whitener, columns, optimize=True)
-        white = white.reshape(n, columns.shape[1], -1)
-        n_expected = 4 + len(prior) + len(self._failed)
-        local = assemble(prior, values, white[:, 0], white[:, 1:n_expected],
-                         white[:, n_expected:], information_of_covariance=self._information,
+        local = assemble(prior, values, white.reshape(*columns.shape[:2], -1),
+                         information_of_covariance=self._information,
                          n_linear=len(self._failed))
         return local._replace(value=local.value + self._offset)
-
-
-def _amplitude_weights(likelihood: Likelihood) -> np.ndarray:
-    """Weight of each element's direct path per standard deviation of an amplitude.
-
-    Returns complex128 [N_E, N_B, N_SB F].
-    """
-    scenario = likelihood.scenario
-    weights = np.matmul(likelihood.codebook.digital, onboard_matrix(scenario)) / np.sqrt(12)
-    shape = scenario.n_bands, -1, scenario.n_elements
-    return np.ascontiguousarray(np.moveaxis(weights.reshape(shape), 2, 0))
 
 
 class FailureModel:
@@ -306,52 +252,45 @@ class FailureModel:
         self.likelihood, self.scenario = likelihood, scenario
         intact = dataclasses.replace(scenario, failed_element_share=0.0)
         self._model = MeasurementModel(intact, codebook).prepare(jacobian=True)
+        # Weights of the elements' direct paths, [N_E, N_B, N_SB F]: their changes by a failure,
+        # and per standard deviation of the amplitude of a failed element.
         weights = np.matmul(codebook.digital, onboard_matrix(scenario))
-        shift = ((0.5 - codebook.analog[:, None]) * weights).reshape(self._model.radiation.shape)
-        self._shift = np.ascontiguousarray(np.moveaxis(shift, 2, 0))
-        self._amplitudes = _amplitude_weights(likelihood)
+        self._shift, self._amplitudes = (
+            np.ascontiguousarray(np.moveaxis(one.reshape(self._model.radiation.shape), 2, 0))
+            for one in ((0.5 - codebook.analog[:, None]) * weights, weights / np.sqrt(12)))
         self._spatial = multipath_covariance(scenario)
         self._correlation = measurement_correlation(scenario)
-        self._intact = Surface((), np.matmul(self._model.radiation, self._spatial),
+        self._intact = Surface(np.matmul(self._model.radiation, self._spatial),
                                self._model.covariance())
-        self._surfaces: dict[tuple[int, ...], Surface] = {}
         failing = dataclasses.replace(scenario, element_error_rms=0.0)
         self._error = DeclaredElements(failing).error_covariance(failing, codebook)
-        self._extensions: dict[tuple[tuple[int, ...], float], Whitening] = {}
+        self._extensions: dict[tuple[Failed, float], Whitening] = {}
         share = scenario.failed_element_share
         self._log_odds = float(np.log(share / (1 - share)))
         self._log_intact = scenario.n_elements * float(np.log1p(-share))
         # The same set is often probable in successive phases.
-        self.failed_set = functools.lru_cache(maxsize=_MAX_SURFACES)(self._failed_set)
-        self._whitening = functools.lru_cache(maxsize=_MAX_SURFACES)(
-            lambda failed: self.surface(failed).whitening(likelihood.nuisance))
+        cache = functools.lru_cache(maxsize=_MAX_SURFACES)
+        self.surface = cache(self._surface)
+        self._whitening = cache(lambda failed: self.surface(failed).whitening(likelihood.nuisance))
+        self.failed_set = cache(lambda failed: FailedSet(
+            likelihood, failed, self._whitening(failed), self._amplitudes,
+            len(failed) * self._log_odds + self._log_intact))
 
-    def _failed_set(self, failed: tuple[int, ...]) -> FailedSet:
-        return FailedSet(self.likelihood, self.surface(failed),
-                         len(failed) * self._log_odds + self._log_intact)
-
-    def surface(self, failed: tuple[int, ...]) -> Surface:
-        """Return the surface with these failed elements, in ascending order."""
+    def _surface(self, failed: Failed) -> Surface:
         if not failed:
             return self._intact
-        if failed not in self._surfaces:
-            smaller, element = self.surface(failed[:-1]), failed[-1]
-            shift = self._shift[element]
-            scattered = smaller.scattered + shift[..., None] * self._spatial[:, None, element]
-            growth = self._growth(smaller, slice(element, element + 1))[0]
-            if len(self._surfaces) >= _MAX_SURFACES:
-                self._surfaces.clear()
-            self._surfaces[failed] = Surface(failed, scattered, smaller.covariance + growth)
-        return self._surfaces[failed]
+        smaller, element = self.surface(failed[:-1]), failed[-1]
+        shift = self._shift[element]
+        scattered = smaller.scattered + shift[..., None] * self._spatial[:, None, element]
+        growth = self._growth(smaller, slice(element, element + 1))[0]
+        return Surface(scattered, smaller.covariance + growth)
 
     def site(self, point: np.ndarray, values: np.ndarray, signals: Signals) -> Site:
         """Evaluate the signals of a phase, N = 1, at a point [3] with parameters [Q]."""
         prior, position = self.likelihood.nuisance, to_positions(point[None])
         by_point = jacobian(point[None])
         mean, slopes = self._model.mean_and_jacobian(position, by_point)
-        divided = prior.divide(signals.received, values)
-        columns = np.concatenate([
-            divided - mean, slopes[0], prior.patterns * prior.sources(mean, divided)[0]])
+        columns = prior.columns(values, signals.received, mean, slopes)[0, :4 + len(prior)]
         gains = []
         for band in range(self.scenario.n_bands):
             gain, slope = los_and_derivative(self.scenario, position, band)
@@ -360,33 +299,29 @@ class FailureModel:
         elements = np.moveaxis(np.stack(gains), (0, 1, 2, 3), (2, 1, 3, 0))
         changes = elements * self._shift[:, None]
         fixed = prior.patterns * ~prior.moves_multipath[:, None, None]
-        changes = np.concatenate([
-            -changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
+        changes = np.concatenate([-changes[:, :1], changes[:, 1:], fixed * changes[:, :1]], axis=1)
         return Site(point, values, columns, changes, elements[:, 0] * self._amplitudes)
 
-    def weigh(self, surface: Surface, site: Site) -> tuple[float, float]:
-        """Return the log-probability of a surface at a site, and its deviance.
+    def weigh(self, failed: Failed, site: Site) -> tuple[float, float]:
+        """Return the log-probability of a set at a site, and its deviance, after a step.
 
-        Both are those after a Gauss-Newton step. The log-probability is relative to the prior of
-        an intact surface. The deviance is the energy of the residual plus the cost of the
-        parameters: an unknown gain lowers any energy, at a cost.
+        The former is relative to the prior of an intact surface. The deviance is the energy of
+        the residual plus the cost of the parameters: an unknown gain lowers any energy.
         """
-        failed, whitening = list(surface.failed), self._whitening(surface.failed)
-        columns = site.columns + site.changes[failed].sum(axis=0)
-        columns = np.concatenate([columns, site.amplitudes[failed]])[None]
+        whitening = self._whitening(failed)
+        columns = np.concatenate([site.columns_of(failed), site.amplitudes[[*failed]]])[None]
         value = float(self._predicted(site, columns, whitening, len(failed))[0])
         return len(failed) * self._log_odds - float(whitening.log_volume[0]) + value, -value
 
-    def weigh_extensions(self, surface: Surface, site: Site, remainder: float = 0.0) -> np.ndarray:
+    def weigh_extensions(self, failed: Failed, site: Site, remainder: float = 0.0) -> np.ndarray:
         """Compute the log-probability of `weigh` if one more element fails, float64 [N_E].
 
         Besides, further elements may have failed, the declared share times `remainder` of them.
         They add to the covariance, so that elements which explain a part of the signals have a
         higher value than elements which imitate the sum.
         """
-        extended, failed = self._extensions_of(surface.failed, remainder), list(surface.failed)
-        columns = site.columns + site.changes[failed].sum(axis=0)
-        own = np.broadcast_to(site.amplitudes[failed],
+        extended, columns = self._extensions_of(failed, remainder), site.columns_of(failed)
+        own = np.broadcast_to(site.amplitudes[[*failed]],
                               (len(site.amplitudes), len(failed), *columns.shape[1:]))
         parts = np.concatenate([columns + site.changes, own, site.amplitudes[:, None]], axis=1)
         value = self._predicted(site, parts, extended, len(failed) + 1)
@@ -394,23 +329,17 @@ class FailureModel:
 
     def _predicted(self, site: Site, columns: np.ndarray, whitening: Whitening,
                    n_failed: int) -> np.ndarray:
-        """Marginal log-likelihood of H hypotheses after a step, without determinants, [H].
-
-        Takes columns [H, C, N_B, N_SB F].
-        """
+        """Marginal log-likelihood of columns [H, C, N_B, N_SB F] after a step, [H]."""
         prior, n = self.likelihood.nuisance, len(columns)
         white = np.matmul(np.moveaxis(columns, 2, 0), np.swapaxes(whitening.whitener, 2, 3))
         white = np.moveaxis(white, 0, 2).reshape(n, columns.shape[1], -1)
         values = np.broadcast_to(site.values, (n, len(prior)))
-        local = assemble(prior, values, white[:, 0], white[:, 1:], n_linear=n_failed,
+        local = assemble(prior, values, white, n_linear=n_failed,
                          information_of_covariance=whitening.information)
         return predict(local, self.likelihood)
 
-    def search_factor(self, failed: tuple[int, ...]) -> np.ndarray:
-        """Compute the factor of the inverse covariance of a set for `TemplateTable.starts_under`.
-
-        The failed elements have their second moments, averaged over the region of interest.
-        """
+    def search_factor(self, failed: Failed) -> np.ndarray:
+        """Compute the factor of the average covariance of a set for `starts_under`."""
         covariance = self._intact.covariance.copy()
         for band, of_band in enumerate(covariance):
             correlation = element_correlation(self.scenario, band)
@@ -421,7 +350,7 @@ class FailureModel:
         ratio = np.linalg.solve(np.linalg.cholesky(covariance), self.likelihood.model.root)
         return np.conj(np.swapaxes(ratio, 1, 2))
 
-    def _extensions_of(self, failed: tuple[int, ...], remainder: float) -> Whitening:
+    def _extensions_of(self, failed: Failed, remainder: float) -> Whitening:
         if (failed, remainder) not in self._extensions:
             surface = self.surface(failed)
             covariance = surface.covariance[:, None] + np.swapaxes(self._growth(surface), 0, 1)
@@ -446,27 +375,14 @@ class FailureModel:
 
 
 class FailureSearch:
-    """Adds failed elements to sets, one at a time, at several sites.
+    """Adds failed elements to sets, one at a time, at several sites, for the signals of a phase.
 
     The order of the extended sets follows from a likelihood that admits a few more failures; see
     `FailureModel.weigh_extensions`. Without them, the best first element of two would often be
     one that imitates the sum of both.
 
-    Parameters
-    ----------
-    signals
-        Signals of the phase, N = 1.
-    margin
-        Growth ends with sets that are less probable than the best by this, in log-probability.
-    usual_residual
-        The growth continues while no hypothesis has a lower deviance.
-
-    Attributes
-    ----------
-    sites
-        The sites.
-    values
-        Logarithm of prior times likelihood of each hypothesis.
+    Growth ends with sets that are less probable than the best by a margin, in log-probability, but
+    continues while no hypothesis has a deviance below the usual residual.
     """
 
     def __init__(self, model: FailureModel, signals: Signals, margin: float,
@@ -474,6 +390,7 @@ class FailureSearch:
         self._model, self._signals, self._margin = model, signals, margin
         self._usual_residual = usual_residual
         self.sites: list[Site] = []
+        # Logarithm of prior times likelihood of each hypothesis.
         self.values: dict[Key, float] = {}
         self._deviances: dict[Key, float] = {}
 
@@ -486,8 +403,7 @@ class FailureSearch:
         """Whether a hypothesis has no higher deviance than usual."""
         return any(self._deviances[key] <= self._usual_residual for key in keys)
 
-    def add(self, points: np.ndarray, values: np.ndarray,
-            failed: tuple[int, ...] = ()) -> list[Key]:
+    def add(self, points: np.ndarray, values: np.ndarray, failed: Failed = ()) -> list[Key]:
         """Add sites at points [P, 3] with parameters [P, Q] and a set; the best come first."""
         first = len(self.sites)
         self.sites += [self._model.site(point, own, self._signals)
@@ -497,13 +413,8 @@ class FailureSearch:
     def grow(self, parents: list[Key], remainder: float = 0.0, n_extended: int = 8) -> None:
         """Add failures to hypotheses as long as the result is probable.
 
-        Parameters
-        ----------
-        remainder
-            Share of further failures, relative to the declared one, with which the sets are
-            ordered; see `FailureModel.weigh_extensions`.
-        n_extended
-            Number of sets of the same size to extend.
+        Takes the share of further failures that orders the sets, as in
+        `FailureModel.weigh_extensions`, and the number of sets of the same size to extend.
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)
@@ -534,7 +445,7 @@ class FailureSearch:
             if key not in self.values:
                 failed, index = key
                 self.values[key], self._deviances[key] = self._model.weigh(
-                    self._model.surface(failed), self.sites[index])
+                    failed, self.sites[index])
         return sorted(keys, key=lambda key: -self.values[key])
 
     def _weigh_children(self, parents: list[Key], remainder: float = 0.0) -> list[Key]:
@@ -542,8 +453,7 @@ class FailureSearch:
         children: dict[Key, float] = {}
         # The covariances of a set are computed once.
         for failed, index in sorted(parents):
-            values = self._model.weigh_extensions(
-                self._model.surface(failed), self.sites[index], remainder)
+            values = self._model.weigh_extensions(failed, self.sites[index], remainder)
             for element, value in enumerate(values.tolist()):
                 if element not in failed:
                     children[tuple(sorted((*failed, element))), index] = value

@@ -10,6 +10,7 @@ steps that resolve the carriers, along which one output per band rotates.
 All lengths of the grid follow from the scenario; see `lattice`.
 """
 
+import itertools
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -19,17 +20,19 @@ from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
+    concatenate,
     is_inside,
     likelihood_loss,
     offset_to_roi,
     to_positions,
 )
-from rhs_isac_ros.positioning.expansion import Expansion
 from rhs_isac_ros.positioning.lattice import (
     PHASE_ERROR,
+    Expansion,
     Resolution,
     lay_grid,
     subband_wavenumbers,
+    whiten,
 )
 from rhs_isac_ros.positioning.likelihood import NuisancePrior
 from rhs_isac_ros.support.threads import map_blocks
@@ -59,20 +62,15 @@ _STEP_ERROR = 0.5
 
 
 def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
-    """Compute the templates of a scenario and codebook.
+    """Compute the arrays of a `TemplateTable`, for G templates and C pairs with a range cell.
 
-    Returns
-    -------
-    dict of numpy.ndarray
-        By name, for G templates and C pairs of a template and a range cell: ``filters``, the
-        conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``, the conjugate
-        derivatives of the templates with respect to (r [m], u, v), complex64
-        [N_B, N_SB, G, 3, F]; ``energy`` of the whitened means, float32 [C]; ``energy_slope``, its
-        derivative, float32 [C, 3]; ``curvature`` of the log-likelihood, float64 [C, 3, 3];
-        ``spread``, the mean of the outer products of the whitened means, complex128
-        [N_B, N_SB F, N_SB F]; ``whitener``, inverse Cholesky factors of the covariance, of the
-        same shape; and, independent of the codebook, ``normal``, points that represent a standard
-        Gaussian, float64 [128, 3].
+    They are ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``,
+    their derivatives with respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of
+    the whitened means, float32 [C]; ``energy_slope``, its derivative, float32 [C, 3];
+    ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``spread``, the mean of the outer
+    products of the whitened means, and ``whitener``, inverse Cholesky factors of the covariance,
+    complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a standard Gaussian,
+    float64 [128, 3].
     """
     grid, (n_bands, n_rows) = lay_grid(model.scenario), model.shape
     points = grid.points
@@ -101,15 +99,10 @@ def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
         spread = np.zeros((n_bands, n_rows, n_rows), complex)
         cells = order[bounds[nodes.start]:bounds[nodes.stop]]
         for part in np.array_split(cells, -(-len(cells) // _BLOCK)):
-            mean, slopes = expansion.at(grid.node[part] - nodes.start, points[part])
-            columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
-            white = np.matmul(columns.reshape(n_bands, -1, n_rows),
-                              np.swapaxes(model.whitener, 1, 2))
-            white = white.reshape(n_bands, len(part), 4, n_rows)
-            spread += np.einsum('icr,ics->irs', white[:, :, 0], white[:, :, 0].conj(),
-                                optimize=True)
-            flat = np.moveaxis(white, 0, 2).reshape(len(part), 4, -1)
-            form = quadratic_form(flat)
+            white = whiten(model, *expansion.at(grid.node[part] - nodes.start, points[part]))
+            mean = np.moveaxis(white[:, 0], 1, 0)
+            spread += np.einsum('icr,ics->irs', mean, mean.conj(), optimize=True)
+            form = quadratic_form(white.reshape(len(part), 4, -1))
             table['energy'][part] = form[:, 0, 0] / 2
             table['energy_slope'][part] = form[:, 0, 1:]
             table['curvature'][part] = form[:, 1:, 1:]
@@ -132,17 +125,7 @@ def standard_normal(n: int) -> np.ndarray:
 class TemplateTable:
     """Fast evaluation of the log-likelihood over the whole region of interest.
 
-    Parameters
-    ----------
-    arrays
-        The arrays that `tabulate` returns for the scenario and a codebook.
-
-    Attributes
-    ----------
-    normal
-        Points that represent a standard Gaussian, float64 [128, 3].
-    spread
-        Mean of the outer products of the whitened means, complex128 [N_B, N_SB F, N_SB F].
+    Takes the arrays of `tabulate`, of which `normal` and `spread` are attributes.
     """
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray]) -> None:
@@ -188,41 +171,27 @@ class TemplateTable:
     def starts(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Starts':
         """Find the most likely separate points, to the accuracy of one Gauss-Newton step.
 
-        Those of a phase do not depend on the other phases.
-
-        Parameters
-        ----------
-        whitened
-            Signals of N phases, complex128 [N, N_B, N_SB F], without the offsets of carrier and
-            timing.
-        prior
-            The nuisance parameters.
-        margin
-            Negative logarithm of the share of the posterior that points may leave out.
+        Takes whitened signals of N phases, complex128 [N, N_B, N_SB F], without the offsets of
+        carrier and timing; and the negative logarithm of the share of the posterior that points
+        may leave out. The points of a phase do not depend on the other phases.
         """
-        weighted = np.swapaxes(
-            np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
+        weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
         energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
         n = max(1, _N_OUTPUTS // (len(self._energy) * len(self._wavenumbers)))
         parts = []
         for first in range(0, len(whitened), n):
             block = slice(first, first + n)
-            part = self._starts(weighted[block], energies[block], prior, margin, self._energy)
+            query = self._query(weighted[block], energies[block], prior, margin, self._energy)
+            part = self._starts(query)
             parts.append(part._replace(phases=part.phases + first))
-        return parts[0] if len(parts) == 1 else Starts(
-            *(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+        return concatenate(*parts)
 
     def starts_under(self, whitened: np.ndarray, prior: NuisancePrior, factor: np.ndarray,
                      margin: float) -> 'Starts':
         """Find the most likely separate points for another covariance of the signals.
 
-        Parameters
-        ----------
-        whitened
-            Signals of one phase, complex128 [N_B, N_SB F].
-        factor
-            F of the inverse F F^H of the other covariance after this whitening, complex128
-            [N_B, N_SB F, N_SB F].
+        Takes the whitened signals of one phase, complex128 [N_B, N_SB F], and the factor F of the
+        inverse F F^H of the other covariance after this whitening, [N_B, N_SB F, N_SB F].
         """
         root = np.matmul(np.conj(np.swapaxes(self._whitener, 1, 2)), factor)
         signals = np.einsum('isr,is->ir', factor.conj(), whitened)
@@ -235,67 +204,64 @@ class TemplateTable:
             means = templates[grid.node] * turns[band].T[grid.cell]
             turned = means @ root[band].astype(np.complex64)
             energy += np.sum(turned.real**2 + turned.imag**2, axis=1)
-        return self._starts(weighted[None], np.array([np.sum(np.abs(signals)**2)]), prior, margin,
-                            energy, steps=False)
+        energies = np.array([np.sum(np.abs(signals)**2)])
+        return self._starts(self._query(weighted[None], energies, prior, margin, energy),
+                            steps=False)
 
-    def _starts(self, weighted: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
-                margin: float, template_energy: np.ndarray, steps: bool = True) -> 'Starts':
-        """Find points for N phases, [N, N_B, N_SB F], weighted with the inverse covariance."""
+    def _query(self, weighted: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
+               margin: float, template_energy: np.ndarray) -> '_Query':
+        """Filter signals [N, N_B, N_SB F], weighted with the inverse covariance."""
         n, n_bands = weighted.shape[:2]
         signals = weighted.reshape(n, n_bands, -1, self._filters.shape[3]).astype(np.complex64)
-        # By sub-band and template, complex64 [N, N_B, N_SB, G].
         outputs = np.ascontiguousarray(np.moveaxis(np.matmul(
             self._filters, np.moveaxis(signals, 0, 3)), 3, 0))
-        peaks = self._peaks(outputs, energies, prior, margin, template_energy)
+        return _Query(signals, outputs, energies, template_energy, prior, margin)
+
+    def _starts(self, query: '_Query', steps: bool = True) -> 'Starts':
+        """Find the starts of a query."""
+        prior, margin = query.prior, query.margin
+        peaks = self._peaks(query)
         points = self._points(peaks)
         values = np.zeros((len(points), len(prior)))
         if len(prior):
             values = prior.start(peaks.outputs.T, peaks.gain)
         value = peaks.value
         if steps and not prior.is_coarse:
-            step, value = self._step(outputs, signals, peaks, points, values, prior)
+            step, value = self._step(query, peaks, points, values)
             points = points + step
         error = _STEP_ERROR * self._loss[peaks.cell]
-        value = value - self._loss_outside(
-            peaks.phases, points, peaks.cell, value, margin + error)
+        value = value - self._loss_outside(peaks.phases, points, peaks.cell, value, margin + error)
         order = np.lexsort((-value, peaks.phases))
         order = order[np.isfinite(value[order])]
         firsts = first_of_each(peaks.phases[order])
-        slack = error[order] + np.repeat(
-            error[order[firsts]], np.diff(firsts, append=len(order)))
+        slack = error[order] + np.repeat(error[order[firsts]], np.diff(firsts, append=len(order)))
         order = order[heaviest(peaks.phases[order], value[order], margin + slack)]
         phases, points, values = peaks.phases[order], points[order], values[order]
         chosen = separate(phases, points, self._resolution.separation(prior.is_coarse),
                           self._curvature[peaks.cell[order]])
         return Starts(phases[chosen], points[chosen], values[chosen])
 
-    def _peaks(self, outputs: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
-               margin: float, template_energy: np.ndarray) -> '_Peaks':
+    def _peaks(self, query: '_Query') -> '_Peaks':
         """Find the probable peaks along the range for all phases."""
-        bound = self._bound(outputs, energies, prior, template_energy)
+        bound = self._bound(query)
         n, n_first = len(bound), min(_N_FIRST, bound.shape[1])
         first = np.sort(np.argpartition(bound, -n_first, axis=1)[:, -n_first:], axis=1)
         rows = np.repeat(np.arange(n), n_first)
-        peaks = self._peaks_of(rows, first.ravel(), outputs, energies, prior, template_energy)
+        peaks = self._peaks_of(rows, first.ravel(), query)
         best = np.full(n, -np.inf)
         np.maximum.at(best, peaks.phases, peaks.value)
-        limit = best - margin
+        limit = best - query.margin
         bound[rows, first.ravel()] = -np.inf
         rows, others = np.nonzero(bound + self._loss >= limit[:, None])
-        parts = [peaks]
         if len(rows):
-            parts.append(self._peaks_of(rows, others, outputs, energies, prior, template_energy))
-        peaks = _Peaks(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
-        likely = np.flatnonzero(
-            peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
+            peaks = concatenate(peaks, self._peaks_of(rows, others, query))
+        likely = np.flatnonzero(peaks.value + self._loss[peaks.cell] >= limit[peaks.phases])
         likely = likely[np.lexsort((-peaks.value[likely], peaks.phases[likely]))]
         phases = peaks.phases[likely]
         place = np.arange(len(likely)) - np.searchsorted(phases, phases)
-        likely = likely[place < _MAX_PEAKS]
-        peaks = _Peaks(*(field[likely] for field in peaks))
-        points = self._points(peaks)
-        chosen = separate(peaks.phases, points, self._resolution.separation(prior.is_coarse))
-        return _Peaks(*(field[chosen] for field in peaks))
+        peaks = peaks.select(likely[place < _MAX_PEAKS])
+        radii = self._resolution.separation(query.prior.is_coarse)
+        return peaks.select(separate(peaks.phases, self._points(peaks), radii))
 
     def _points(self, peaks: '_Peaks') -> np.ndarray:
         """Points (r [m], u, v) of peaks, float64 [P, 3]."""
@@ -303,10 +269,9 @@ class TemplateTable:
         points[:, 0] = peaks.range_m
         return points
 
-    def _bound(self, outputs: np.ndarray, energies: np.ndarray, prior: NuisancePrior,
-               template_energy: np.ndarray) -> np.ndarray:
+    def _bound(self, query: '_Query') -> np.ndarray:
         """Bound the log-likelihood in all cells: that of outputs in phase, float32 [N, C]."""
-        grid = self._grid
+        grid, outputs = self._grid, query.outputs
         amplitude = np.empty((len(outputs), len(grid.node)), np.float32)
         turns = np.swapaxes(self._cell_turns, 1, 2)
         for nodes, cells, pairs in grid.segments:
@@ -314,23 +279,17 @@ class TemplateTable:
             dense = ((grid.cell[pairs] - cells.start) * by_range.shape[2]
                      + grid.node[pairs] - nodes.start)
             amplitude[:, pairs] = by_range.reshape(len(outputs), -1)[:, dense]
-        if not prior.gain_std:
+        if not query.prior.gain_std:
             amplitude *= 2
-            amplitude -= template_energy
+            amplitude -= query.template_energy
             return amplitude
-        bounds = [self._over_gain(one, energy, prior)[0]
-                  for one, energy in zip(amplitude, energies.tolist(), strict=True)]
-        return np.stack(bounds) - template_energy
+        bounds = [query.over_gain(one, energy)[0]
+                  for one, energy in zip(amplitude, query.energies.tolist(), strict=True)]
+        return np.stack(bounds) - query.template_energy
 
-    def _over_gain(self, amplitude: np.ndarray, energy: float, prior: NuisancePrior
-                   ) -> tuple[np.ndarray, np.ndarray]:
-        return prior.over_gain(amplitude, energy, int(np.prod(self._whitener.shape[:2])))
-
-    def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, outputs: np.ndarray,
-                  energies: np.ndarray, prior: NuisancePrior, template_energy: np.ndarray
-                  ) -> '_Peaks':
+    def _peaks_of(self, phases: np.ndarray, cells: np.ndarray, query: '_Query') -> '_Peaks':
         """Find all peaks along the range in pairs [K] of the grid, for a phase each, ascending."""
-        grid = self._grid
+        grid, outputs, prior = self._grid, query.outputs, query.prior
         counts = self._n_windows[grid.cell[cells]]
         pair = np.repeat(np.arange(len(cells)), counts)
         place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -340,7 +299,7 @@ class TemplateTable:
         by_subband = outputs[phases, :, :, grid.node[cells]]
         of_band = np.einsum('wis,isw->iw', by_subband, self._window_turns[:, :, window])
         scale = self._cell_ranges(cells) / self._window_ranges_m[window]
-        energy = template_energy[cells] * (scale**2).astype(np.float32)
+        energy = query.template_energy[cells] * (scale**2).astype(np.float32)
         fine = np.ones_like(self._fine[:, :1]) if prior.is_coarse else self._fine
         if prior.phase_covariance.any():
             likelihood = 2 * prior.amplitude(fine[..., None] * of_band[:, None])
@@ -349,14 +308,18 @@ class TemplateTable:
         gain = np.zeros_like(likelihood) if prior.gain_std else None
         if gain is not None:
             ends = np.searchsorted(phases, np.arange(len(outputs) + 1))
-            for first, last, of_phase in zip(ends, ends[1:], energies.tolist(), strict=False):
+            for (first, last), of_phase in zip(
+                    itertools.pairwise(ends), query.energies.tolist(), strict=True):
                 if last > first:
                     part = np.s_[:, first:last]
-                    likelihood[part], gain[part] = self._over_gain(
-                        likelihood[part] / 2, of_phase, prior)
+                    likelihood[part], gain[part] = query.over_gain(likelihood[part] / 2, of_phase)
         likelihood -= energy
-        step, column = np.nonzero(np.ones_like(likelihood, bool) if prior.is_coarse
-                                  else _are_maxima(likelihood))
+        is_peak = np.full(likelihood.shape, prior.is_coarse)
+        if not prior.is_coarse:
+            # Local maxima along the range, but not at its ends.
+            np.greater_equal(likelihood[1:-1], likelihood[:-2], out=is_peak[1:-1])
+            is_peak[1:-1] &= likelihood[1:-1] > likelihood[2:]
+        step, column = np.nonzero(is_peak)
         value, range_m = likelihood[step, column], self._window_ranges_m[window[column]]
         if not prior.is_coarse:
             # The vertex of a parabola through a maximum and the steps beside it.
@@ -374,23 +337,19 @@ class TemplateTable:
             phases[column], cells[column], range_m, value,
             np.zeros(len(step)) if gain is None else gain[step, column], at_peak)
 
-    def _step(self, outputs: np.ndarray, signals: np.ndarray, peaks: '_Peaks',
-              points: np.ndarray, values: np.ndarray, prior: NuisancePrior
+    def _step(self, query: '_Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss-Newton steps from peaks, [P, 3], and the likelihood that they predict, [P].
-
-        Between grid points, a sharp mode is much higher.
-        """
-        grid, node = self._grid, self._grid.node[peaks.cell]
+        """Gauss-Newton steps from peaks, [P, 3], and the likelihood that they predict, [P]."""
+        grid, prior, node = self._grid, query.prior, self._grid.node[peaks.cell]
         pairs, index = np.unique(peaks.phases * len(grid.nodes) + node, return_inverse=True)
         phase, its_node = np.divmod(pairs, len(grid.nodes))
         # By band, sub-band, pair and coordinate.
         slopes = np.einsum('iskqf,kisf->kisq', self._slope_filters[:, :, its_node],
-                           signals[phase])[index]
+                           query.signals[phase])[index]
         node_m = grid.nodes[node, 0]
         ratio = node_m / points[:, 0]
         change = (node_m * (1 - ratio))[:, None, None] * slopes[..., 0]
-        value = outputs[peaks.phases, :, :, node] + change
+        value = query.outputs[peaks.phases, :, :, node] + change
         slopes[..., 0] *= (ratio**2)[:, None, None]
         turns = np.moveaxis(self._turns(points[:, 0]), 2, 0)
         if len(prior):
@@ -419,10 +378,7 @@ class TemplateTable:
 
     def _loss_outside(self, phases: np.ndarray, points: np.ndarray, cells: np.ndarray,
                       value: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Loss of log-likelihood from points to the region, [P]: 0 inside.
-
-        The loss is infinite for points that are too unlikely even without it.
-        """
+        """Loss of log-likelihood from points to the region, [P]; infinite for unlikely points."""
         inside = is_inside(to_positions(points), self._bounds)
         result = np.where(inside, 0.0, np.inf)
         best = np.full(phases.max(initial=0) + 1, -np.inf)
@@ -437,48 +393,39 @@ class TemplateTable:
 
 
 class Starts(NamedTuple):
-    """Points from which a search ascends to the modes of N phases.
+    """Points from which a search ascends to the modes of N phases, the most likely first."""
 
-    Attributes
-    ----------
-    phases
-        Phase of each point, int [M], ascending; those of a phase start with the most likely.
-    points
-        (r [m], u, v), float64 [M, 3].
-    values
-        Nuisance parameters, float64 [M, Q].
-    """
+    phases: np.ndarray  # Phase of each point, int [M], ascending.
+    points: np.ndarray  # (r [m], u, v), float64 [M, 3].
+    values: np.ndarray  # Nuisance parameters, float64 [M, Q].
 
-    phases: np.ndarray
-    points: np.ndarray
-    values: np.ndarray
+
+class _Query(NamedTuple):
+    """Signals of N phases, and the hypotheses with which the grid compares them."""
+
+    signals: np.ndarray  # Weighted with the inverse covariance, complex64 [N, N_B, N_SB, F].
+    outputs: np.ndarray  # Of the filters of all templates, complex64 [N, N_B, N_SB, G].
+    energies: np.ndarray  # Of the whitened signals, float64 [N].
+    template_energy: np.ndarray  # Of the whitened means, float32 [C].
+    prior: NuisancePrior
+    margin: float
+
+    def over_gain(self, amplitude: np.ndarray, energy: float) -> tuple[np.ndarray, np.ndarray]:
+        return self.prior.over_gain(amplitude, energy, self.signals[0].size)
 
 
 class _Peaks(NamedTuple):
-    """P peaks along the range.
+    """P peaks along the range."""
 
-    Attributes
-    ----------
-    phases
-        Phase of each, int [P].
-    cell
-        Index of the pair of the grid, int [P].
-    range_m
-        Float64 [P] [m].
-    value
-        Log-likelihood, float32 [P].
-    gain
-        Most likely gain [nepers], float64 [P].
-    outputs
-        Outputs of the bands' matched filters, complex64 [P, N_B].
-    """
+    phases: np.ndarray  # Phase of each, int [P].
+    cell: np.ndarray  # Index of the pair of the grid, int [P].
+    range_m: np.ndarray  # Float64 [P] [m].
+    value: np.ndarray  # Log-likelihood, float32 [P].
+    gain: np.ndarray  # Most likely gain [nepers], float64 [P].
+    outputs: np.ndarray  # Outputs of the bands' matched filters, complex64 [P, N_B].
 
-    phases: np.ndarray
-    cell: np.ndarray
-    range_m: np.ndarray
-    value: np.ndarray
-    gain: np.ndarray
-    outputs: np.ndarray
+    def select(self, chosen: np.ndarray) -> '_Peaks':
+        return _Peaks(*(field[chosen] for field in self))
 
 
 def first_of_each(phases: np.ndarray) -> np.ndarray:
@@ -491,14 +438,8 @@ def first_of_each(phases: np.ndarray) -> np.ndarray:
 def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) -> np.ndarray:
     """Return which points contain almost all of the weight of their phase, bool [M].
 
-    Parameters
-    ----------
-    phases
-        Phase of each point, int [M], ascending.
-    value
-        Log-likelihoods, float64 [M], descending for each phase.
-    margin
-        Negative logarithm of the share of the weight that may be left out, a number or [M].
+    Takes the phase of each point, int [M], ascending; log-likelihoods, float64 [M], descending for
+    each phase; and the negative logarithm of the share that may be left out, a number or [M].
     """
     firsts = first_of_each(phases)
     counts = np.diff(firsts, append=len(phases))
@@ -509,34 +450,13 @@ def heaviest(phases: np.ndarray, value: np.ndarray, margin: float | np.ndarray) 
     return relative + np.log(n_left) > np.repeat(np.log(total), counts) - margin
 
 
-def _are_maxima(values: np.ndarray) -> np.ndarray:
-    """Return which values [D, W] are local maxima along the first axis, but not at its ends."""
-    result = np.zeros(values.shape, bool)
-    np.greater_equal(values[1:-1], values[:-2], out=result[1:-1])
-    result[1:-1] &= values[1:-1] > values[2:]
-    return result
-
-
 def separate(phases: np.ndarray, points: np.ndarray, radii: np.ndarray,
              curvature: np.ndarray | None = None) -> np.ndarray:
     """Choose the points that are not in the mode of a better one: non-maximum suppression.
 
-    Parameters
-    ----------
-    phases
-        Phase of each point, int [M], ascending; those of a phase start with the best.
-    points
-        (r [m], u, v), float64 [M, 3].
-    radii
-        Radii of an ellipsoid around a mode that contains no other, float64 [3].
-    curvature
-        Curvature of the log-likelihood at the points, float64 [M, 3, 3], if broad modes shall
-        extend beyond the ellipsoid.
-
-    Returns
-    -------
-    numpy.ndarray
-        Bool [M].
+    Takes the phase of each point, int [M], ascending, of which the best comes first; and points
+    (r [m], u, v), float64 [M, 3]. The ellipsoid with the `radii` [3] around a mode contains no
+    other; with the curvature [M, 3, 3] of the log-likelihood, broad modes extend beyond it.
     """
     from scipy.spatial import cKDTree
 

@@ -1,17 +1,19 @@
-"""The lattice of directions and ranges on which signals from the region differ.
+"""The lengths over which signals from the region differ, and what follows from them.
 
-All its lengths follow from wavelength, aperture, bandwidth and region, so that the number of
-points is that of distinguishable positions.
+The lengths follow from wavelength, aperture, bandwidth and region. The grid of the search has as
+many points as there are distinguishable positions, and points that are closer share one evaluation
+of the model.
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
 from rhs_isac_ros.model.geometry import element_positions, subband_frequencies_hz
-from rhs_isac_ros.positioning.coordinates import to_positions
+from rhs_isac_ros.positioning.coordinates import jacobian, to_positions
 
 # Largest sine of the angle from boresight on the grid: directions have no derivative at the rim.
 _MAX_SINE = 0.995
@@ -26,7 +28,9 @@ _STEP_RAD = 0.5
 # correct the errors to first order.
 PHASE_ERROR = 0.2
 _AMPLITUDE_ERROR = 0.05
-# Radii of an ellipsoid around a mode that contains no other, in the same units.
+# Phase at the edge of the aperture over which points share an expansion [rad].
+_SHARED_RAD = 0.05
+# Radii of an ellipsoid around a mode that contains no other, in wavelengths and radians.
 _SEPARATION_WAVELENGTHS = 0.37
 _SEPARATION_RAD = 0.57
 # Steps and radii in range cells if the phases of the bands carry no information about the range.
@@ -44,34 +48,18 @@ _FLOOR = 0.01
 
 
 class Resolution(NamedTuple):
-    """Lengths over which signals from the region of interest change.
+    """Lengths over which signals from the region of interest change."""
 
-    Attributes
-    ----------
-    wavelength_m
-        Shortest wavelength of the bands' centres.
-    direction
-        Changes of (u, v) that turn the phase at the edge of the aperture by one radian, [2].
-    curvature_m
-        Phase [rad] at the vertex of the aperture per change of the inverse range.
-    delay_m
-        Change of the range that turns the phase at the edge of a band by one radian.
-    nearest_m, farthest_m
-        Extent of the region in range.
-    directions
-        Extent of the region in u and in v, float64 [2, 2].
-    bounds_m
-        Lower and upper vertex of the region, float64 [2, 3]. A flat region is a fraction of a
-        wavelength thick, so that samples of a posterior can be inside.
-    """
-
-    wavelength_m: float
+    wavelength_m: float  # Shortest wavelength of the bands' centres.
+    # Changes of (u, v) that turn the phase at the edge of the aperture by one radian, [2].
     direction: np.ndarray
-    curvature_m: float
-    delay_m: float
+    curvature_m: float  # Phase [rad] at the vertex of the aperture per change of 1 / r.
+    delay_m: float  # Change of the range that turns the phase at the edge of a band by 1 rad.
     nearest_m: float
     farthest_m: float
-    directions: np.ndarray
+    directions: np.ndarray  # Extent of the region in u and in v, float64 [2, 2].
+    # Lower and upper vertex of the region, float64 [2, 3]. A flat region is a fraction of a
+    # wavelength thick, so that samples of a posterior can be inside.
     bounds_m: np.ndarray
 
     @classmethod
@@ -80,8 +68,11 @@ class Resolution(NamedTuple):
         """Derive the lengths from a scenario."""
         elements = element_positions(scenario)
         wavenumber = subband_wavenumbers(scenario).max()
-        bounds = _thick_bounds(scenario)
-        low, high = bounds
+        wavelength_m = SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
+        thickness_m, center = _MIN_THICKNESS * wavelength_m, np.array(scenario.roi_center_m)
+        thick = np.stack([center - thickness_m / 2, center + thickness_m / 2])
+        low, high = bounds = np.where(
+            np.array(scenario.roi_size_m) < thickness_m, thick, scenario.roi_bounds_m)
         nearest, farthest = np.clip(0.0, low, high), np.maximum(np.abs(low), np.abs(high))
         directions = np.empty((2, 2))
         for axis, other in ((1, 2), (2, 1)):
@@ -91,7 +82,7 @@ class Resolution(NamedTuple):
                 high[axis] / np.hypot(high[axis], far if high[axis] < 0 else near)]
         farthest_m = float(np.linalg.norm(farthest))
         return cls(
-            SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz),
+            wavelength_m,
             1 / np.maximum(wavenumber * np.abs(elements[:, 1:]).max(axis=0), 1 / _MAX_DIRECTION),
             max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
             SPEED_OF_LIGHT_MPS / (np.pi * scenario.n_subbands * scenario.subband_width_hz),
@@ -108,10 +99,7 @@ class Resolution(NamedTuple):
         return min(2 * _AMPLITUDE_ERROR * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
-        """Longest steps in (r [m], u, v) for which the linear model of the mean holds, [3].
-
-        They are longer if the phases of the bands carry no information about the range.
-        """
+        """Longest steps in (r [m], u, v) for which the linear model of the mean holds, [3]."""
         return self._radii(is_coarse, _STEP_WAVELENGTHS, _STEP_RAD)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
@@ -119,6 +107,7 @@ class Resolution(NamedTuple):
         return self._radii(is_coarse, _SEPARATION_WAVELENGTHS, _SEPARATION_RAD)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
+        # Ranges are coarse if the phases of the bands carry no information about them.
         range_m = (_COARSE_CELLS * self.cell_width_m(self.nearest_m) if is_coarse
                    else wavelengths * self.wavelength_m)
         return np.array([range_m, *radians * self.direction])
@@ -137,40 +126,21 @@ class Resolution(NamedTuple):
         return _TOLERANCE_WAVELENGTHS * self.wavelength_m
 
 
-def _thick_bounds(scenario: Scenario) -> np.ndarray:
-    """Return the bounds of the region, at least a fraction of a wavelength apart, [2, 3]."""
-    thickness_m = _MIN_THICKNESS * SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz)
-    center = np.array(scenario.roi_center_m)
-    thick = np.stack([center - thickness_m / 2, center + thickness_m / 2])
-    return np.where(np.array(scenario.roi_size_m) < thickness_m, thick, scenario.roi_bounds_m)
-
-
 def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
     """Return the wavenumbers k_n of the sub-bands, float64 [N_B, N_SB] [1/m]."""
     return 2 * np.pi * subband_frequencies_hz(scenario) / SPEED_OF_LIGHT_MPS
 
 
 class Grid(NamedTuple):
-    """Templates and range cells that cover ranges and directions.
+    """Templates and range cells that cover ranges and directions."""
 
-    Attributes
-    ----------
-    nodes
-        Points (r [m], u, v) of the templates, float64 [G, 3].
-    ranges_m, widths_m
-        Centres and widths of the range cells, float64 [R].
-    node, cell
-        Template and range cell of each pair that belongs to the grid, int [C].
-    segments
-        Successive templates, range cells and pairs of one range of templates: a segment's pairs
-        are some of all pairs of its range cells and templates.
-    """
-
-    nodes: np.ndarray
-    ranges_m: np.ndarray
+    nodes: np.ndarray  # Points (r [m], u, v) of the templates, float64 [G, 3].
+    ranges_m: np.ndarray  # Centres of the range cells, float64 [R].
     widths_m: np.ndarray
-    node: np.ndarray
-    cell: np.ndarray
+    node: np.ndarray  # Template of each pair that belongs to the grid, int [C].
+    cell: np.ndarray  # Its range cell.
+    # Successive templates, range cells and pairs of one range of templates: a segment's pairs are
+    # some of all pairs of its range cells and templates.
     segments: list[tuple[slice, slice, slice]]
 
     @property
@@ -193,18 +163,17 @@ def lay_grid(scenario: Scenario) -> Grid:
     ranges_m, widths_m = (edges_m[1:] + edges_m[:-1]) / 2, np.diff(edges_m)
     steps = 2 * PHASE_ERROR * resolution.direction
     low, high = resolution.bounds_m
-    lines = []
-    for axis in range(2):
-        limit = resolution.directions[axis]
-        lines.append(np.arange(np.floor(limit[0] / steps[axis]),
-                               np.ceil(limit[1] / steps[axis]) + 1) * steps[axis])
+    lines = [np.arange(np.floor(first / step), np.ceil(last / step) + 1) * step
+             for (first, last), step in zip(resolution.directions, steps, strict=True)]
     directions = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
     # Directions slightly beyond the rim of the half space are moved onto it.
     excess = np.maximum(np.hypot(*directions.T) / _MAX_SINE, 1.0)
     directions = (directions / excess[:, None])[excess < 1 + 2 * steps.max()]
     halves = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing='ij'), axis=-1).reshape(-1, 3)
     nodes, node, cell, segments, n_nodes, n_pairs = [], [], [], [], 0, 0
-    for first, last in _shared_ranges(edges_m, 2 * PHASE_ERROR / resolution.curvature_m):
+    inverse_step = 2 * PHASE_ERROR / resolution.curvature_m
+    for first, last in groups(len(ranges_m), lambda first, end: bool(
+            1 / edges_m[first] - 1 / edges_m[end] <= inverse_step)):
         inside = []
         for index in range(first, last):
             centres = np.insert(directions, 0, ranges_m[index], axis=1)
@@ -226,11 +195,84 @@ def lay_grid(scenario: Scenario) -> Grid:
                 np.concatenate(cell), segments)
 
 
-def _shared_ranges(edges_m: np.ndarray, inverse_step: float) -> list[tuple[int, int]]:
-    """Group successive cells whose inverse ranges differ by at most a step."""
-    groups, first = [], 0
-    for last in range(1, len(edges_m)):
-        if last + 1 == len(edges_m) or 1 / edges_m[first] - 1 / edges_m[last + 1] > inverse_step:
-            groups.append((first, last))
-            first = last
-    return groups
+def groups(n: int, fits: Callable[[int, int], bool]) -> list[tuple[int, int]]:
+    """Divide n successive items into groups, from `first` to before `end`, as long as they fit."""
+    result, first = [], 0
+    for end in range(1, n + 1):
+        if end == n or not fits(first, end + 1):
+            result.append((first, end))
+            first = end
+    return result
+
+
+class Expansion(NamedTuple):
+    """Mean signals around n points, to first order apart from distance and carriers.
+
+    The factor exp(-i k_n r) / r of a sub-band's mean is exact. The rest changes with the
+    direction, as the aperture resolves it, and with the curvature of the wavefront, 1 / r.
+    """
+
+    points: np.ndarray  # (r [m], u, v), float64 [n, 3].
+    wavenumbers: np.ndarray  # Of the carrier of each measurement, float64 [N_B, N_SB F] [1/m].
+    mean: np.ndarray  # Mean signals over the factor, complex128 [n, N_B, N_SB F].
+    slopes: np.ndarray  # Their derivatives, complex128 [n, 3, N_B, N_SB F].
+
+    @classmethod
+    def of(cls, model: MeasurementModel, points: np.ndarray) -> 'Expansion':
+        """Evaluate a model at points."""
+        wavenumbers = subband_wavenumbers(model.scenario)
+        wavenumbers = np.repeat(wavenumbers, model.shape[1] // wavenumbers.shape[1], axis=1)
+        mean, slopes = model.mean_and_jacobian(to_positions(points), jacobian(points))
+        range_m = points[:, :1, None]
+        factor = range_m * np.exp(1j * wavenumbers * range_m)
+        mean, slopes = mean * factor, slopes * factor[:, None]
+        slopes[:, 0] += (1j * wavenumbers + 1 / range_m) * mean
+        return cls(points, wavenumbers, mean, slopes)
+
+    def at(self, index: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate points [M, 3], each near the point of the expansion with an index, int [M].
+
+        Returns means, complex128 [M, N_B, N_SB F], and derivatives, [M, 3, N_B, N_SB F].
+        """
+        offset, range_m = points - self.points[index], points[:, :1, None]
+        ratio = self.points[index, 0] / points[:, 0]
+        offset[:, 0] *= ratio
+        slopes = self.slopes[index]
+        mean = self.mean[index] + np.matmul(
+            offset[:, None], slopes.reshape(len(index), 3, -1)).reshape(-1, *self.mean.shape[1:])
+        factor = np.exp(-1j * self.wavenumbers * range_m) / range_m
+        mean *= factor
+        slopes *= factor[:, None]
+        slopes[:, 0] *= ratio[:, None, None]**2
+        slopes[:, 0] -= (1j * self.wavenumbers + 1 / range_m) * mean
+        return mean, slopes
+
+
+def whiten(model: MeasurementModel, mean: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Whiten the results of `Expansion.at`, complex128 [M, 4, N_B, N_SB F]."""
+    n_bands, n_rows = model.shape
+    columns = np.moveaxis(np.concatenate([mean[:, None], slopes], axis=1), 2, 0)
+    white = np.matmul(columns.reshape(n_bands, -1, n_rows), np.swapaxes(model.whitener, 1, 2))
+    return np.moveaxis(white.reshape(n_bands, len(mean), 4, n_rows), 0, 2)
+
+
+class Means:
+    """Mean signals and their derivatives; neighbouring points share one expansion.
+
+    Modes of the posterior stand in rows along the range, in nearly the same direction.
+    """
+
+    def __init__(self, model: MeasurementModel) -> None:
+        self._model, resolution = model, Resolution.of(model.scenario)
+        self._per_cell = np.array(
+            [resolution.curvature_m, *1 / resolution.direction]) / _SHARED_RAD
+
+    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate points (r [m], u, v), [M, 3], as `Expansion.at` does."""
+        cells = points * self._per_cell
+        cells[:, 0] = self._per_cell[0] / points[:, 0]
+        keys = np.rint(cells).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
+        _, first, index = np.unique(keys, return_index=True, return_inverse=True)
+        if len(first) == len(points):
+            return self._model.mean_and_jacobian(to_positions(points), jacobian(points))
+        return Expansion.of(self._model, points[first]).at(index, points)

@@ -11,7 +11,6 @@ and tracks use only `Conditional`, whatever the impairments are.
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -20,12 +19,10 @@ from rhs_isac_ros.bounds.fisher import quadratic_form
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.gaussian import eliminate, marginalise
-from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, nuisance_of
 from rhs_isac_ros.model.measurement import Surface
 from rhs_isac_ros.positioning.coordinates import to_positions
-from rhs_isac_ros.positioning.expansion import Means
-from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.positioning.lattice import Means, Resolution, whiten
 
 # Standard deviation of a Gaussian whose density at its centre is that of a uniform phase.
 _UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
@@ -69,22 +66,14 @@ class Signals(NamedTuple):
 class Local(NamedTuple):
     """The log-likelihood of M points (r [m], u, v) with nuisance parameters, and its derivatives.
 
-    Attributes
-    ----------
-    value
-        Logarithm of likelihood and prior of the parameters, float64 [M].
-    gradient, information
-        Float64 [M, 3 + Q] and [M, 3 + Q, 3 + Q]. The information is the expected one. Observed
-        curvatures of range and phase differ by noise, and would spoil the marginal, in which the
-        two nearly cancel.
-    residual
-        Energy of the whitened residual, float64 [M].
+    The information is the expected one. Observed curvatures of range and phase differ by noise,
+    and would spoil the marginal, in which the two nearly cancel.
     """
 
-    value: np.ndarray
-    gradient: np.ndarray
-    information: np.ndarray
-    residual: np.ndarray
+    value: np.ndarray  # Logarithm of likelihood and prior of the parameters, float64 [M].
+    gradient: np.ndarray  # Float64 [M, 3 + Q].
+    information: np.ndarray  # Float64 [M, 3 + Q, 3 + Q].
+    residual: np.ndarray  # Energy of the whitened residual, float64 [M].
 
 
 class Conditional(Protocol):
@@ -101,39 +90,20 @@ class NuisancePrior:
     A uniform phase has no prior, and the unit `_UNIFORM_EQUIVALENT`. If the phases of the bands
     are nearly independent, each band has a uniform phase instead of all parameters that turn whole
     bands; the range then follows from delays, amplitudes and wavefronts only.
-
-    Attributes
-    ----------
-    patterns
-        Exponents of the signals per unit, complex128 [Q, N_B, N_SB F].
-    precision
-        Of the prior, 1 or 0, float64 [Q].
-    phases
-        Phase of each band per unit [rad], float64 [N_B, Q].
-    gain
-        Gain of all signals per unit [nepers], float64 [Q].
-    volume
-        Change of the logarithm of the signals' volume per unit, float64 [Q].
-    information
-        Fisher information from the covariance of the signals, see `information_of`.
-    is_coarse
-        Whether every band has a uniform phase.
-    floor
-        Curvature of the log-likelihood in (r, u, v) that is added everywhere, float64 [3].
-    phase_covariance
-        Covariance of the phases of the bands that the scenario declares, float64 [N_B, N_B].
     """
 
     def __init__(self, model: MeasurementModel) -> None:
         nuisance = nuisance_of(model.scenario)
         n_bands, n_rows = model.shape
         patterns, phases = nuisance.scaled_patterns, nuisance.phases
+        # Covariance of the phases of the bands that the scenario declares, float64 [N_B, N_B].
         self.phase_covariance = phases @ phases.T
         centre = np.eye(n_bands) - (1 / n_bands if n_bands > 1 else 0.0)
         relative = np.linalg.eigvalsh(centre @ self.phase_covariance @ centre)[-1]
         # A phase that all bands share leaves rounding errors.
         is_shared = relative <= 1e-9 * np.trace(self.phase_covariance)
         self.relative_phase_std_rad = 0.0 if is_shared else float(np.sqrt(relative))
+        # Whether every band has a uniform phase.
         self.is_coarse = self.relative_phase_std_rad >= COARSE_STD_RAD
         keeps = np.ones(len(nuisance), bool)
         if self.is_coarse:
@@ -145,42 +115,38 @@ class NuisancePrior:
         largest = np.abs(phases).max(axis=0, initial=0.0)
         uniform = largest > UNIFORM_STD_RAD
         scale = np.where(uniform, _UNIFORM_EQUIVALENT / np.where(uniform, largest, 1.0), 1.0)
+        # Per unit: exponents of the signals, complex128 [Q, N_B, N_SB F]; phase of each band
+        # [rad], float64 [N_B, Q]; precision of the prior; gain of all signals [nepers]; and change
+        # of the logarithm of the signals' volume, float64 [Q].
         self.patterns, self.phases = patterns * scale[:, None, None], phases * scale
         self.precision = np.where(uniform, 0.0, 1.0)
         self.gain = self.patterns.real.mean(axis=(1, 2))
+        # Standard deviations of the gain of all signals [nepers], 0 if it is negligible, and of
+        # the phase of each band, infinite if it is uniform, float64 [N_B].
+        gain_std = np.linalg.norm(self.gain)
+        phase_std = np.sqrt(np.diagonal(self.phase_covariance))
+        self.gain_std = float(gain_std) if gain_std > _MIN_GAIN_STD else 0.0
+        self.phase_std_rad = np.where(
+            self.is_coarse | (phase_std > UNIFORM_STD_RAD), np.inf, phase_std)
         self.volume = 2 * self.patterns.real.sum(axis=(1, 2))
         self.needs_search = np.append(nuisance.needs_search[keeps], np.zeros(n_added, bool))
         self.moves_multipath = np.append(nuisance.moves_multipath[keeps], np.zeros(n_added, bool))
         self._operators = self._multiplying(model.root, model.whitener)
         self.information = self.information_of(model.root, model.whitener)
+        # Curvature of the log-likelihood in (r, u, v) that is added everywhere, float64 [3].
         self.floor = Resolution.of(model.scenario).curvature_floor
 
     def __len__(self) -> int:
         """Return the number Q of parameters."""
         return len(self.patterns)
 
-    @functools.cached_property
-    def gain_std(self) -> float:
-        """Standard deviation of the gain of all signals [nepers]; 0 if it is negligible."""
-        std = float(np.linalg.norm(self.gain))
-        return std if std > _MIN_GAIN_STD else 0.0
-
-    @functools.cached_property
-    def phase_std_rad(self) -> np.ndarray:
-        """Standard deviation of the phase of each band, infinite if uniform, float64 [N_B]."""
-        std = np.sqrt(np.diagonal(self.phase_covariance))
-        return np.where(self.is_coarse | (std > UNIFORM_STD_RAD), np.inf, std)
-
     def divide(self, received: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Remove the factors of parameters [..., Q] from signals [..., N_B, N_SB F]."""
         return received * np.exp(-np.tensordot(values, self.patterns, axes=1))
 
     def information_of(self, root: np.ndarray, whitener: np.ndarray) -> np.ndarray:
-        """Compute the Fisher information from a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q].
-
-        The multipath reveals gains and offsets of carrier and timing, but no phase. Takes Cholesky
-        factors and their inverses, complex128 [N_B, N_SB F, N_SB F].
-        """
+        """Compute the Fisher information of a covariance, tr(L^-1 dL L^-1 dL'), float64 [Q, Q]."""
+        # The multipath reveals gains and offsets of carrier and timing, but no phase.
         operators = self._multiplying(root, whitener)
         both = operators + np.conj(np.swapaxes(operators, 2, 3))
         return np.einsum('aimn,binm->ab', both, both, optimize=True).real
@@ -189,15 +155,21 @@ class NuisancePrior:
         """Compute W P W^-1, which multiplies whitened signals, [Q, N_B, N_SB F, N_SB F]."""
         return np.matmul(whitener * self.patterns[:, :, None], root)
 
-    def sources(self, mean: np.ndarray, divided: np.ndarray) -> np.ndarray:
-        """Choose the signals whose derivatives contain the information about the parameters.
+    def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
+                slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:
+        """Return the residual and its derivatives at M points, complex128 [M, C, N_B, N_SB F].
 
-        Takes mean signals and received ones without factors, [M, N_B, N_SB F] before or after
-        whitening; returns [M, Q, N_B, N_SB F]. A parameter that moves the multipath is visible in
-        the multipath that was received; the information about it varies from phase to phase.
+        After the residual, the columns are the derivatives of the mean with respect to the point,
+        of the signals that contain the information about the parameters, of the mean with respect
+        to further `linear` parameters, and of the received signals with respect to the parameters.
         """
-        return np.where(
-            self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
+        divided = self.divide(received, values)
+        # A parameter that moves the multipath is visible in the multipath that was received; the
+        # information about it varies from phase to phase.
+        sources = np.where(self.moves_multipath[:, None, None], divided[:, None], mean[:, None])
+        return np.concatenate([
+            (divided - mean)[:, None], slopes, self.patterns * sources, *linear,
+            self.patterns * divided[:, None]], axis=1)
 
     def slopes(self, whitened: np.ndarray) -> np.ndarray:
         """Compute W P W^-1 times whitened signals [M, N_B, N_SB F], [M, Q, N_B N_SB F]."""
@@ -213,19 +185,13 @@ class NuisancePrior:
         return -(values**2 @ self.precision / 2 + values @ self.volume)
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> float:
-        """Integrate over the parameters that move the multipath by Laplace's method.
-
-        Takes the values [Q] that the signals alone reveal, relative to which the result is.
-        """
+        """Integrate over the parameters that move the multipath, relative to the aligned [Q]."""
         (moves,) = np.nonzero(self.moves_multipath)
         curvature = self.information[np.ix_(moves, moves)] + np.diag(self.precision[moves])
         return float(-self.precision @ aligned**2 - np.linalg.slogdet(curvature)[1]) / 2
 
     def amplitude(self, outputs: np.ndarray) -> np.ndarray:
-        """Sum the outputs of the bands' matched filters in their most likely phases.
-
-        Takes complex [N_B, ...]. Each rotation costs half of its improbability.
-        """
+        """Sum the outputs of the bands' matched filters, [N_B, ...], in their likely phases."""
         if not self.relative_phase_std_rad:
             return _in_phase(outputs.sum(axis=0), float(self.phase_std_rad[0]))
         parts = [_in_phase(output, float(std))
@@ -263,30 +229,9 @@ class NuisancePrior:
         values += np.outer(gain, self.gain) / max(self.gain_std, _MIN_GAIN_STD)**2
         return values
 
-    def with_phases(self, values: np.ndarray, outputs: np.ndarray) -> np.ndarray:
-        """Turn every band by the angle of its filter's output [M, N_B], if phases are uniform."""
-        change = np.zeros_like(values)
-        change[:, -outputs.shape[1]:] = np.angle(outputs) / _UNIFORM_EQUIVALENT
-        return values + change
-
 
 class Likelihood:
-    """The likelihood with one covariance everywhere: the average over region and surfaces.
-
-    Attributes
-    ----------
-    model
-        Mean and covariance of the signals.
-    nuisance
-        Prior of the nuisance parameters.
-    resolution
-        Lengths over which the signals change.
-
-    Raises
-    ------
-    CodebookError
-        If the codebook does not fit the scenario.
-    """
+    """The likelihood with one covariance everywhere: the average over region and surfaces."""
 
     def __init__(self, scenario: Scenario, codebook: Codebook,
                  surface: Surface | None = None) -> None:
@@ -296,6 +241,7 @@ class Likelihood:
         self.model = MeasurementModel(scenario, codebook, surface).prepare(jacobian=True)
         self.nuisance = NuisancePrior(self.model)
         self.resolution, self._means = Resolution.of(scenario), Means(self.model)
+        self.log_volume = float(log_determinant(self.model.root).sum())
 
     def signals(self, received: np.ndarray) -> Signals:
         """Whiten signals [N, N_B, N_SB F]."""
@@ -309,84 +255,65 @@ class Likelihood:
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
-        n = len(points)
-        means, slopes = self._means(points)
-        columns = np.moveaxis(np.concatenate([means[:, None], slopes], axis=1), 2, 0)
-        shape = self.model.shape
-        white = np.matmul(columns.reshape(shape[0], -1, shape[1]),
-                          np.swapaxes(self.model.whitener, 1, 2))
-        white = np.moveaxis(white.reshape(shape[0], n, 4, shape[1]), 0, 2)
-        mean, derivative = white[:, 0], white[:, 1:].reshape(n, 3, -1)
-        whitened = self.whitened(values, signals)
-        residual = (whitened - mean).reshape(n, -1)
+        n, white = len(points), whiten(self.model, *self._means(points))
+        mean, whitened = white[:, 0], self.whitened(values, signals)
+        residual, derivative = (whitened - mean).reshape(n, -1), white[:, 1:].reshape(n, 3, -1)
         if len(self.nuisance):
             observed = self.nuisance.slopes(whitened)
             moves = self.nuisance.moves_multipath[:, None]
             expected = np.where(moves, observed, self.nuisance.slopes(mean))
-            return assemble(self.nuisance, values, residual,
-                            np.concatenate([derivative, expected], axis=1), observed)
-        # Re(a^H b) is the inner product of real and imaginary parts.
+            return assemble(self.nuisance, values, np.concatenate(
+                [residual[:, None], derivative, expected, observed], axis=1))
+        # The same as `assemble`, without the copies that take time.
         parts = residual.view(float)
-        information = quadratic_form(derivative) + np.diag(self.nuisance.floor)
         gradient = 2 * np.matmul(derivative.view(float), parts[..., None])[..., 0]
         energy = np.sum(parts**2, axis=1)
+        information = quadratic_form(derivative) + np.diag(self.nuisance.floor)
         return Local(-energy, gradient, information, energy)
 
     def settle(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
-        """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones.
-
-        Steps of the range turn the phases many times. Other parameters remain as they are.
-        """
+        """Replace uniform phases of all bands, in parameters [M, Q], by the most likely ones."""
+        # Steps of the range turn the phases many times.
         if not self.nuisance.is_coarse:
             return values
-        return self.nuisance.with_phases(values, self.outputs(points, values, signals))
+        outputs, change = self.outputs(points, values, signals), np.zeros_like(values)
+        change[:, -outputs.shape[1]:] = np.angle(outputs) / _UNIFORM_EQUIVALENT
+        return values + change
 
     def outputs(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> np.ndarray:
         """Compute the outputs of the bands' matched filters, complex128 [M, N_B]."""
         mean = self.model.whiten(self.model.mean(to_positions(points)))
         return np.sum(mean.conj() * self.whitened(values, signals), axis=2)
 
-    @functools.cached_property
-    def log_volume(self) -> float:
-        """Logarithm of the determinants of the covariance."""
-        return float(log_determinant(self.model.root).sum())
 
-
-def assemble(prior: NuisancePrior, values: np.ndarray, residual: np.ndarray,
-             expected: np.ndarray, observed: np.ndarray | None = None, *,
+def assemble(prior: NuisancePrior, values: np.ndarray, white: np.ndarray, *,
              information_of_covariance: np.ndarray | None = None, n_linear: int = 0) -> Local:
-    """Combine whitened columns to the likelihood and its derivatives.
+    """Combine whitened columns to the likelihood and its derivatives at parameters [M, Q].
 
     Parameters
     ----------
-    values
-        Parameters, float64 [M, Q].
-    residual
-        Signals without factors less their mean, complex128 [M, n].
-    expected
-        Derivatives of the mean with respect to the point, and of `sources` with respect to their
-        factors, complex128 [M, 3 + Q, n].
-    observed
-        Derivatives of the signals times their factors, [M, Q, n]; by default those of the mean,
-        with which the gradient predicts no more than the whole energy.
+    white
+        The columns of `NuisancePrior.columns`, complex128 [M, C, n]. The last Q may be absent:
+        with the derivatives of the mean, the gradient predicts no more than the whole energy.
     information_of_covariance
-        Of the parameters, float64 [Q, Q]; by default that of the average covariance.
+        Of the parameters, float64 [Q, Q]; by default from the average covariance.
     n_linear
-        Number of further standard normal parameters in which the mean is linear, and whose
-        derivatives follow in `expected`. They are integrated out.
+        Number of further standard normal parameters in which the mean is linear. They are
+        integrated out.
     """
-    n = 3 + len(prior)
-    parts = np.ascontiguousarray(residual).view(float)
+    n, end = 3 + len(prior), 4 + len(prior) + n_linear
+    expected, observed = white[:, 1:end], white[:, end:]
+    # Re(a^H b) is the inner product of real and imaginary parts.
+    parts = np.ascontiguousarray(white[:, 0]).view(float)
     information = quadratic_form(expected)
     information += np.diag(np.concatenate([prior.floor, prior.precision, np.ones(n_linear)]))
     # The derivatives of parameters that move the multipath include it.
     still = ~prior.moves_multipath
     information[:, 3:n, 3:n] += np.outer(still, still) * (
         prior.information if information_of_covariance is None else information_of_covariance)
-    if observed is not None:
+    if observed.shape[1]:
         expected = np.concatenate([expected[:, :3], observed, expected[:, n:]], axis=1)
-    gradient = 2 * np.matmul(
-        np.ascontiguousarray(expected).view(float), parts[..., None])[..., 0]
+    gradient = 2 * np.matmul(np.ascontiguousarray(expected).view(float), parts[..., None])[..., 0]
     gradient[:, 3:n] -= prior.precision * values + prior.volume
     energy = np.sum(parts**2, axis=1)
     value = prior.log_prior(values) - energy
@@ -425,8 +352,7 @@ class DispersedLikelihood:
         self._offsets = log_weights + likelihood.log_volume
         self._latest: tuple[np.ndarray, list[np.ndarray]] | None = None
         average, least = self._average.covariance(), self._intact.covariance()
-        roots = np.linalg.cholesky(
-            least + self._scales[:, None, None, None] * (average - least))
+        roots = np.linalg.cholesky(least + self._scales[:, None, None, None] * (average - least))
         self._information = [likelihood.nuisance.information_of(*both)
                              for both in zip(roots, np.linalg.inv(roots), strict=True)]
 
@@ -446,20 +372,13 @@ class DispersedLikelihood:
 
     def local(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> Local:
         """Evaluate points, as `Conditional` describes."""
-        prior, n = self._base.nuisance, len(points)
-        mean, slopes = self._means(points)
-        divided = prior.divide(signals.received, values)
-        columns = np.concatenate([
-            (divided - mean)[:, None], slopes, prior.patterns * prior.sources(mean, divided),
-            prior.patterns * divided[:, None]], axis=1)
-        states, n_expected = [], 4 + len(prior)
+        prior, states = self._base.nuisance, []
+        columns = prior.columns(values, signals.received, *self._means(points))
         for roots, offset, information in zip(
                 self._roots_at(points), self._offsets, self._information, strict=True):
             white = np.linalg.solve(roots, np.moveaxis(columns, 1, 3))
-            white = np.moveaxis(white, 3, 1).reshape(n, columns.shape[1], -1)
-            local = assemble(
-                prior, values, white[:, 0], white[:, 1:n_expected], white[:, n_expected:],
-                information_of_covariance=information)
+            white = np.moveaxis(white, 3, 1).reshape(*columns.shape[:2], -1)
+            local = assemble(prior, values, white, information_of_covariance=information)
             volume = log_determinant(roots).sum(axis=1)
             states.append(local._replace(value=local.value + offset - volume))
         return _average_of(states)
@@ -518,8 +437,7 @@ def _in_phase(outputs: np.ndarray, std: float) -> np.ndarray:
         return magnitude
     angle = np.angle(outputs)
     phase = angle * magnitude / (magnitude + 1 / (2 * std**2))
-    magnitude = magnitude * np.cos(angle - phase) - phase**2 / (4 * std**2)
-    return magnitude
+    return magnitude * np.cos(angle - phase) - phase**2 / (4 * std**2)
 
 
 class Alignment:
@@ -527,11 +445,10 @@ class Alignment:
 
     Offsets of carrier and timing move the signals out of the nulls of the multipath, so that they
     must be known before the search. Whatever the position, it contributes the covariance of the
-    mean signals over the region.
+    mean signals over the region, the `spread` of `tabulate`.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
-        """Take the `spread` of `tabulate`."""
         self._model, self._prior = likelihood.model, likelihood.nuisance
         self._whitener = np.linalg.inv(np.linalg.cholesky(spread + np.eye(spread.shape[1])))
 
@@ -562,6 +479,7 @@ class Alignment:
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
+        """Compare values of the parameters whose likelihood has several maxima."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
         n_grid = _N_GRID.get(len(searched), 5)

@@ -1,25 +1,138 @@
-"""The paper's estimator: a network with one hidden layer, trained on simulated pairs."""
+"""The paper's estimator: a network with one hidden layer, its file, its use and its training.
 
-from collections.abc import Iterator
+The "256 nodes" that the paper mentions in its description of Fig. 4 are read as the units of the
+hidden layer. The paper does not specify the rest. This implementation uses the real and imaginary
+parts of the signals or their magnitudes as inputs, the ReLU activation, the squared position error
+as the loss, and Adam with a learning rate of 10^-3. The 10^5 simulated pairs are split
+7 : 1.5 : 1.5 for training, validation and test. When the validation error has not decreased for
+some epochs, the batch size grows, which reduces the noise of the steps. Training stops after the
+largest batches, and the weights of the best epoch are used.
+"""
+
+import copy
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros import __version__
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
-from rhs_isac_ros.positioning.fit import FitTest
-from rhs_isac_ros.positioning.network import ModelError, Network
+from rhs_isac_ros.positioning.simulate import simulate_pairs
+from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.files import ArchiveError, read_archive, write_archive
+from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.support.threads import one_blas_thread
+
+DEFAULT_PAIRS = 100_000
+DEFAULT_HIDDEN = 256
+DEFAULT_EPOCHS = 150
+_BATCH_SIZES = (128, 1024, 8192)
+_LEARNING_RATE = 1e-3
+# Epochs without improvement before the batch size grows.
+_PATIENCE_EPOCHS = 4
+# Per cent of the pairs that precede the validation, and the test.
+_VALIDATION_PERCENT, _TEST_PERCENT = 70, 85
+_FORMAT = 1
+# Arrays of a network with D inputs and H hidden units.
+_SHAPES = {'input_mean': 'D', 'input_scale': 'D', 'w_in': 'DH', 'b_in': 'H', 'w_out': 'H3',
+           'b_out': '3', 'center': '3', 'covariance': '33', 'max_energy': ''}
+# Their keys in the file.
+_KEYS = {name: 'loudest' if name == 'max_energy' else name for name in _SHAPES}
+
+
+def stack_parts(signals: np.ndarray) -> np.ndarray:
+    """Flatten complex signals to float64 [N, 2 N_B N_SB F], all real parts first."""
+    flat = signals.reshape(len(signals), -1)
+    return np.hstack([flat.real, flat.imag])
+
+
+def magnitudes(signals: np.ndarray) -> np.ndarray:
+    """Flatten complex signals [N, N_B, N_SB F] to their magnitudes, float64 [N, N_B N_SB F]."""
+    return np.abs(signals.reshape(len(signals), -1))
+
+
+# Inputs of a network as functions of the received signals. The paper does not specify them.
+INPUTS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
+    'parts': stack_parts, 'magnitudes': magnitudes}
+
+
+class ModelError(ValueError):
+    """A trained model cannot be read, or belongs to another codebook or scenario."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Network:
+    """A trained network, with the arguments and results of its training.
+
+    The input x consists of the real and imaginary parts of the received signals,
+    D = 2 N_B N_SB F, or of their magnitudes, D = N_B N_SB F, each scaled to zero mean and unit
+    variance. The position is p = center + w_out^T max(0, w_in^T x + b_in) + b_out, in metres.
+    """
+
+    input_mean: np.ndarray  #: Of the inputs in training, float64 [D].
+    input_scale: np.ndarray  #: Their standard deviation.
+    w_in: np.ndarray  #: Weights of the hidden layer, float64 [D, H].
+    b_in: np.ndarray  #: [H].
+    w_out: np.ndarray  #: Weights of the output, float64 [H, 3] [m].
+    b_out: np.ndarray  #: [3] [m].
+    center: np.ndarray  #: Of the region of interest, float64 [3] [m].
+    covariance: np.ndarray  #: Second moments of the validation residuals, float64 [3, 3] [m^2].
+    max_energy: float  #: Largest energy of the whitened mean signal at a training position.
+    #: ``codebook``, the id of the codebook; ``scenario``, the fields that differ from Table I;
+    #: ``seed``, ``pairs``, ``epochs``, ``version``; ``validation_mse_m2`` and ``test_mse_m2``.
+    about: dict[str, Any]
+    inputs: str = 'parts'  #: One of `INPUTS`.
+
+    def __post_init__(self) -> None:
+        """Check that sizes agree and numbers are finite."""
+        if self.inputs not in INPUTS:
+            raise ModelError(f'inputs: {self.inputs!r}, expected one of {sorted(INPUTS)}')
+        n_inputs, n_hidden = np.shape(self.w_in) if np.ndim(self.w_in) == 2 else (0, 0)
+        sizes = {'D': n_inputs, 'H': n_hidden, '3': 3}
+        for name, letters in _SHAPES.items():
+            value, shape = getattr(self, name), tuple(sizes[letter] for letter in letters)
+            if np.shape(value) != shape:
+                raise ModelError(f'{name}: shape {np.shape(value)}, expected {shape}')
+            if not np.isfinite(value).all():
+                raise ModelError(f'{name}: not finite, expected finite numbers')
+
+    def positions(self, received: np.ndarray) -> np.ndarray:
+        """Map received signals, complex128 [N, N_B, N_SB F], to positions, float64 [N, 3] [m]."""
+        inputs = (INPUTS[self.inputs](received) - self.input_mean) / self.input_scale
+        hidden = np.maximum(inputs @ self.w_in + self.b_in, 0.0)
+        return hidden @ self.w_out + self.b_out + self.center
+
+    def save(self, path: str | Path) -> None:
+        """Write an ``.npz`` file; an existing one is kept if there is an `OSError`."""
+        write_archive(path, {key: getattr(self, name) for name, key in _KEYS.items()},
+                      {'format': _FORMAT, 'inputs': self.inputs, **self.about})
+
+    @classmethod
+    def load(cls, path: str | Path) -> 'Network':
+        """Read a model from a file, or raise `ModelError`."""
+        try:
+            arrays, about = read_archive(path, 'model', _FORMAT, set(_KEYS.values()))
+        except ArchiveError as error:
+            raise ModelError(str(error)) from error
+        inputs = str(about.pop('inputs', 'parts'))
+        try:
+            fields: dict[str, Any] = {
+                name: arrays[key].astype(float) for name, key in _KEYS.items()}
+            return cls(**fields, about=about, inputs=inputs)
+        except ValueError as error:
+            raise ModelError(f'{path}: {error}') from None
 
 
 class NeuralEstimator:
-    """Positions by a trained network.
+    """Positions by a trained network, all with the covariance of the validation residuals.
 
-    The covariance is the same for all positions: the second-moment matrix of the residuals of the
-    validation pairs. The network cannot test whether signals fit its position. Signals that are
-    weaker than noise, or stronger than those from any position, give no position; all others give
-    one.
+    The network cannot test whether signals fit its position. Only signals that are weaker than
+    noise, or stronger than any position explains, give no position.
 
     Raises
     ------
@@ -45,7 +158,7 @@ class NeuralEstimator:
             self._network, source = model_file, 'model'
         else:
             self._network, source = Network.load(model_file), str(model_file)
-        check_trained_for(self._network, scenario, codebook, source)
+        _check_purpose(self._network, scenario, codebook, source)
         self._test = FitTest(int(np.prod(self._model.shape)))
 
     @one_blas_thread
@@ -63,20 +176,123 @@ class NeuralEstimator:
             yield position, self._network.covariance, reason
 
 
-def check_trained_for(
+def _check_purpose(
         network: Network, scenario: Scenario, codebook: Codebook, source: str) -> None:
-    """Raise `ModelError` unless a model was trained for a scenario and codebook.
-
-    `source` is the model's name in the error.
-    """
-    about = network.about
-    if about.get('codebook') != codebook.id:
-        raise ModelError(f'{source}: trained for codebook {about.get("codebook")}, expected '
-                         f'{codebook.id}')
-    if about.get('scenario') != scenario.changes():
-        raise ModelError(f'{source}: trained for the scenario {about.get("scenario")}, expected '
-                         f'{scenario.changes()}')
+    for key, subject, expected in (('codebook', 'codebook', codebook.id),
+                                   ('scenario', 'the scenario', scenario.changes())):
+        found = network.about.get(key)
+        if found != expected:
+            raise ModelError(f'{source}: trained for {subject} {found}, expected {expected}')
     n_bands, n_subbands, n_frames, _, _ = codebook.shape
-    expected = (2 if network.inputs == 'parts' else 1) * n_bands * n_subbands * n_frames
-    if len(network.w_in) != expected:
-        raise ModelError(f'{source}: {len(network.w_in)} inputs, expected {expected}')
+    n_inputs = (2 if network.inputs == 'parts' else 1) * n_bands * n_subbands * n_frames
+    if len(network.w_in) != n_inputs:
+        raise ModelError(f'{source}: {len(network.w_in)} inputs, expected {n_inputs}')
+
+
+class Epoch(NamedTuple):
+    """Progress of a training after `number` epochs."""
+
+    number: int
+    validation_mse_m2: float
+
+
+# One thread: more threads change the rounding and do not speed up such small products.
+@one_blas_thread
+def train(
+        scenario: Scenario, codebook: Codebook, n_pairs: int = DEFAULT_PAIRS, seed: int = 0,
+        n_hidden: int = DEFAULT_HIDDEN, max_epochs: int = DEFAULT_EPOCHS,
+        progress: Callable[[Epoch], None] | None = None, inputs: str = 'parts') -> Network:
+    """Train a network, and return the one of the epoch with the smallest validation error.
+
+    The seed determines the pairs, at least 20, their order and the initial weights. `n_hidden` is
+    the number of units of the hidden layer, and `inputs` a key of `INPUTS`.
+
+    Raises
+    ------
+    CodebookError
+        If the codebook does not fit the scenario.
+    ValueError
+        If a number is too small, or the inputs are unknown.
+    MissingLibraryError
+        If scikit-learn is not installed.
+    """
+    for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
+                                 ('max_epochs', max_epochs, 1)):
+        if value < minimum:
+            raise ValueError(f'{name}: {value}, expected at least {minimum}')
+    if inputs not in INPUTS:
+        raise ValueError(f'inputs: {inputs!r}, expected one of {sorted(INPUTS)}')
+    regressor = _regressor(n_hidden, seed)
+    positions, received = simulate_pairs(scenario, codebook, n_pairs, seed)
+    first, second = (n_pairs * percent // 100 for percent in (_VALIDATION_PERCENT, _TEST_PERCENT))
+    training, validation, test = slice(first), slice(first, second), slice(second, None)
+    features, center = INPUTS[inputs](received), scenario.roi_bounds_m.mean(axis=0)
+    mean, scale = features[training].mean(axis=0), features[training].std(axis=0)
+    # One unit for all coordinates, so that the loss is the squared error.
+    unit_m = np.sqrt(np.mean((positions[training] - center)**2))
+    scaled = ((features - mean) / scale).astype(np.float32)
+    targets = ((positions - center) / unit_m).astype(np.float32)
+
+    def residuals(subset: slice) -> np.ndarray:
+        errors: np.ndarray = regressor.predict(scaled[subset]) - targets[subset]
+        return errors.astype(float) * unit_m
+
+    def after_epoch(number: int) -> float:
+        mse = _mean_square(residuals(validation))
+        if progress:
+            progress(Epoch(number, mse))
+        return mse
+
+    best_epoch, best_mse = _fit(
+        regressor, scaled[training], targets[training], max_epochs, after_epoch)
+    errors = residuals(validation)
+    model = MeasurementModel(scenario, codebook)
+    energies = np.sum(np.abs(model.whiten(model.mean(positions)))**2, axis=(1, 2))
+    (w_in, w_out), (b_in, b_out) = (
+        [array.astype(float) for array in arrays]
+        for arrays in (regressor.coefs_, regressor.intercepts_))
+    return Network(
+        input_mean=mean, input_scale=scale, w_in=w_in, b_in=b_in, w_out=w_out * unit_m,
+        b_out=b_out * unit_m, center=center, inputs=inputs,
+        covariance=errors.T @ errors / len(errors),
+        max_energy=float(energies.max()), about={
+            'codebook': codebook.id, 'scenario': scenario.changes(), 'seed': seed,
+            'pairs': n_pairs, 'epochs': best_epoch, 'version': __version__,
+            'validation_mse_m2': best_mse, 'test_mse_m2': _mean_square(residuals(test))})
+
+
+def _fit(
+        regressor: Any, inputs: np.ndarray, targets: np.ndarray, max_epochs: int,
+        after_epoch: Callable[[int], float]) -> tuple[int, float]:
+    """Train up to `max_epochs` epochs, restore the best weights, return their epoch and error."""
+    best_weights: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+    best_mse, best_epoch, reference_epoch = np.inf, 0, 0
+    sizes = [min(size, len(inputs)) for size in _BATCH_SIZES]
+    regressor.set_params(batch_size=sizes.pop(0))
+    for number in range(1, max_epochs + 1):
+        regressor.partial_fit(inputs, targets)
+        mse = after_epoch(number)
+        if mse < best_mse:
+            best_weights = copy.deepcopy((regressor.coefs_, regressor.intercepts_))
+            best_mse, best_epoch, reference_epoch = mse, number, number
+        if number - reference_epoch >= _PATIENCE_EPOCHS:
+            if not sizes:
+                break
+            regressor.set_params(batch_size=sizes.pop(0))
+            reference_epoch = number
+    regressor.coefs_, regressor.intercepts_ = best_weights
+    return best_epoch, best_mse
+
+
+def _regressor(n_hidden: int, seed: int) -> Any:
+    """Return the untrained network."""
+    with optional_import('training', extra='neural'):
+        from sklearn.neural_network import MLPRegressor
+    state = int(streams.generator(seed, streams.TRAINING).integers(2**32))
+    return MLPRegressor(
+        hidden_layer_sizes=(n_hidden,), activation='relu', solver='adam', alpha=0.0,
+        learning_rate_init=_LEARNING_RATE, random_state=state)
+
+
+def _mean_square(errors: np.ndarray) -> float:
+    return float(np.mean(np.sum(errors**2, axis=1)))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.impairments.impairment import UNIFORM_STD_RAD
+from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD
 from rhs_isac_ros.positioning.coordinates import (
     carrier_wavenumbers,
     is_inside,
@@ -41,50 +41,25 @@ _MAX_STD_RAD = 3.0
 
 
 class Posterior(NamedTuple):
-    """The posterior of one positioning phase, for a uniform prior on the region of interest.
-
-    Attributes
-    ----------
-    estimate
-        Its mean and covariance, or the reason why there is no position.
-    modes
-        Its modes; None without a position.
-    signals
-        Signals of the phase, N = 1.
-    """
+    """The posterior of one positioning phase, for a uniform prior on the region of interest."""
 
     estimate: Estimate
-    modes: Modes | None
-    signals: Signals
+    modes: Modes | None  # None without a position.
+    signals: Signals  # Of the phase, N = 1.
 
 
 class Samples(NamedTuple):
-    """Samples of the Gaussians of M modes, S of each.
+    """Samples of the Gaussians of M modes, S of each."""
 
-    Attributes
-    ----------
-    positions
-        Float64 [M, S, 3] [m].
-    log_weights
-        Logarithm of the weights, not normalised, float64 [M, S]; -inf outside of the region.
-    spread
-        Factor of the covariance of each mode's position, float64 [M, 3, 3] [m].
-    """
-
-    positions: np.ndarray
-    log_weights: np.ndarray
-    spread: np.ndarray
+    positions: np.ndarray  # Float64 [M, S, 3] [m].
+    log_weights: np.ndarray  # Not normalised, float64 [M, S]; -inf outside of the region.
+    spread: np.ndarray  # Factor of the covariance of each mode's position, float64 [M, 3, 3] [m].
 
 
 def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Samples:
-    """Represent the modes by samples, for a uniform prior on the region of interest.
+    """Represent the modes by samples, for a uniform prior between the bounds [2, 3] of the region.
 
-    Parameters
-    ----------
-    normal
-        Points that represent a standard Gaussian, float64 [S, 3].
-    bounds
-        Lower and upper vertex of the region, float64 [2, 3] [m].
+    Takes points that represent a standard Gaussian, float64 [S, 3].
     """
     points, curvature, roi_offset = modes.points, modes.curvature, modes.roi_offset
     starts = first_of_each(modes.phases)
@@ -111,27 +86,13 @@ def draw_samples(modes: Modes, normal: np.ndarray, bounds: np.ndarray) -> Sample
 
 
 class WeightedSamples(NamedTuple):
-    """The samples of the posteriors of N phases, with weights whose sum is one for each phase.
+    """The samples of the posteriors of N phases, with weights whose sum is one for each phase."""
 
-    Attributes
-    ----------
-    positions
-        Float64 [M, S, 3] [m].
-    weights
-        Float64 [M, S].
-    spread
-        As in `Samples`.
-    starts
-        Index of each phase's first mode, int [N].
-    log_totals
-        Logarithms of the sums of the weights before they were normalised, float64 [N].
-    """
-
-    positions: np.ndarray
-    weights: np.ndarray
-    spread: np.ndarray
-    starts: np.ndarray
-    log_totals: np.ndarray
+    positions: np.ndarray  # Float64 [M, S, 3] [m].
+    weights: np.ndarray  # Float64 [M, S].
+    spread: np.ndarray  # As in `Samples`.
+    starts: np.ndarray  # Index of each phase's first mode, int [N].
+    log_totals: np.ndarray  # Of the weights before they were normalised, float64 [N].
 
     @classmethod
     def of(cls, samples: Samples, modes: Modes) -> 'WeightedSamples':
@@ -212,8 +173,7 @@ def _log_proposal(points: np.ndarray, modes: Modes) -> np.ndarray:
     squares += np.einsum('ma,ma->m', means, spread) - 2 * points @ spread.T
     exponent = -squares / (2 * _SPREAD**2)
     exponent += np.linalg.slogdet(modes.curvature)[1] / 2
-    return (np.logaddexp.reduce(exponent, axis=1)
-            - 3 * np.log(_SPREAD) - 1.5 * np.log(2 * np.pi))
+    return (np.logaddexp.reduce(exponent, axis=1) - 3 * np.log(_SPREAD) - 1.5 * np.log(2 * np.pi))
 
 
 class BandPhases:
@@ -221,20 +181,14 @@ class BandPhases:
 
     Relative to uniform phases, the likelihood of a position has one factor for each band: the
     density of the phase of the matched filter's output, the wrapped normal distribution broadened
-    by the noise. Along the range, the product of the factors turns with the carriers, far faster
-    than the rest of the posterior: it has peaks of centimetres, whose heights follow the
-    differences of the carriers. It is averaged over one wavelength around each sample.
-
-    Attributes
-    ----------
-    is_informative
-        Whether the search has left out information in the phases of the bands; otherwise, there
-        are no factors.
+    by the noise. Along the range, their product turns with the carriers, far faster than the rest
+    of the posterior. It is averaged over one wavelength around each sample.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
         prior = likelihood.nuisance
         self._std = prior.relative_phase_std_rad
+        # Whether the search has left out information; otherwise, there are no factors.
         self.is_informative = prior.is_coarse and self._std <= UNIFORM_STD_RAD
         if not self.is_informative:
             return
@@ -251,12 +205,8 @@ class BandPhases:
                 ) -> tuple[np.ndarray, np.ndarray]:
         """Average the product of the factors over the wavelength around positions, or not.
 
-        Takes the outputs of the matched filters at the positions, complex128 [N_B, P].
-
-        Returns
-        -------
-        log_factors, offsets_m
-            Logarithm of the average, and the mean offset in range [m], float64 [P].
+        Takes the outputs of the matched filters, [N_B, P]. Returns the logarithm of the average,
+        and the mean offset in range [m], [P].
         """
         ranges_m = self._ranges_m if averages else np.zeros(1)
         all_turns = self._wavenumbers[:, None, None] * ranges_m[:, None] + self._common
@@ -271,11 +221,9 @@ class BandPhases:
         return highest + np.log(total), weights @ ranges_m / total
 
     def _broadened(self, magnitude: np.ndarray) -> np.ndarray:
-        """Standard deviation of the phase of outputs of these magnitudes.
-
-        That of the noise has the von Mises density; its first harmonic is that of a wrapped
-        normal distribution.
-        """
+        """Standard deviation of the phase of outputs of these magnitudes."""
+        # The phase of the noise has the von Mises density; its first harmonic is that of a
+        # wrapped normal distribution.
         from scipy.special import i0e, i1e
 
         concentration = 2 * np.maximum(magnitude, 1e-9)
@@ -301,5 +249,4 @@ def _log_density(angle: np.ndarray, std: np.ndarray) -> np.ndarray:
     ratio = np.exp(-2 * np.pi**2 / std**2)
     slope = 2 * np.pi / std**2 * angle
     wraps = ratio * (np.exp(slope) + np.exp(-slope))
-    return (
-        np.log(np.sqrt(2 * np.pi) / std) - angle**2 / (2 * std**2) + np.log1p(wraps))
+    return (np.log(np.sqrt(2 * np.pi) / std) - angle**2 / (2 * std**2) + np.log1p(wraps))

@@ -24,8 +24,6 @@ from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, 
 # accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 10.0
 EXACT_MARGIN = 8.0
-# Squared Mahalanobis distance below which two modes have converged to the same maximum.
-_SAME_MODE = 2.0
 # A mode has converged when its last step gained less log-likelihood than this.
 _MIN_GAIN = 0.05
 # Maximum number of exact steps. Few modes need more than two, unless signals are strong.
@@ -34,37 +32,18 @@ _N_USUAL_STEPS = 4
 
 
 class Modes(NamedTuple):
-    """Local maxima of the posterior in or near the region of interest (ROI).
+    """Local maxima of the posterior in or near the region of interest (ROI)."""
 
-    Attributes
-    ----------
-    phases
-        Positioning phase of each mode, int [M], ascending.
-    points
-        (r [m], u, v), float64 [M, 3].
-    curvature
-        Curvature of the marginal log-likelihood in these coordinates, float64 [M, 3, 3].
-    log_likelihood
-        Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters, it is
-        minus the squared norm of the whitened residual.
-    roi_offset
-        Offset to the region of interest, from `offset_to_roi`, float64 [M, 3].
-    values
-        Nuisance parameters, float64 [M, Q].
-    residual
-        Energy of the whitened residual, float64 [M].
-    state
-        Number of the state of the surface, int [M]; 0 if there is only one.
-    """
-
-    phases: np.ndarray
-    points: np.ndarray
-    curvature: np.ndarray
+    phases: np.ndarray  # Positioning phase of each mode, int [M], ascending.
+    points: np.ndarray  # (r [m], u, v), float64 [M, 3].
+    curvature: np.ndarray  # Curvature of the marginal log-likelihood there, float64 [M, 3, 3].
+    # Marginal log-likelihood, up to a constant, float64 [M]. Without nuisance parameters, it is
+    # minus the energy of the whitened residual.
     log_likelihood: np.ndarray
-    roi_offset: np.ndarray
-    values: np.ndarray
-    residual: np.ndarray
-    state: np.ndarray
+    roi_offset: np.ndarray  # Offset to the region, from `offset_to_roi`, float64 [M, 3].
+    values: np.ndarray  # Nuisance parameters, float64 [M, Q].
+    residual: np.ndarray  # Energy of the whitened residual, float64 [M].
+    state: np.ndarray  # Number of the state of the surface, int [M]; 0 if there is only one.
 
     @property
     def roi_log_likelihood(self) -> np.ndarray:
@@ -75,6 +54,10 @@ class Modes(NamedTuple):
     def roi_points(self) -> np.ndarray:
         """For each mode, its most likely point inside the region, (r [m], u, v), [M, 3]."""
         return self.points + self.roi_offset
+
+    def starts(self) -> Starts:
+        """Return the most likely points inside the region as starts of another search."""
+        return Starts(self.phases, self.roi_points, self.values)
 
     def select(self, chosen: np.ndarray | slice) -> 'Modes':
         """Return the modes with the given indices or mask."""
@@ -94,14 +77,9 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
                aligned: np.ndarray, extra_margin: float = 0.0) -> Modes:
     """Find the modes of each of N phases with a substantial weight in the posterior.
 
-    Each phase has at least one mode, and its most likely one comes first.
-
-    Parameters
-    ----------
-    aligned
-        Parameters that the signals alone reveal, float64 [N, Q]; 0 for the others.
-    extra_margin
-        Modes may be less likely than the best by this more than usual.
+    Each phase has at least one mode, and its most likely one comes first. Takes the parameters
+    that the signals alone reveal, float64 [N, Q], 0 for the others. Modes may be less likely than
+    the best by the `extra_margin` more than usual.
     """
     starts = grid.starts(
         likelihood.whitened(aligned, signals), likelihood.nuisance, GRID_MARGIN + extra_margin)
@@ -113,16 +91,13 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
            n_steps: int, margin: float = EXACT_MARGIN, state: int = 0) -> Modes:
     """Take Gauss-Newton steps from points to the modes of the posterior.
 
-    Parameters
-    ----------
-    conditional
-        The likelihood of the state of the surface.
-    starts
-        Points of N phases, and parameters there.
-    margin
-        Modes that are less likely than the best of a phase by more are dropped.
+    The first argument is the likelihood of the state of the surface. Modes that are less likely
+    than the best of a phase by more than the margin are dropped.
     """
-    modes, gain = _step(conditional, likelihood, starts, signals.take(starts.phases), state)
+    def step(starts: Starts, moves: bool = True) -> tuple[Modes, np.ndarray]:
+        return _step(conditional, likelihood, starts, signals.take(starts.phases), state, moves)
+
+    modes, gain = step(starts)
     for number in range(n_steps):
         chosen = _prune(likelihood, modes, gain, margin)
         modes, gain = modes.select(chosen), gain[chosen]
@@ -130,16 +105,13 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         (moving,) = np.nonzero(gain > (_MIN_GAIN if number < _N_USUAL_STEPS else 1.0))
         if not len(moving) or number == n_steps - 1:
             break
-        again = Starts(modes.phases[moving], modes.roi_points[moving], modes.values[moving])
-        moved, gain[moving] = _step(
-            conditional, likelihood, again, signals.take(again.phases), state)
+        moved, gain[moving] = step(modes.select(moving).starts())
         modes.replace(moving, moved)
     # A step that has not converged may predict any likelihood.
     (moving,) = np.nonzero((gain > _MIN_GAIN) | (len(likelihood.nuisance) > 0))
     if len(moving):
         again = Starts(modes.phases[moving], modes.points[moving], modes.values[moving])
-        modes.replace(moving, _step(conditional, likelihood, again, signals.take(again.phases),
-                                    state, moves=False)[0])
+        modes.replace(moving, step(again, moves=False)[0])
         gain[moving] = 0.0
         modes = modes.select(_prune(likelihood, modes, gain, margin))
     return modes
@@ -206,14 +178,10 @@ def _newton(local: Local, likelihood: Likelihood) -> tuple[Marginal, np.ndarray,
     return marginal, whole, rise
 
 
-def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
-           ) -> np.ndarray:
-    """Choose the probable and separate modes of each phase, the most likely first.
-
-    The likelihood of a mode is a prediction. The best is at most the one before the last step,
-    which is computed.
-    """
-    # A step that has not converged may predict any likelihood.
+def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float) -> np.ndarray:
+    """Choose the probable and separate modes of each phase, the most likely first."""
+    # The likelihood of a mode is a prediction. The best is at most the one before the last step,
+    # which is computed. A step that has not converged may predict any likelihood.
     value = modes.roi_log_likelihood + np.maximum(gain, 0)
     order = np.lexsort((-modes.roi_log_likelihood, modes.phases))
     phases = modes.phases[order]
@@ -224,5 +192,4 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     order = order[heaviest(phases, np.minimum(relative, 0.0), margin)]
     phases = modes.phases[order]
     radii = likelihood.resolution.separation(likelihood.nuisance.is_coarse)
-    return order[separate(
-        phases, modes.roi_points[order], radii, modes.curvature[order])]
+    return order[separate(phases, modes.roi_points[order], radii, modes.curvature[order])]

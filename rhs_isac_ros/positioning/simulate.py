@@ -17,18 +17,8 @@ def simulate_pairs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate positioning phases at random positions of the region of interest.
 
-    A seed defines an infinite sequence of pairs. This function returns a part of it, which is
-    identical bit for bit however the sequence is divided. Signals are drawn by
-    `MeasurementModel.sample`.
-
-    Parameters
-    ----------
-    n
-        Number of pairs.
-    seed
-        Seed of the sequence.
-    first
-        Index of the first pair in the sequence.
+    A seed defines an infinite sequence of pairs. This function returns the n pairs from `first`
+    on, which are identical bit for bit however the sequence is divided.
 
     Returns
     -------

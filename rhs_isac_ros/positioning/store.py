@@ -12,7 +12,7 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.positioning import grid, outside
+from rhs_isac_ros.positioning import alternatives, grid
 from rhs_isac_ros.support.files import write_whole
 
 # Maximum number of tables in a folder; the least recently used ones beyond it are deleted.
@@ -32,13 +32,9 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
                ) -> Mapping[str, np.ndarray]:
     """Load the table of a model from a folder, or compute it and store it there.
 
-    The result contains the arrays of `tabulate` and `tabulate_outside`; from a folder, they
-    are read-only and mapped into memory. Without a folder, the table is in memory only.
-
-    Warns
-    -----
-    RuntimeWarning
-        If the folder cannot be written; the table is then in memory only.
+    The result contains the arrays of `tabulate` and `tabulate_outside`; from a folder, they are
+    read-only and mapped into memory. Without a folder, or with a `RuntimeWarning` if it cannot be
+    written, the table is in memory only.
     """
     if folder is None:
         return _tabulate(model)
@@ -57,7 +53,7 @@ def load_table(model: MeasurementModel, codebook_id: str, folder: Path | None = 
 
 
 def _tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
-    return grid.tabulate(model) | outside.tabulate_outside(model)
+    return grid.tabulate(model) | alternatives.tabulate_outside(model)
 
 
 def table_key(model: MeasurementModel, codebook_id: str) -> str:
@@ -81,7 +77,11 @@ def _write(path: Path, key: str, table: Mapping[str, np.ndarray]) -> None:
     record['digest'] = _digest(record)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, lambda stream: np.save(stream, record, allow_pickle=False))
-    _prune(path.parent)
+    # Another process may delete the same files.
+    with contextlib.suppress(OSError):
+        tables = sorted(path.parent.glob(f'{_PREFIX}*.npy'), key=lambda one: -one.stat().st_mtime)
+        for unused in tables[_MAX_TABLES:]:
+            unused.unlink(missing_ok=True)
 
 
 def _read(path: Path, key: str) -> Mapping[str, np.ndarray] | None:
@@ -104,11 +104,3 @@ def _digest(record: np.ndarray) -> bytes:
     content.update(repr(record.dtype.descr).encode())
     content.update(record.view(np.uint8)[64:].data)
     return content.hexdigest().encode()
-
-
-def _prune(folder: Path) -> None:
-    # Another process may delete the same files.
-    with contextlib.suppress(OSError):
-        tables = sorted(folder.glob(f'{_PREFIX}*.npy'), key=lambda path: -path.stat().st_mtime)
-        for path in tables[_MAX_TABLES:]:
-            path.unlink(missing_ok=True)

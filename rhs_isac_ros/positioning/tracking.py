@@ -2,22 +2,32 @@
 
 The signals of a phase often fit several positions, 0.6 m apart in range on Table I. The tracker
 keeps them all, as a mixture of Gaussians over position and velocity, until the movement over
-several phases decides between them.
+several phases decides between them. It assumes that velocities drift at random, and that there are
+turns. Coordinates are those of `coordinates`.
 """
 
 import dataclasses
+import itertools
+from typing import NamedTuple
 
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT
-from rhs_isac_ros.positioning.coordinates import is_inside, jacobian
+from rhs_isac_ros.positioning.coordinates import (
+    concatenate,
+    is_inside,
+    jacobian,
+    log_sum,
+    symmetric,
+    to_polar,
+    to_positions,
+)
 from rhs_isac_ros.positioning.estimate import Estimate
 from rhs_isac_ros.positioning.estimators import SearchEstimator
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
-from rhs_isac_ros.positioning.motion import Mixture, Motion, concatenate, reduce
 from rhs_isac_ros.positioning.posterior import Posterior
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -47,48 +57,227 @@ _SAME_MAXIMUM = 1.0
 # Log-likelihood, relative to that of the best mode, of a mode that the search has missed: it finds
 # those above.
 _FLOOR = -EXACT_MARGIN
+# Bounds of the intervals of the time between two phases, as shares of it, in which a turn is
+# distinguished. With one interval, the position after an early turn is too unlikely: the Gaussian
+# has the mean time after a turn.
+_TURN_INTERVALS = (0.0, 0.5, 1.0)
+# Components that are lighter than the heaviest by more than this, in log-weight, do not turn.
+_TURN_MARGIN = 10.0
+# Components whose squared Mahalanobis distance is below this are merged.
+_MERGE_DISTANCE = 1.0
+# Components that are lighter than the heaviest by more than this, in log-weight, are discarded.
+_WEIGHT_MARGIN = 18.0
+
+
+class Mixture(NamedTuple):
+    """A mixture of C Gaussians."""
+
+    log_weights: np.ndarray  # Float64 [C].
+    means: np.ndarray  # (r [m], u, v) and its rate [1/s], float64 [C, 6].
+    covariances: np.ndarray  # Float64 [C, 6, 6].
+
+    def select(self, chosen: np.ndarray) -> 'Mixture':
+        """Return the components with the given indices or mask."""
+        return Mixture(*(field[chosen] for field in self))
+
+    def normalised(self) -> 'Mixture':
+        """Return the mixture with weights whose sum is one."""
+        return self.weighted(-log_sum(self.log_weights))
+
+    def positions(self, normal: np.ndarray) -> np.ndarray:
+        """Map points that represent a standard Gaussian, [S, 3], to positions, [C, S, 3] [m]."""
+        factors = np.linalg.cholesky(self.covariances[:, :3, :3])
+        points = self.means[:, None, :3] + np.matmul(normal, np.swapaxes(factors, 1, 2))
+        return to_positions(points)
+
+    def weighted(self, log_factor: float | np.ndarray) -> 'Mixture':
+        """Return the mixture with its weights multiplied by a factor."""
+        return self._replace(log_weights=self.log_weights + log_factor)
+
+    def velocity(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean, float64 [3] [m/s], and covariance, float64 [3, 3], of the velocity."""
+        weights = np.exp(self.log_weights - log_sum(self.log_weights))
+        by_rate = jacobian(self.means[:, :3])
+        means = np.matmul(by_rate, self.means[:, 3:, None])[..., 0]
+        mean = weights @ means
+        offsets = means - mean
+        within = np.matmul(np.matmul(by_rate, self.covariances[:, 3:, 3:]),
+                           np.swapaxes(by_rate, 1, 2))
+        covariance = np.tensordot(weights, within, axes=1)
+        covariance += (weights[:, None] * offsets).T @ offsets
+        return mean, symmetric(covariance)
+
+
+def reduce(mixture: Mixture, max_components: int) -> Mixture:
+    """Merge components that are close to a heavier one, and discard those of little weight."""
+    order = np.argsort(-mixture.log_weights)
+    order = order[mixture.log_weights[order] >= mixture.log_weights[order[0]] - _WEIGHT_MARGIN]
+    mixture = mixture.select(order)
+    means = mixture.means
+    precisions = np.linalg.inv(mixture.covariances)
+    free = np.ones(len(means), bool)
+    group = np.full(len(means), -1)
+    n_groups = 0
+    while free.any() and n_groups < max_components:
+        leader = int(np.argmax(free))
+        offsets = means - means[leader]
+        distance = np.einsum('cp,cp->c', offsets @ precisions[leader], offsets)
+        members = free & (distance < _MERGE_DISTANCE)
+        group[members] = n_groups
+        free[members] = False
+        n_groups += 1
+    return _merge(mixture, group, n_groups)
+
+
+def _merge(mixture: Mixture, group: np.ndarray, n_groups: int) -> Mixture:
+    """Merge the components of each group, with their mean and covariance; discard group -1."""
+    mixture = mixture.select(group >= 0)
+    group = group[group >= 0]
+    member = np.equal.outer(np.arange(n_groups), group)
+    weights = np.exp(mixture.log_weights - mixture.log_weights.max())
+    shares = member * weights
+    total = shares.sum(axis=1)
+    shares /= total[:, None]
+    means = shares @ mixture.means
+    offsets = mixture.means - means[group]
+    spread = mixture.covariances + offsets[:, :, None] * offsets[:, None, :]
+    covariances = (shares @ spread.reshape(len(group), -1)).reshape(n_groups, 6, 6)
+    return Mixture(np.log(total) + mixture.log_weights.max(), means, covariances)
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """A random velocity, the same in all directions, with sudden turns.
+
+    Between turns, the velocity is an Ornstein-Uhlenbeck process: over times that are short against
+    `memory_s`, it is constant up to noise. At a turn, which may also be a stop or a start, it is
+    drawn anew. The numbers of turns in separate times are independent.
+    """
+
+    speed_mps: float = 1.0  #: Root mean square.
+    memory_s: float = 5.0  #: Time over which the velocity loses its memory without a turn.
+    turn_s: float = 2.0  #: Mean time between turns.
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ('speed_mps', 'memory_s', 'turn_s'):
+            value = getattr(self, name)
+            if not 0 < value < np.inf:
+                raise ValueError(f'{name}: {value}, expected a positive number')
+
+    @property
+    def velocity_variance(self) -> float:
+        """Variance of each component of the velocity [m^2/s^2]."""
+        return self.speed_mps**2 / 3
+
+    def start(self, points: np.ndarray, covariances: np.ndarray,
+              log_weights: np.ndarray) -> Mixture:
+        """Return a mixture with velocities of the stationary process at points (r [m], u, v)."""
+        n = len(points)
+        means, joint = np.zeros((n, 6)), np.zeros((n, 6, 6))
+        means[:, :3], joint[:, :3, :3] = points, covariances
+        joint[:, 3:, 3:] = self.velocity_variance * _isotropic(points)
+        return Mixture(log_weights, means, joint)
+
+    def predict(self, mixture: Mixture, elapsed_s: float) -> Mixture:
+        """Return the mixture after a time [s].
+
+        Every component gives one without a turn, and one with a turn in each of the
+        `_TURN_INTERVALS`. Means move in straight lines; the covariances neglect the curvature of
+        the coordinates.
+        """
+        log_no_turn = -elapsed_s / self.turn_s
+        turn = -np.expm1(log_no_turn)
+        straight = self._straight(mixture, elapsed_s).weighted(log_no_turn)
+        mixture = mixture.select(mixture.log_weights >= mixture.log_weights.max() - _TURN_MARGIN)
+        return concatenate(
+            straight,
+            *(self._turned(mixture.weighted(np.log(turn * (end - begin))),
+                           begin * elapsed_s, end * elapsed_s, elapsed_s)
+              for begin, end in itertools.pairwise(_TURN_INTERVALS)))
+
+    def _straight(self, mixture: Mixture, elapsed_s: float) -> Mixture:
+        decay = np.exp(-elapsed_s / self.memory_s)
+        reach_s = self.memory_s * (1 - decay)
+        points, velocity = _moved(mixture, reach_s)
+        rates = decay * np.linalg.solve(jacobian(points), velocity[..., None])[..., 0]
+        means = np.concatenate([points, rates], axis=1)
+        transition = np.eye(6)
+        transition[:3, 3:] += reach_s * np.eye(3)
+        transition[3:, 3:] *= decay
+        return Mixture(
+            mixture.log_weights, means,
+            transition @ mixture.covariances @ transition.T
+            + np.kron(self._noise(elapsed_s, decay), np.ones((3, 3)))
+            * np.tile(_isotropic(points), (2, 2)))
+
+    def _turned(self, mixture: Mixture, begin_s: float, end_s: float, elapsed_s: float) -> Mixture:
+        """Return the mixture of users that have turned once, at a random moment of an interval."""
+        mean_s, variance_s2 = (begin_s + end_s) / 2, (end_s - begin_s)**2 / 12
+        rest_s = elapsed_s - mean_s
+        points, _ = _moved(mixture, mean_s)
+        means = np.concatenate([points, np.zeros_like(points)], axis=1)
+        transition = np.hstack([np.eye(3), mean_s * np.eye(3)])
+        rates, within = mixture.means[:, 3:], mixture.covariances[:, 3:, 3:]
+        turned = self.velocity_variance * _isotropic(points)
+        covariances = np.empty_like(mixture.covariances)
+        covariances[:, :3, :3] = (
+            transition @ mixture.covariances @ transition.T
+            + variance_s2 * (within + rates[:, :, None] * rates[:, None])
+            + (rest_s**2 + variance_s2) * turned)
+        covariances[:, :3, 3:] = covariances[:, 3:, :3] = rest_s * turned
+        covariances[:, 3:, 3:] = turned
+        return Mixture(mixture.log_weights, means, covariances)
+
+    def _noise(self, elapsed_s: float, decay: float) -> np.ndarray:
+        """Covariance of position [m] and velocity [m/s] along an axis, float64 [2, 2]."""
+        variance, memory_s = self.velocity_variance, self.memory_s
+        ratio = elapsed_s / memory_s
+        # The difference cancels for short times; its leading term is 2 ratio^3 / 3.
+        drift = 2 * ratio - 3 + 4 * decay - decay**2 if ratio > 1e-3 else 2 * ratio**3 / 3
+        return variance * np.array([
+            [memory_s**2 * drift, memory_s * (1 - decay)**2],
+            [memory_s * (1 - decay)**2, 1 - decay**2]])
+
+
+def _moved(mixture: Mixture, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (r, u, v) after a time in a straight line, and velocities, float64 [C, 3]."""
+    points = mixture.means[:, :3]
+    velocities = np.matmul(jacobian(points), mixture.means[:, 3:, None])[..., 0]
+    positions = to_positions(points) + time_s * velocities
+    # Nobody is behind the surface.
+    positions[:, 0] = np.maximum(positions[:, 0], 1e-3)
+    return to_polar(positions), velocities
+
+
+def _isotropic(points: np.ndarray) -> np.ndarray:
+    """Covariance of (r, u, v) for the unit covariance of the position, float64 [C, 3, 3]."""
+    inverse = np.linalg.inv(jacobian(points))
+    return np.matmul(inverse, np.swapaxes(inverse, 1, 2))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TrackEstimate(Estimate):
-    """A position and velocity with their uncertainty, or the reason why there is none.
+    """A position and velocity with their uncertainty, or the reason why there is none."""
 
-    Attributes
-    ----------
-    velocity
-        Float64 [3] [m/s]; NaN without a position.
-    velocity_covariance
-        Float64 [3, 3] [m^2/s^2]; NaN without a position.
-    n_phases
-        Number of phases that contribute to the estimate; 0 without a position.
-    is_predicted
-        Whether the position is a prediction, because the user is blocked.
-    """
-
+    #: Float64 [3] [m/s], and its covariance, [3, 3]; NaN without a position.
     velocity: np.ndarray = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
     velocity_covariance: np.ndarray = dataclasses.field(
         default_factory=lambda: np.full((3, 3), np.nan))
-    n_phases: int = 0
-    is_predicted: bool = False
+    n_phases: int = 0  #: Phases that contribute to the estimate; 0 without a position.
+    is_predicted: bool = False  #: The position is a prediction if the user is blocked.
 
 
 class Tracker:
     """The track of one user: a Gaussian mixture filter over the modes of the posterior.
 
-    The first position of a track is that of the estimator. A track ends with a gap of more than
+    The first position of a track is the estimate itself. A track ends with a gap of more than
     `MAX_GAP_S`; signals without a position do not change it, and neither do those whose multipath
-    is almost that of the phase before. While the user is blocked, the position is a prediction.
+    is almost equal to the previous phase's. While the user is blocked, the position is a
+    prediction. Positions are inside the region of interest.
 
-    Positions of the track are inside the region of interest. The probabilities of a user outside
-    and of a blocked one are those of the estimator.
-
-    Parameters
-    ----------
-    estimator
-        Estimator of the signals. The attribute may be replaced between phases, for example by
-        the estimator of another codebook.
-    motion
-        Assumed movement.
+    The attribute `estimator` may be replaced between phases, for example by the estimator of
+    another codebook, whose probabilities of a user outside or blocked are part of the estimates.
     """
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
@@ -100,22 +289,11 @@ class Tracker:
 
     @one_blas_thread
     def update(self, time_s: float, received: np.ndarray) -> TrackEstimate:
-        """Return the position and velocity at the time of a phase, from it and earlier ones.
+        """Return the position and velocity at the time [s] of a phase, from it and earlier ones.
 
-        The position for a phase that is not later than the last one follows from its signals
-        alone, and the track does not change.
-
-        Parameters
-        ----------
-        time_s
-            Time of the phase [s].
-        received
-            Signals, complex128 [N_B, N_SB F].
-
-        Raises
-        ------
-        SignalError
-            If the signals cannot be used; the track does not change.
+        Takes signals, complex128 [N_B, N_SB F]; `SignalError` if they cannot be used. The position
+        for a phase that is not later than the last one follows from its signals alone, and the
+        track does not change.
         """
         posterior = self.estimator.posterior(received)
         if posterior.modes is None:
@@ -147,8 +325,7 @@ class Tracker:
                 or not found.blocked_probability > BLOCKED_LIMIT):
             return TrackEstimate(**vars(found))
         self._latest_s = max(time_s, self._latest_s)
-        mixture, mean, covariance = self._inside(
-            self._motion.predict(self._mixture, elapsed_s))
+        mixture, mean, covariance = self._inside(self._motion.predict(self._mixture, elapsed_s))
         estimate = dataclasses.replace(found, mean=mean, covariance=covariance, reason='')
         return dataclasses.replace(
             _described(estimate, mixture, self._n_phases), is_predicted=True)
@@ -178,8 +355,8 @@ class Tracker:
             # user anywhere in the region.
             odds = share * np.log(blocked / max(1 - blocked - outside, 1e-12))
             weight = np.logaddexp.reduce(lost.log_weights) + odds
-            parts.append(predicted._replace(log_weights=predicted.log_weights + weight))
-        lost = lost._replace(log_weights=lost.log_weights + np.log(_LOSS_RATE_HZ * elapsed_s))
+            parts.append(predicted.weighted(weight))
+        lost = lost.weighted(np.log(_LOSS_RATE_HZ * elapsed_s))
         return reduce(concatenate(*parts, lost), MAX_COMPONENTS).normalised()
 
     def _inside(self, mixture: Mixture) -> tuple[Mixture, np.ndarray, np.ndarray]:
@@ -202,7 +379,7 @@ class Tracker:
         offsets = points - mean
         covariance = (flat[:, None] * offsets).T @ offsets
         mixture = concatenate(mixture, light).normalised()
-        return mixture, mean, (covariance + covariance.T) / 2
+        return mixture, mean, symmetric(covariance)
 
 
 def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEstimate:
@@ -214,9 +391,9 @@ def _described(estimate: Estimate, mixture: Mixture, n_phases: int) -> TrackEsti
 def independent_share(scenario: Scenario, elapsed_s: float) -> float:
     """Return the share of a phase's information that the previous phase does not contain.
 
-    With the correlation rho of Eq. (4) between the phases, N phases at one place contain as much
-    information as N (1 - rho) / (1 + rho) independent ones. A negative correlation, which would
-    add information, counts as none. The result is the average over the bands.
+    With the correlation rho of Eq. (4) between the phases, averaged over the bands, N phases at
+    one place contain as much information as N (1 - rho) / (1 + rho) independent ones. A negative
+    correlation, which would add information, counts as none.
     """
     lag = np.array(elapsed_s / scenario.frame_duration_s)
     rho = np.array([float(time_correlation(scenario, band, lag, np.array(0.0)))
@@ -233,24 +410,13 @@ def update(
     """Return the product of a predicted mixture and the likelihood of a phase, not normalised.
 
     Every mode updates every component. Components also remain without an update, as if a mode with
-    a low likelihood, as wide as the best one, had been missed at an unknown place inside them.
-
-    Parameters
-    ----------
-    modes
-        Modes of the likelihood.
-    share
-        Exponent of the likelihood, from 0 to 1; below 1 for signals whose multipath was in part
-        received before.
-    likelihood
-        With which the heaviest pairs are evaluated; None to use the Gaussians of the modes.
-    signals
-        Signals of the phase, N = 1.
+    a low likelihood, as wide as the best one, had been missed at an unknown place inside them. The
+    exponent of the likelihood, from 0 to 1, is below 1 if the multipath was in part received
+    before. The heaviest pairs are evaluated with the likelihood, unless it is None.
     """
     spread = np.linalg.inv(modes.curvature) / share
     offsets = modes.points[:, None] - predicted.means[:, :3]
-    log_weights, precision = _evidence(
-        offsets, predicted.covariances[:, :3, :3], spread[:, None])
+    log_weights, precision = _evidence(offsets, predicted.covariances[:, :3, :3], spread[:, None])
     log_weights += share * modes.log_likelihood[:, None] + predicted.log_weights
     flat = log_weights.ravel()
     order = np.argsort(-flat)[:_MAX_PAIRS]
@@ -268,8 +434,7 @@ def update(
     best = int(np.argmax(modes.roi_log_likelihood))
     floor, _ = _evidence(np.zeros(3), predicted.covariances[:, :3, :3], spread[best])
     floor += share * (modes.roi_log_likelihood[best] + _FLOOR)
-    return concatenate(
-        updated, predicted._replace(log_weights=predicted.log_weights + floor))
+    return concatenate(updated, predicted.weighted(floor))
 
 
 def _exact_update(
@@ -288,11 +453,9 @@ def _exact_update(
 
 
 def _is_first(updated: Mixture, component: np.ndarray) -> np.ndarray:
-    """Return which components are not equal to an earlier one, bool [C].
-
-    Modes that have not converged may lead one predicted component, given by its index, to the
-    same maximum, which must not count twice.
-    """
+    """Return which components are not equal to an earlier one, bool [C]."""
+    # Modes that have not converged may lead one predicted component, given by its index, to the
+    # same maximum, which must not count twice.
     points = updated.means[:, :3]
     offsets = points[:, None] - points
     precision = np.linalg.inv(updated.covariances[:, :3, :3])
@@ -306,14 +469,8 @@ def _evidence(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Integrate the product of two Gaussians, one a density, the other with the maximum 1.
 
-    Returns the logarithm, float64 [...], and the precision of the offset, float64 [..., 3, 3].
-
-    Parameters
-    ----------
-    offsets
-        Differences of the means, float64 [..., 3].
-    predicted, spread
-        Covariance of the density and of the other, float64 [..., 3, 3].
+    Takes the differences of the means, float64 [..., 3], and the covariances of both. Returns the
+    logarithm, float64 [...], and the precision of the offset, float64 [..., 3, 3].
     """
     total = predicted + spread
     precision = np.linalg.inv(total)
@@ -327,5 +484,4 @@ def _shifted(mixture: Mixture, precision: np.ndarray, offsets: np.ndarray) -> Mi
     gain = np.matmul(mixture.covariances[:, :, :3], precision)
     means = mixture.means + np.matmul(gain, offsets[..., None])[..., 0]
     covariances = mixture.covariances - np.matmul(gain, mixture.covariances[:, :3])
-    covariances = (covariances + np.swapaxes(covariances, 1, 2)) / 2
-    return mixture._replace(means=means, covariances=covariances)
+    return mixture._replace(means=means, covariances=symmetric(covariances))

@@ -1,65 +1,98 @@
 """The base station, which sends beacons, then selects, positions and serves a user per cycle."""
 
-from collections.abc import Callable, Iterable, Mapping
+import collections
+import dataclasses
+import enum
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import (
-    NOT_BEACONING,
-    AckFilter,
-    Cycle,
-    OutageLog,
-    State,
-    UserInstances,
-    UserScheduler,
-    parse_users,
-    timeouts,
+from rhs_isac_ros.protocol.events import Event, Outcome, Timeout
+from rhs_isac_ros.protocol.role import (
+    ANY,
+    Drops,
+    EventT,
+    NewestDict,
+    StateMachine,
+    Transition,
+    on,
 )
-from rhs_isac_ros.protocol.events import (
-    Action,
-    CodebookOffered,
-    Event,
-    LocateRequested,
-    LogMessage,
-    Outcome,
-    PauseRequested,
-    PeersChanged,
-    Reply,
-    Resumed,
-    ResumeRequested,
-    Send,
-    SettingsOffered,
-    StepRequested,
-    StoodBy,
-    Timeout,
-)
-from rhs_isac_ros.protocol.role import ANY, EventT, StateMachine, Transition, always
 from rhs_isac_ros.protocol.settings import BaseStationSettings, PendingSettings
+from rhs_isac_ros.protocol.user_registry import (
+    LAST_NUMBER,
+    MAX_USERS,
+    UserRegistry,
+    join_users,
+    parse_users,
+)
 
 
-class Row(Transition[State, 'BaseStation', EventT]):
+class State(enum.Enum):
+    """States of the base station."""
+
+    WAITING = 'waiting'            # waits for a codebook and the other roles
+    PAUSED = 'paused'              # waits for an operator to resume or step the cycles
+    RESTING = 'resting'            # waits between cycles
+    BEACONING = 'beaconing'        # waits for acks
+    CONFIGURING = 'configuring'    # waits for the RHS to report the configurations of all bands
+    SOUNDING = 'sounding'          # waits for the feed signals of all bands
+    ESTIMATING = 'estimating'      # waits for the position estimate
+    STEERING = 'steering'          # waits for the beam and for the RHS to apply it
+    TRANSMITTING = 'transmitting'  # waits for the uplink data
+
+
+# Steps of a granted cycle: each waits for a reply and may request it again.
+STEPS = (State.CONFIGURING, State.SOUNDING, State.ESTIMATING, State.STEERING, State.TRANSMITTING)
+NOT_BEACONING = tuple(state for state in State if state is not State.BEACONING)
+# The reasons for a lost cycle that concern one user; all others concern the whole network.
+_USER_REASONS = (Outcome.USER_GONE, Outcome.NO_FIX)
+
+
+@dataclasses.dataclass
+class Cycle:
+    """The memory of one cycle."""
+
+    cycle_id: int
+    codebook: Codebook | None = None  # the one offered last before the latest beacon
+    attempt: int = 0  # number of beacons sent before the current one
+    user: int = 0     # user that was granted the cycle; 0 before the grant
+    # The granted instance of the user; if unknown, that of the first signals; otherwise 0.
+    user_instance: int = 0
+    # Instance of the channel that sent the first signals; 0 before them or if unknown.
+    channel: int = 0
+    # Bands whose configurations the RHS has reported.
+    configured: set[int] = dataclasses.field(default_factory=set)
+    # Feed signals by band, complex128 [F, N_SB, K].
+    signals: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
+    stamp_ns: int = 0  # time of the first of them [ns]; 0 if unknown
+    # Signals that were sent to the positioner, once all bands are complete.
+    received: m.ReceivedSignals | None = None
+    beam: m.Beam | None = None
+    beam_applied: bool = False  # whether the RHS has reported the configuration of the beam
+    # Time at which each phase began [s]; NaN before. The latest beacon begins the first.
+    began_s: np.ndarray = dataclasses.field(
+        default_factory=lambda: np.full(len(m.Phase), math.nan))
+
+    @property
+    def codebook_id(self) -> str:
+        """Id of the codebook; empty if there is none."""
+        return self.codebook.id if self.codebook else ''
+
+
+class Row(Transition['BaseStation', EventT]):
     """A row of the table."""
 
 
-def give_up(
-        source: State, event: type[EventT], outcome: Outcome,
-        before: tuple[Callable[['BaseStation', EventT, float], Iterable[Action] | None], ...] = (),
-) -> Row[EventT]:
-    """Return a row that ends the cycle without service; `outcome` is counted and published."""
-    def abandon(role: 'BaseStation', event: EventT, now_s: float) -> list[Action]:
-        return role.abandon(event, now_s, outcome)
-
-    return Row((source,), event, always, (*before, abandon), State.RESTING, outcome)
-
-
-def reply(success: bool, text: str) -> Callable[['BaseStation', Event, float], list[Action]]:
-    """Return an action that answers an operator; see `BaseStation.fill` for placeholders."""
-    def reply(role: 'BaseStation', event: Event, now_s: float) -> list[Action]:
-        return [Reply(success, role.fill(text))]
+def reply(success: bool, text: str) -> Callable[['BaseStation', Event], None]:
+    """Return a step that answers an operator; see `BaseStation.fill` for placeholders."""
+    def reply(role: 'BaseStation', event: Event) -> None:
+        role.act(events.Reply(success, role.fill(text)))
 
     return reply
 
@@ -67,7 +100,7 @@ def reply(success: bool, text: str) -> Callable[['BaseStation', Event, float], l
 reply_resumed = reply(True, 'resumed{waiting}')
 
 
-class BaseStation(StateMachine[State]):
+class BaseStation(StateMachine):
     """The role of the base station.
 
     Parameters
@@ -84,16 +117,8 @@ class BaseStation(StateMachine[State]):
 
     SENDS = (m.Beacon, m.Grant, m.RhsCommand, m.PilotRequest, m.ReceivedSignals, m.Data,
              m.ProtocolState)
-    RECEIVES = (m.Ack, m.RhsConfiguration, m.FeedSignals, m.PositionEstimate, m.NoFix, m.Beam,
-                m.Data)
 
     STATES = State
-    EVENT_NAMES = {
-        CodebookOffered: 'codebook', PeersChanged: 'peers', SettingsOffered: 'settings',
-        PauseRequested: 'pause', ResumeRequested: 'resume', StepRequested: 'step',
-        LocateRequested: 'locate', StoodBy: 'stood_by', Resumed: 'resumed', Timeout: 'timeout',
-        m.Ack: 'ack', m.RhsConfiguration: 'configured', m.FeedSignals: 'signals',
-        m.PositionEstimate: 'estimate', m.NoFix: 'no_fix', m.Beam: 'beam', m.Data: 'delivered'}
     BLOCKED_STATES = frozenset({State.WAITING})
     WORLD_STATES = frozenset({State.RESTING})
 
@@ -101,498 +126,460 @@ class BaseStation(StateMachine[State]):
             self, scenario: Scenario, settings: BaseStationSettings, rng: np.random.Generator,
             receiver: Callable[[Codebook, np.ndarray, int, int, bool], np.ndarray],
             first_cycle_id: int = 1) -> None:
-        super().__init__(State.WAITING, {})
+        super().__init__(State.WAITING)
         self._scenario, self._receiver = scenario, receiver
-        self._users, self._instances = UserScheduler(settings.policy, rng), UserInstances()
+        self._bands = frozenset(range(scenario.n_bands))
+        self._users = UserRegistry(settings.policy, rng)
         self._settings = PendingSettings(settings)
-        self._pausing = False  # whether a pause begins after the current cycle
+        # Acks by user in the current second; discarded every second, which bounds the memory.
+        self._acks: collections.Counter[int] = collections.Counter()
+        self._second = 0
         self._use(settings)
-        # The codebook of the current cycle, and the one for the next.
-        self._codebook: Codebook | None = None
-        self._offered: Codebook | None = None
+        self._pause_requested = False  # whether a pause begins after the current cycle
+        self._offered: Codebook | None = None  # codebook for the next cycle
         # Roles that are missing; None before the first report.
         self._missing: tuple[str, ...] | None = None
-        self._outages, self._cycle = OutageLog(), Cycle(first_cycle_id - 1)
+        self._cycle = Cycle(first_cycle_id - 1)
+        # Outages that were logged and last, by reason and user; user 0 for the whole network.
+        self._outages: NewestDict[tuple[str, int], None] = NewestDict(MAX_USERS)
+        # What the last warning listed as missing; empty once a cycle has begun.
+        self._logged_lacking: tuple[str, ...] = ()
+        # Whether a cycle was served since something was missing.
+        self._serving = False
 
     def _use(self, settings: BaseStationSettings) -> None:
-        self._users.set_policy(settings.policy)
-        self._ack_filter = AckFilter(
-            parse_users(settings.allowed_users), settings.ack_rate_hz, settings.max_users)
-        self._timeouts_s = timeouts(settings, self._pausing)
+        self._users.policy = settings.policy
+        self._allowed = parse_users(settings.allowed_users) or (range(LAST_NUMBER + 1),)
+        self._acks.clear()
+
+    def timeout_s(self, state: enum.Enum) -> float | None:
+        """Return the timeout of a state [s]; the attempts of a step share its timeout equally.
+
+        There is no rest before a pause.
+        """
+        settings = self._settings.in_use
+        if state is State.BEACONING:
+            return settings.ack_timeout_s
+        if state is State.RESTING:
+            return 0.0 if self._pause_requested else settings.rest_s
+        return settings.step_timeout_s / (settings.retries + 1) if state in STEPS else None
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and the codebook in use, pending settings and conflicts."""
-        return (self._settings.describe() | {'codebook_id': self._codebook_id}
-                | self._instances.conflicts())
-
-    @property
-    def _codebook_id(self) -> str:
-        return self._codebook.id if self._codebook else ''
+        return (self._settings.describe() | {'codebook_id': self._cycle.codebook_id}
+                | self._users.conflicts(self.now_s))
 
     # Guards
 
-    def not_ready(self, event: Event, now_s: float) -> bool:
-        """Whether a role or the codebook is missing."""
-        return self._missing != () or not self._offered
+    def _not_ready(self, event: Event) -> bool:
+        """Whether a role or the codebook is missing, once the event is taken into account."""
+        missing = event.missing if isinstance(event, events.PeersChanged) else self._missing
+        has_codebook = self._offered or isinstance(event, events.CodebookOffered)
+        return missing != () or not has_codebook
 
-    def pausing(self, event: Event, now_s: float) -> bool:
-        """Whether an operator has requested a pause."""
-        return self._pausing
+    def _pausing(self, event: Event) -> bool:
+        return self._pause_requested
 
-    def peers_present(self, event: CodebookOffered, now_s: float) -> bool:
-        """Whether all roles are present."""
-        return self._missing == ()
-
-    def ready_with_peers(self, event: PeersChanged, now_s: float) -> bool:
-        """Whether all roles are present now and a codebook was offered."""
-        return not event.missing and self._offered is not None
-
-    def some_acks(self, event: Timeout, now_s: float) -> bool:
-        """Whether at least one user answered the beacon."""
+    def _some_acks(self, event: Timeout) -> bool:
         return bool(self._users.answered)
 
-    def may_retry(self, event: Timeout, now_s: float) -> bool:
-        """Whether the current step may be requested again."""
+    def _may_retry(self, event: Timeout) -> bool:
         return self.repeats < self._settings.in_use.retries
 
-    def wrong_cycle(self, event: m.Message, now_s: float) -> bool:
-        """Whether a message belongs to another cycle."""
-        return event.cycle_id != self._cycle.id
+    def _wrong_cycle(self, event: m.Message) -> bool:
+        return event.cycle_id != self._cycle.cycle_id
 
-    def wrong_user(self, event: Any, now_s: float) -> bool:
-        """Whether a message concerns a user other than the granted one."""
+    def _wrong_user(self, event: Any) -> bool:
         return bool(event.user != self._cycle.user)
 
-    def wrong_instance(self, event: m.FeedSignals, now_s: float) -> bool:
-        """Whether feed signals concern another instance of the user or of the channel."""
-        cycle = self._cycle
-        return not (m.same_instance(event.user_instance, cycle.user_instance)
-                    and m.same_instance(event.sender, cycle.channel))
+    def _wrong_instance(self, event: m.FeedSignals) -> bool:
+        return not (m.same_instance(event.user_instance, self._cycle.user_instance)
+                    and m.same_instance(event.sender, self._cycle.channel))
 
-    def wrong_codebook(self, event: Any, now_s: float) -> bool:
-        """Whether a message refers to another codebook."""
-        return bool(event.codebook_id != self._codebook_id)
+    def _wrong_codebook(self, event: Any) -> bool:
+        return bool(event.codebook_id != self._cycle.codebook_id)
 
-    def duplicate_signals(self, event: m.FeedSignals, now_s: float) -> bool:
-        """Whether the signals of the band were received before."""
+    def _duplicate_signals(self, event: m.FeedSignals) -> bool:
         return event.band in self._cycle.signals
 
-    def not_delivered_uplink(self, event: m.Data, now_s: float) -> bool:
-        """Whether data are anything other than uplink data delivered by the channel."""
+    def _not_delivered_uplink(self, event: m.Data) -> bool:
         return event.stage is m.Stage.OFFERED or event.direction is m.Direction.DOWNLINK
 
-    def not_allowed(self, event: m.Ack, now_s: float) -> bool:
-        """Whether the user is not in the list of allowed users, or its number is too high."""
-        return not self._ack_filter.allows(event.user)
+    def _not_allowed(self, event: m.Ack) -> bool:
+        return not self._allows(event.user)
 
-    def too_often(self, event: m.Ack, now_s: float) -> bool:
-        """Whether the user has reached its rate of acks."""
-        return not self._ack_filter.within_rate(event.user, now_s)
+    def _allows(self, user: int) -> bool:
+        return user <= self._settings.in_use.max_users and any(
+            user in users for users in self._allowed)
 
-    def number_taken(self, event: m.Ack, now_s: float) -> bool:
-        """Whether another instance owns the number of the user."""
-        return self._instances.is_taken(event.user, event.sender, now_s)
+    def _too_often(self, event: m.Ack) -> bool:
+        counted = self._acks[event.user] if math.floor(self.now_s) == self._second else 0
+        return counted + 1 > self._settings.in_use.ack_rate_hz
 
-    def duplicate_ack(self, event: m.Ack, now_s: float) -> bool:
-        """Whether the user acknowledged this cycle before."""
+    def _number_taken(self, event: m.Ack) -> bool:
+        return self._users.is_taken(event.user, event.sender, self.now_s)
+
+    def _duplicate_ack(self, event: m.Ack) -> bool:
         return event.user in self._users.answered
 
-    def last_ack(self, event: m.Ack, now_s: float) -> bool:
-        """Whether the ack completes the set of users to wait for."""
+    def _last_ack(self, event: m.Ack) -> bool:
         return self._users.is_complete_with(event.user)
 
-    def last_signals(self, event: m.FeedSignals, now_s: float) -> bool:
-        """Whether the signals of all other bands have been received."""
-        return len(self._cycle.signals | {event.band: event}) == self._scenario.n_bands
+    def _last_signals(self, event: m.FeedSignals) -> bool:
+        return self._cycle.signals.keys() | {event.band} == self._bands
 
-    def last_configuration(self, event: m.RhsConfiguration, now_s: float) -> bool:
-        """Whether the RHS has reported the configurations of all bands with this report."""
-        return (event.mode is m.Mode.POSITIONING
-                and len(self._cycle.configured | {event.band}) == self._scenario.n_bands)
-
-    def for_positioning(self, event: m.RhsConfiguration, now_s: float) -> bool:
-        """Whether the RHS has reported the configurations of any band."""
+    def _for_positioning(self, event: m.RhsConfiguration) -> bool:
         return event.mode is m.Mode.POSITIONING
 
-    def for_beam(self, event: m.RhsConfiguration, now_s: float) -> bool:
-        """Whether the RHS has applied the configuration of a beam."""
-        return event.mode is m.Mode.TRANSMISSION
+    def _last_configuration(self, event: m.RhsConfiguration) -> bool:
+        return (self._for_positioning(event)
+                and self._cycle.configured | {event.band} == self._bands)
 
-    def for_known_beam(self, event: m.RhsConfiguration, now_s: float) -> bool:
-        """Whether the RHS has applied a beam that the base station has received."""
-        return event.mode is m.Mode.TRANSMISSION and self._cycle.beam is not None
+    def _beam_known(self, event: m.RhsConfiguration) -> bool:
+        return self._cycle.beam is not None
 
-    def beam_applied(self, event: m.Beam, now_s: float) -> bool:
-        """Whether the RHS has reported the beam before the beam itself arrived."""
+    def _beam_applied(self, event: m.Beam) -> bool:
         return self._cycle.beam_applied
 
-    # Actions, in the order of a cycle
+    # Steps, in the order of a cycle
 
-    def store_codebook(self, event: CodebookOffered, now_s: float) -> None:
-        """Store a codebook for the next cycle."""
+    def _store_codebook(self, event: events.CodebookOffered) -> None:
         self._offered = event.codebook
 
-    def store_peers(self, event: PeersChanged, now_s: float) -> None:
-        """Store which roles are missing."""
+    def _store_peers(self, event: events.PeersChanged) -> None:
         self._missing = event.missing
 
-    def forget_peers(self, event: StoodBy, now_s: float) -> None:
+    def _forget_peers(self, event: events.StoodBy) -> None:
         """Forget which roles are missing, so that no cycle begins until they are known again."""
         self._missing = None
 
-    def skip_cycles(self, event: Resumed, now_s: float) -> None:
+    def _skip_cycles(self, event: events.Resumed) -> None:
         """Skip the ids of cycles that another base station has used."""
-        self._cycle = Cycle(max(event.first_cycle_id - 1, self._cycle.id))
+        self._cycle.cycle_id = max(event.first_cycle_id - 1, self._cycle.cycle_id)
 
-    def store_settings(self, event: SettingsOffered, now_s: float) -> None:
-        """Store settings until they may be applied."""
+    def _store_settings(self, event: events.SettingsOffered) -> None:
         self._settings.latest = event.settings
 
-    def apply_settings(self, event: Event, now_s: float) -> list[Action]:
-        """Apply the latest settings."""
-        messages = self._settings.apply()
-        if messages:
-            self._use(self._settings.in_use)
-            removed = self._users.remove_all_except(self._ack_filter.allows)
-            messages += self._outages.log_removed_users(
-                removed, self._settings.in_use.allowed_users)
-        return [*messages]
+    def _apply_settings(self, event: Event) -> None:
+        for message in self._settings.apply():
+            self.act(message)
+            settings = self._settings.in_use
+            self._use(settings)
+            for user in self._users.remove_all_except(self._allows):
+                self.log(f'user {user} removed: not in allowed_users {settings.allowed_users!r}')
 
-    def log_not_ready(self, event: Event, now_s: float) -> list[Action]:
-        """Log what is missing, once the presence of the other roles is known."""
-        if self._missing is None:
-            return []
-        return [*self._outages.log_waiting(self._lacking())]
+    def _log_not_ready(self, event: Event) -> None:
+        """Log what is missing, unless it was logged or the other roles are not known yet."""
+        lacking = self._lacking()
+        if self._missing is not None:
+            self._serving = False
+            if lacking != self._logged_lacking:
+                self._logged_lacking = lacking
+                self.log(f'waiting for {", ".join(lacking)}', warning=True)
 
     def fill(self, text: str) -> str:
         """Fill the id of the cycle, and what the next one lacks, into a text."""
         lacking = ', '.join(self._lacking())
-        return text.format(cycle=self._cycle.id, lacking=lacking,
+        return text.format(cycle=self._cycle.cycle_id, lacking=lacking,
                            waiting=f'; waiting for {lacking}' if lacking else '')
 
     def _lacking(self) -> tuple[str, ...]:
         roles = ('the other roles',) if self._missing is None else self._missing
         return roles if self._offered else (*roles, 'codebook')
 
-    def prefer_user(self, event: LocateRequested, now_s: float) -> None:
-        """Serve a user before others once."""
+    def _prefer_user(self, event: events.LocateRequested) -> None:
         self._users.request(event.user)
 
-    def pause(self, event: PauseRequested, now_s: float) -> None:
-        """Store that a pause was requested."""
-        self._pausing = True
-        self._timeouts_s = timeouts(self._settings.in_use, self._pausing)
+    def _pause(self, event: events.PauseRequested) -> None:
+        self._pause_requested = True
 
-    def resume(self, event: ResumeRequested, now_s: float) -> list[Action]:
-        """Store that no pause is requested, and log that cycles resume."""
-        self._pausing = False
-        self._timeouts_s = timeouts(self._settings.in_use, self._pausing)
-        return [LogMessage('resumed')]
+    def _resume(self, event: events.ResumeRequested) -> None:
+        self._pause_requested = False
+        self.log('resumed')
 
-    def log_paused(self, event: PauseRequested | Timeout, now_s: float) -> list[Action]:
-        """Log that the pause begins."""
-        return [LogMessage(f'paused after cycle {self._cycle.id}')]
+    def _log_paused(self, event: events.PauseRequested | Timeout) -> None:
+        self.log(f'paused after cycle {self._cycle.cycle_id}')
 
-    def log_unanswered(self, event: Timeout, now_s: float) -> list[Action]:
-        """Log that the pause begins because no user answered the beacon."""
-        return [LogMessage(f'paused: no user answered the beacon of cycle {self._cycle.id}')]
+    def _log_unanswered(self, event: Timeout) -> None:
+        self.log(f'paused: no user answered the beacon of cycle {self._cycle.cycle_id}')
 
-    def begin_cycle(self, event: Event, now_s: float) -> list[Action]:
-        """Begin a cycle with its first beacon."""
-        self._outages.clear_waiting()
-        self._cycle = Cycle(self._cycle.id + 1)
-        self._users.begin_cycle()
-        return self._beacon(now_s)
+    def _begin_cycle(self, event: Event) -> None:
+        self._logged_lacking = ()
+        self._cycle = Cycle(self._cycle.cycle_id + 1)
+        self._beacon()
 
-    def beacon_again(self, event: Timeout, now_s: float) -> list[Action]:
+    def _beacon_again(self, event: Timeout) -> None:
         """Send another beacon of the cycle, which invites more users if not all were invited."""
         # If all users were invited, they may be absent for as long as the base station is alone.
-        lost = [] if self._users.all_invited else self._lose_absent(now_s)
+        if not self._users.all_invited:
+            self._lose_absent()
         self._cycle.attempt += 1
-        return [*self._beacon(now_s), *lost]
+        self._beacon()
 
-    def _beacon(self, now_s: float) -> list[Action]:
-        self._codebook = self._offered  # nothing before the grant depends on the codebook
-        self._cycle.began_s[m.Phase.BEACONING] = now_s
+    def _beacon(self) -> None:
+        self._cycle.codebook = self._offered  # nothing before the grant depends on the codebook
+        self._cycle.began_s[m.Phase.BEACONING] = self.now_s
         first, last = self._users.invite(self._cycle.attempt)
-        return [Send(m.Beacon(cycle_id=self._cycle.id, attempt=self._cycle.attempt,
-                              first_user=first, last_user=last))]
+        self._send(m.Beacon, attempt=self._cycle.attempt, first_user=first, last_user=last)
 
-    def count_ack(self, event: m.Ack, now_s: float) -> None:
-        """Count an ack against the user's rate."""
-        self._ack_filter.count(event.user, now_s)
+    def _send(self, kind: type[m.Message], **fields: Any) -> None:
+        """Send a message of the cycle, which carries its user and its codebook."""
+        self.send(m.derive(kind, self._cycle, **fields))
 
-    def accept_ack(self, event: m.Ack, now_s: float) -> list[Action]:
-        """Add a user to those that may be granted the cycle."""
-        self._users.add_answer(event.user)
-        return [*self._instances.accept(event.user, event.sender, now_s)]
+    def _count_ack(self, event: m.Ack) -> None:
+        second = math.floor(self.now_s)
+        if second != self._second:
+            self._second = second
+            self._acks.clear()
+        self._acks[event.user] += 1
 
-    def reject_number(self, event: m.Ack, now_s: float) -> None:
-        """Count an ack of an instance that does not own the number of the user."""
-        self._instances.reject(event.user)
+    def _reject_number(self, event: m.Ack) -> None:
+        self._users.reject(event.user)
 
-    def register_user(self, event: m.Ack, now_s: float) -> list[Action]:
+    def _accept_ack(self, event: m.Ack) -> None:
+        self.log(self._users.add_answer(event.user, event.sender, self.now_s), warning=True)
+
+    def _register_user(self, event: m.Ack) -> None:
         """Register a user, for which the next cycle waits as well."""
-        self._users.register(event.user)
-        return [*self._instances.accept(event.user, event.sender, now_s)]
+        self.log(self._users.register(event.user, event.sender, self.now_s), warning=True)
 
-    def grant(self, event: m.Ack | Timeout, now_s: float) -> list[Action]:
-        """Grant the cycle to one of the users that answered."""
-        lost = self._lose_absent(now_s)
-        cycle = self._cycle
-        cycle.user = self._users.select()
-        cycle.user_instance = self._instances.owner(cycle.user)
-        grant = m.Grant(cycle_id=cycle.id, user=cycle.user, user_instance=cycle.user_instance)
-        return [Send(grant), *lost]
+    def _grant(self, event: m.Ack | Timeout) -> None:
+        """Grant the cycle to one of the users that answered, and begin to position it."""
+        self._lose_absent()
+        self._cycle.user = self._users.select()
+        self._cycle.user_instance = self._users.owner(self._cycle.user)
+        self._send(m.Grant)
+        self._command_bands(event)
+        self._announce(m.Phase.POSITIONING)
 
-    def _lose_absent(self, now_s: float) -> list[Action]:
+    def _lose_absent(self) -> None:
         """Count the invited users that did not answer, and remove those that no longer do."""
         lost = self._users.remove_absent()
         self.count(Outcome.USER_LOST, len(lost))
-        self._instances.forget(lost, now_s)
-        return [*self._outages.log_lost_users(lost)]
+        if lost:
+            plural, verb = ('s', 'answer') if len(lost) > 1 else ('', 'answers')
+            self.log(f'user{plural} {join_users(lost)} no longer {verb}', warning=True)
 
-    def announce_positioning(self, event: Event, now_s: float) -> list[Action]:
-        """Publish the phase."""
-        return self._announce(m.Phase.POSITIONING, now_s)
+    def _command_bands(self, event: Event) -> None:
+        for band in sorted(self._bands - self._cycle.configured):
+            self._send(m.RhsCommand, band=band)
 
-    def command_bands(self, event: Event, now_s: float) -> list[Action]:
-        """Request the configurations that the RHS has not reported."""
-        return self._command(set(range(self._scenario.n_bands)) - self._cycle.configured)
+    def _command_silent_bands(self, event: Event) -> None:
+        for band in sorted(self._bands - self._cycle.signals.keys()):
+            self._send(m.RhsCommand, band=band)
 
-    def command_silent_bands(self, event: Event, now_s: float) -> list[Action]:
-        """Request the configurations of the bands whose signals lack."""
-        return self._command(set(range(self._scenario.n_bands)) - self._cycle.signals.keys())
-
-    def _command(self, bands: set[int]) -> list[Action]:
-        return [Send(m.RhsCommand(cycle_id=self._cycle.id, band=band,
-                                  codebook_id=self._codebook_id)) for band in sorted(bands)]
-
-    def store_configured(self, event: m.RhsConfiguration, now_s: float) -> None:
-        """Store that the RHS has reported the configurations of a band."""
+    def _store_configured(self, event: m.RhsConfiguration) -> None:
         self._cycle.configured.add(event.band)
 
-    def request_pilots(self, event: Event, now_s: float) -> list[Action]:
-        """Request the pilots of all bands, from the first whose signals lack."""
-        return [Send(self._cycle.pilot_request(self._scenario.n_bands, self._scenario.n_frames))]
+    def _request_pilots(self, event: Event) -> None:
+        first = min(self._bands - self._cycle.signals.keys())
+        self._send(m.PilotRequest, band=first, last_band=max(self._bands),
+                   n_frames=self._scenario.n_frames)
 
-    def store_signals(self, event: m.FeedSignals, now_s: float) -> None:
+    def _store_signals(self, event: m.FeedSignals) -> None:
         """Store the feed signals of a band; those of all bands come from the same instances."""
-        self._cycle.add_signals(event)
-
-    def send_signals(self, event: m.FeedSignals, now_s: float) -> list[Action]:
-        """Combine the signals of all bands and send the received signals to the positioner."""
-        assert self._codebook
         cycle = self._cycle
-        feeds = np.stack([cycle.signals[band] for band in range(self._scenario.n_bands)])
-        signals = self._receiver(self._codebook, feeds, cycle.user, cycle.id,
+        cycle.user_instance = cycle.user_instance or event.user_instance
+        cycle.channel = cycle.channel or event.sender
+        cycle.stamp_ns = cycle.stamp_ns or event.stamp_ns
+        cycle.signals[event.band] = event.signals
+
+    def _send_signals(self, event: m.FeedSignals) -> None:
+        """Combine the signals of all bands and send the received signals to the positioner."""
+        cycle = self._cycle
+        assert cycle.codebook
+        feeds = np.stack([cycle.signals[band] for band in sorted(self._bands)])
+        signals = self._receiver(cycle.codebook, feeds, cycle.user, cycle.cycle_id,
                                  self._settings.in_use.receiver_noise)
-        cycle.received = m.ReceivedSignals(
-            cycle_id=cycle.id, stamp_ns=cycle.stamp_ns, user=cycle.user,
-            user_instance=cycle.user_instance, codebook_id=self._codebook_id, signals=signals)
-        return [Send(cycle.received), *self._announce(m.Phase.ESTIMATING, now_s)]
+        cycle.received = m.derive(
+            m.ReceivedSignals, cycle, stamp_ns=cycle.stamp_ns, signals=signals)
+        self.send(cycle.received)
+        self._announce(m.Phase.ESTIMATING)
 
-    def resend_signals(self, event: Timeout, now_s: float) -> list[Action]:
-        """Send the received signals again."""
+    def _resend_signals(self, event: Timeout) -> None:
         assert self._cycle.received
-        return [Send(self._cycle.received)]
+        self.send(self._cycle.received)
 
-    def store_beam(self, event: m.Beam, now_s: float) -> None:
-        """Store the beam."""
+    def _store_beam(self, event: m.Beam) -> None:
         self._cycle.beam = event
 
-    def store_beam_applied(self, event: m.RhsConfiguration, now_s: float) -> None:
-        """Store that the RHS has applied the beam."""
+    def _store_beam_applied(self, event: m.RhsConfiguration) -> None:
         self._cycle.beam_applied = True
 
-    def begin_transmission(self, event: Event, now_s: float) -> list[Action]:
-        """Send the downlink data and publish the phase."""
-        return [*self.send_downlink(event, now_s),
-                *self._announce(m.Phase.TRANSMITTING, now_s)]
+    def _begin_transmission(self, event: Event) -> None:
+        self._send_downlink(event)
+        self._announce(m.Phase.TRANSMITTING)
 
-    def send_downlink(self, event: Event, now_s: float) -> list[Action]:
+    def _send_downlink(self, event: Event) -> None:
         """Send as much data as the beam is expected to carry."""
         assert self._cycle.beam
         duration_s = self._settings.in_use.data_duration_s
-        return [Send(m.Data(
-            cycle_id=self._cycle.id, user=self._cycle.user, direction=m.Direction.DOWNLINK,
-            stage=m.Stage.OFFERED, duration_s=duration_s,
-            bits=self._cycle.beam.expected_bps * duration_s // 1))]
+        self._send(m.Data, direction=m.Direction.DOWNLINK, stage=m.Stage.OFFERED,
+                   duration_s=duration_s, bits=self._cycle.beam.expected_bps * duration_s // 1)
 
-    def remove_user(self, event: Timeout, now_s: float) -> None:
+    def _remove_user(self, event: Timeout) -> None:
         """Stop waiting for the user until it answers again."""
         self._users.remove(self._cycle.user)
-        self._instances.forget([self._cycle.user], now_s)
 
-    def abandon(self, event: Any, now_s: float, outcome: Outcome) -> list[Action]:
-        """End the cycle without service."""
-        cycle = self._cycle
-        return [Send(cycle.report(m.Phase.BEACONING, now_s, outcome.value)),
-                *self._outages.log_lost_cycle(cycle.id, cycle.user, outcome.value),
-                *self.apply_settings(event, now_s)]
+    def _abandon(self, event: Timeout | m.NoFix) -> None:
+        """End the cycle without service; log it unless the outage is known."""
+        assert self.outcome
+        cycle, reason = self._cycle, self.outcome.value
+        self._report(m.Phase.BEACONING, reason)
+        outage = reason, cycle.user if self.outcome in _USER_REASONS else 0
+        if outage not in self._outages:
+            self._outages.put(outage, None)
+            self.log(f'cycle {cycle.cycle_id} of user {cycle.user} given up: {reason}',
+                     warning=True)
+        self._apply_settings(event)
 
-    def finish(self, event: m.Data, now_s: float) -> list[Action]:
-        """End the cycle: the user was served."""
-        cycle = self._cycle
-        return [Send(cycle.report(m.Phase.BEACONING, now_s, 'served')),
-                *self._outages.log_served_cycle(
-                    cycle.id, cycle.user, self._codebook_id, self._users.n_users),
-                *self.apply_settings(event, now_s)]
+    def _finish(self, event: m.Data) -> None:
+        """End the cycle with service; log that service begins, or which outages have ended."""
+        cycle, n_users = self._cycle, len(self._users)
+        self._report(m.Phase.BEACONING, 'served')
+        if not self._serving:
+            self._serving = True
+            self.log(f'serving: codebook {cycle.codebook_id}, {n_users} user{"s"[:n_users != 1]}')
+        ended = [outage for outage in self._outages if outage[1] in (0, cycle.user)]
+        for outage in ended:
+            del self._outages[outage]
+        if ended:
+            reasons = ', '.join(sorted({reason for reason, _ in ended}))
+            self.log(f'cycle {cycle.cycle_id}: user {cycle.user} served again after: {reasons}')
+        self._apply_settings(event)
 
-    def _announce(self, phase: m.Phase, now_s: float) -> list[Action]:
-        self._cycle.began_s[phase] = now_s
-        return [Send(self._cycle.report(phase, now_s))]
+    def _announce(self, phase: m.Phase) -> None:
+        self._cycle.began_s[phase] = self.now_s
+        self._report(phase)
 
-    # Messages that are dropped in every state, before the rows of the table.
-    DROPS = {
-        m.Ack: {not_allowed: Outcome.NOT_ALLOWED, too_often: Outcome.TOO_OFTEN},
-        m.RhsConfiguration: {wrong_cycle: Outcome.WRONG_CYCLE,
-                             wrong_codebook: Outcome.WRONG_CODEBOOK},
-        m.FeedSignals: {wrong_cycle: Outcome.WRONG_CYCLE, wrong_user: Outcome.WRONG_USER,
-                        wrong_instance: Outcome.WRONG_INSTANCE,
-                        duplicate_signals: Outcome.DUPLICATE},
-        **dict.fromkeys((m.PositionEstimate, m.NoFix, m.Beam), {
-            wrong_cycle: Outcome.WRONG_CYCLE, wrong_user: Outcome.WRONG_USER,
-            wrong_codebook: Outcome.WRONG_CODEBOOK}),
-        m.Data: {not_delivered_uplink: None, wrong_cycle: Outcome.WRONG_CYCLE,
-                 wrong_user: Outcome.WRONG_USER}}
+    def _report(self, phase: m.Phase, outcome: str = '') -> None:
+        """Publish that a phase has begun, or that the cycle has ended."""
+        began_s = self._cycle.began_s
+        beacon_s = began_s[m.Phase.BEACONING]
+        self._send(m.ProtocolState, phase=phase, outcome=outcome, began_s=began_s - beacon_s,
+                   elapsed_s=float(self.now_s - beacon_s))
+
+    # What a message of a cycle must match.
+    _OF_CYCLE: Drops = {_wrong_cycle: Outcome.WRONG_CYCLE}
+    _OF_USER: Drops = _OF_CYCLE | {_wrong_user: Outcome.WRONG_USER}
+    _OF_CODEBOOK: Drops = {_wrong_codebook: Outcome.WRONG_CODEBOOK}
+    _DELIVERED: Drops = {_not_delivered_uplink: None}
 
     # Every event, in the order in which its rows are tried.
     TABLE = (
-        # Offers and presence. A new codebook and new settings take effect with the next cycle.
-        Row((State.WAITING,), CodebookOffered, guard=peers_present,
-            actions=(store_codebook, begin_cycle), target=State.BEACONING),
-        Row((State.WAITING,), CodebookOffered, actions=(store_codebook, log_not_ready)),
-        Row(ANY, CodebookOffered, actions=(store_codebook,)),
-
-        Row((State.WAITING,), PeersChanged, guard=ready_with_peers,
-            actions=(store_peers, begin_cycle), target=State.BEACONING),
-        Row((State.WAITING,), PeersChanged, actions=(store_peers, log_not_ready)),
-        Row(ANY, PeersChanged, actions=(store_peers,)),
-
-        Row((State.WAITING, State.PAUSED), SettingsOffered,
-            actions=(store_settings, apply_settings)),
-        Row((State.RESTING,), SettingsOffered, actions=(store_settings, apply_settings),
-            restart_timeout=True),
-        Row(ANY, SettingsOffered, actions=(store_settings,)),
-
-        # A newer base station serves, or has gone. A pause outlasts both.
-        Row(ANY, StoodBy, guard=pausing, actions=(forget_peers,), target=State.PAUSED),
-        Row(ANY, StoodBy, actions=(forget_peers,), target=State.WAITING),
-        Row((State.WAITING, State.PAUSED), Resumed, actions=(skip_cycles,)),
-
-        # Requests of an operator. A pause begins between two cycles; a step runs one cycle of it.
-        Row((State.PAUSED,), PauseRequested, actions=(reply(True, 'already paused'),)),
-        Row((State.WAITING, State.RESTING), PauseRequested,
-            actions=(pause, log_paused, reply(True, 'paused')), target=State.PAUSED),
-        Row(ANY, PauseRequested,
-            actions=(pause, reply(True, 'the pause begins after cycle {cycle}'))),
-
-        Row((State.PAUSED,), ResumeRequested, guard=not_ready,
-            actions=(resume, log_not_ready, reply_resumed), target=State.WAITING),
-        Row((State.PAUSED,), ResumeRequested, actions=(resume, begin_cycle, reply_resumed),
-            target=State.BEACONING),
-        Row(ANY, ResumeRequested, guard=pausing, actions=(resume, reply_resumed)),
-        Row(ANY, ResumeRequested, actions=(reply(True, 'not paused'),)),
-
-        Row((State.PAUSED,), StepRequested, guard=not_ready,
-            actions=(reply(False, 'waiting for {lacking}'),)),
-        Row((State.PAUSED,), StepRequested,
-            actions=(begin_cycle, reply(True, 'cycle {cycle} begins')), target=State.BEACONING),
-        Row(ANY, StepRequested, guard=pausing,
-            actions=(reply(False, 'cycle {cycle} has not ended'),)),
-        Row(ANY, StepRequested, actions=(reply(False, 'not paused; a step requires a pause'),)),
-        Row(ANY, LocateRequested, actions=(prefer_user,)),
-
-        # Timeouts.
-        Row((State.RESTING,), Timeout, guard=pausing, actions=(log_paused,), target=State.PAUSED),
-        Row((State.RESTING,), Timeout, guard=not_ready, actions=(log_not_ready,),
-            target=State.WAITING),
-        Row((State.RESTING,), Timeout, actions=(begin_cycle,), target=State.BEACONING),
-
-        Row((State.BEACONING,), Timeout, guard=some_acks,
-            actions=(grant, command_bands, announce_positioning), target=State.CONFIGURING),
-        Row((State.BEACONING,), Timeout, guard=pausing, actions=(apply_settings, log_unanswered),
-            target=State.PAUSED),
-        Row((State.BEACONING,), Timeout, guard=not_ready, actions=(log_not_ready,),
-            target=State.WAITING),
-        Row((State.BEACONING,), Timeout, actions=(apply_settings, beacon_again),
-            outcome=Outcome.UNANSWERED, restart_timeout=True),
-
-        Row((State.CONFIGURING,), Timeout, guard=may_retry, actions=(command_bands,),
-            outcome=Outcome.RETRY_RHS, restart_timeout=True),
-        give_up(State.CONFIGURING, Timeout, Outcome.RHS_SILENT),
-
-        # Repeat the command too, because the channel may have missed the report of the RHS.
-        Row((State.SOUNDING,), Timeout, guard=may_retry,
-            actions=(command_silent_bands, request_pilots), outcome=Outcome.RETRY_BAND,
-            restart_timeout=True),
-        give_up(State.SOUNDING, Timeout, Outcome.USER_GONE, before=(remove_user,)),
-
-        Row((State.ESTIMATING,), Timeout, guard=may_retry, actions=(resend_signals,),
-            outcome=Outcome.RETRY_POSITION, restart_timeout=True),
-        give_up(State.ESTIMATING, Timeout, Outcome.POSITIONER_SILENT),
-
-        # Each role repeats its reply to a repeated message, so the signals also repeat the beam.
-        Row((State.STEERING,), Timeout, guard=may_retry, actions=(resend_signals,),
-            outcome=Outcome.RETRY_BEAM, restart_timeout=True),
-        give_up(State.STEERING, Timeout, Outcome.TRANSMISSION_SILENT),
-
-        # The channel may have missed the beam or its configuration.
-        Row((State.TRANSMITTING,), Timeout, guard=may_retry,
-            actions=(resend_signals, send_downlink), outcome=Outcome.RETRY_DATA,
-            restart_timeout=True),
-        give_up(State.TRANSMITTING, Timeout, Outcome.DATA_LOST),
-
-        # Acks. All that are not dropped count towards the rate of their user.
-        Row(ANY, m.Ack, guard=wrong_cycle, actions=(count_ack,), outcome=Outcome.WRONG_CYCLE),
-        # Of several nodes with the same number, the first is served.
-        Row(ANY, m.Ack, guard=number_taken, actions=(count_ack, reject_number),
-            outcome=Outcome.NUMBER_TAKEN),
-        Row(ANY, m.Ack, guard=duplicate_ack, actions=(count_ack,), outcome=Outcome.DUPLICATE),
-        # A late ack: this cycle no longer collects acks; the user is registered for the next one.
-        Row(NOT_BEACONING, m.Ack, actions=(count_ack, register_user), outcome=Outcome.LATE_ACK),
-        Row((State.BEACONING,), m.Ack, guard=last_ack,
-            actions=(count_ack, accept_ack, grant, command_bands, announce_positioning),
-            target=State.CONFIGURING),
-        Row((State.BEACONING,), m.Ack, actions=(count_ack, accept_ack)),
-
-        # Reports of the RHS: a band's configurations, or the configuration of the beam.
-        Row((State.CONFIGURING,), m.RhsConfiguration, guard=last_configuration,
-            actions=(store_configured, request_pilots), target=State.SOUNDING),
-        Row((State.CONFIGURING, State.SOUNDING), m.RhsConfiguration, guard=for_positioning,
-            actions=(store_configured,)),
-        Row((State.ESTIMATING, State.STEERING, State.TRANSMITTING), m.RhsConfiguration,
-            guard=for_positioning, outcome=Outcome.DUPLICATE),
-        # The beam and its configuration come from two roles, in either order.
-        Row((State.ESTIMATING,), m.RhsConfiguration, guard=for_beam, actions=(store_beam_applied,),
-            target=State.STEERING),
-        Row((State.STEERING,), m.RhsConfiguration, guard=for_known_beam,
-            actions=(begin_transmission,), target=State.TRANSMITTING),
-        Row((State.STEERING,), m.RhsConfiguration, guard=for_beam, actions=(store_beam_applied,)),
-        # A repeated request may be answered twice.
-        Row((State.TRANSMITTING,), m.RhsConfiguration, guard=for_beam, outcome=Outcome.DUPLICATE),
-
-        # Feed signals.
-        Row((State.SOUNDING,), m.FeedSignals, guard=last_signals,
-            actions=(store_signals, send_signals), target=State.ESTIMATING),
-        Row((State.SOUNDING,), m.FeedSignals, actions=(store_signals,), enter_again=True),
-
-        # Position estimates.
-        Row((State.ESTIMATING,), m.PositionEstimate, target=State.STEERING),
-        Row((State.STEERING,), m.PositionEstimate),
-        Row((State.TRANSMITTING,), m.PositionEstimate, outcome=Outcome.DUPLICATE),
-
-        give_up(State.ESTIMATING, m.NoFix, Outcome.NO_FIX),
-
-        # Beams.
-        Row((State.ESTIMATING,), m.Beam, actions=(store_beam,), target=State.STEERING),
-        Row((State.STEERING,), m.Beam, guard=beam_applied,
-            actions=(store_beam, begin_transmission), target=State.TRANSMITTING),
-        Row((State.STEERING,), m.Beam, actions=(store_beam,)),
-        Row((State.TRANSMITTING,), m.Beam, outcome=Outcome.DUPLICATE),
-
-        # Data. Delivered uplink data end the cycle.
-        Row((State.TRANSMITTING,), m.Data, actions=(finish,), target=State.RESTING),
-        Row((State.PAUSED, State.RESTING), m.Data, outcome=Outcome.DUPLICATE),
+        *on(events.CodebookOffered, 'codebook')(
+            # A new codebook takes effect with the next cycle, as do new settings.
+            Row((State.WAITING,), (_store_codebook, _log_not_ready), guard=_not_ready),
+            Row((State.WAITING,), (_store_codebook, _begin_cycle), State.BEACONING),
+            Row(ANY, (_store_codebook,))),
+        *on(events.PeersChanged, 'peers')(
+            Row((State.WAITING,), (_store_peers, _log_not_ready), guard=_not_ready),
+            Row((State.WAITING,), (_store_peers, _begin_cycle), State.BEACONING),
+            Row(ANY, (_store_peers,))),
+        *on(events.SettingsOffered, 'settings')(
+            Row((State.WAITING, State.PAUSED), (_store_settings, _apply_settings)),
+            Row((State.RESTING,), (_store_settings, _apply_settings), restart_timeout=True),
+            Row(ANY, (_store_settings,))),
+        *on(events.StoodBy, 'stood_by')(
+            # A newer base station serves, or has gone. A pause outlasts both.
+            Row(ANY, (_forget_peers,), State.PAUSED, guard=_pausing),
+            Row(ANY, (_forget_peers,), State.WAITING)),
+        *on(events.Resumed, 'resumed')(
+            Row((State.WAITING, State.PAUSED), (_skip_cycles,))),
+        *on(events.PauseRequested, 'pause')(
+            # A pause begins between two cycles; a step runs one cycle of it.
+            Row((State.PAUSED,), (reply(True, 'already paused'),)),
+            Row((State.WAITING, State.RESTING), (_pause, _log_paused, reply(True, 'paused')),
+                State.PAUSED),
+            Row(ANY, (_pause, reply(True, 'the pause begins after cycle {cycle}')))),
+        *on(events.ResumeRequested, 'resume')(
+            Row((State.PAUSED,), (_resume, _log_not_ready, reply_resumed), State.WAITING,
+                guard=_not_ready),
+            Row((State.PAUSED,), (_resume, _begin_cycle, reply_resumed), State.BEACONING),
+            Row(ANY, (_resume, reply_resumed), guard=_pausing),
+            Row(ANY, (reply(True, 'not paused'),))),
+        *on(events.StepRequested, 'step')(
+            Row((State.PAUSED,), (reply(False, 'waiting for {lacking}'),), guard=_not_ready),
+            Row((State.PAUSED,), (_begin_cycle, reply(True, 'cycle {cycle} begins')),
+                State.BEACONING),
+            Row(ANY, (reply(False, 'cycle {cycle} has not ended'),), guard=_pausing),
+            Row(ANY, (reply(False, 'not paused; a step requires a pause'),))),
+        *on(events.LocateRequested, 'locate')(
+            Row(ANY, (_prefer_user,))),
+        *on(Timeout, 'timeout')(
+            Row((State.RESTING,), (_log_paused,), State.PAUSED, guard=_pausing),
+            Row((State.RESTING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
+            Row((State.RESTING,), (_begin_cycle,), State.BEACONING),
+            Row((State.BEACONING,), (_grant,), State.CONFIGURING, guard=_some_acks),
+            Row((State.BEACONING,), (_apply_settings, _log_unanswered), State.PAUSED,
+                guard=_pausing),
+            Row((State.BEACONING,), (_log_not_ready,), State.WAITING, guard=_not_ready),
+            Row((State.BEACONING,), (_apply_settings, _beacon_again), outcome=Outcome.UNANSWERED,
+                restart_timeout=True),
+            Row((State.CONFIGURING,), (_command_bands,), guard=_may_retry,
+                outcome=Outcome.RETRY_RHS, restart_timeout=True),
+            Row((State.CONFIGURING,), (_abandon,), State.RESTING, outcome=Outcome.RHS_SILENT),
+            # Repeat the command too, because the channel may have missed the report of the RHS.
+            Row((State.SOUNDING,), (_command_silent_bands, _request_pilots), guard=_may_retry,
+                outcome=Outcome.RETRY_BAND, restart_timeout=True),
+            Row((State.SOUNDING,), (_remove_user, _abandon), State.RESTING,
+                outcome=Outcome.USER_GONE),
+            Row((State.ESTIMATING,), (_resend_signals,), guard=_may_retry,
+                outcome=Outcome.RETRY_POSITION, restart_timeout=True),
+            Row((State.ESTIMATING,), (_abandon,), State.RESTING,
+                outcome=Outcome.POSITIONER_SILENT),
+            # Roles repeat their replies to a repeated message, so the signals repeat the beam.
+            Row((State.STEERING,), (_resend_signals,), guard=_may_retry,
+                outcome=Outcome.RETRY_BEAM, restart_timeout=True),
+            Row((State.STEERING,), (_abandon,), State.RESTING,
+                outcome=Outcome.TRANSMISSION_SILENT),
+            # The channel may have missed the beam or its configuration.
+            Row((State.TRANSMITTING,), (_resend_signals, _send_downlink), guard=_may_retry,
+                outcome=Outcome.RETRY_DATA, restart_timeout=True),
+            Row((State.TRANSMITTING,), (_abandon,), State.RESTING, outcome=Outcome.DATA_LOST)),
+        *on(m.Ack, 'ack', {_not_allowed: Outcome.NOT_ALLOWED, _too_often: Outcome.TOO_OFTEN})(
+            # All that are not dropped count towards the rate of their user.
+            Row(ANY, (_count_ack,), guard=_wrong_cycle, outcome=Outcome.WRONG_CYCLE),
+            # Of several nodes with the same number, the first is served.
+            Row(ANY, (_count_ack, _reject_number), guard=_number_taken,
+                outcome=Outcome.NUMBER_TAKEN),
+            Row(ANY, (_count_ack,), guard=_duplicate_ack, outcome=Outcome.DUPLICATE),
+            # This cycle no longer collects acks; the user is registered for the next one.
+            Row(NOT_BEACONING, (_count_ack, _register_user), outcome=Outcome.LATE_ACK),
+            Row((State.BEACONING,), (_count_ack, _accept_ack, _grant), State.CONFIGURING,
+                guard=_last_ack),
+            Row((State.BEACONING,), (_count_ack, _accept_ack))),
+        *on(m.RhsConfiguration, 'configured', _OF_CYCLE | _OF_CODEBOOK)(
+            # A band's configurations, or the configuration of the beam.
+            Row((State.CONFIGURING,), (_store_configured, _request_pilots), State.SOUNDING,
+                guard=_last_configuration),
+            Row((State.CONFIGURING, State.SOUNDING), (_store_configured,), guard=_for_positioning),
+            Row((State.ESTIMATING, State.STEERING, State.TRANSMITTING), guard=_for_positioning,
+                outcome=Outcome.DUPLICATE),
+            # The beam and its configuration come from two roles, in either order.
+            Row((State.ESTIMATING,), (_store_beam_applied,), State.STEERING),
+            Row((State.STEERING,), (_begin_transmission,), State.TRANSMITTING, guard=_beam_known),
+            Row((State.STEERING,), (_store_beam_applied,)),
+            # A repeated request may be answered twice.
+            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+        *on(m.FeedSignals, 'signals', _OF_USER | {_wrong_instance: Outcome.WRONG_INSTANCE,
+                                        _duplicate_signals: Outcome.DUPLICATE})(
+            Row((State.SOUNDING,), (_store_signals, _send_signals), State.ESTIMATING,
+                guard=_last_signals),
+            Row((State.SOUNDING,), (_store_signals,), State.SOUNDING)),
+        *on(m.PositionEstimate, 'estimate', _OF_USER | _OF_CODEBOOK)(
+            Row((State.ESTIMATING,), target=State.STEERING),
+            Row((State.STEERING,)),
+            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+        *on(m.NoFix, 'no_fix', _OF_USER | _OF_CODEBOOK)(
+            Row((State.ESTIMATING,), (_abandon,), State.RESTING, outcome=Outcome.NO_FIX)),
+        *on(m.Beam, 'beam', _OF_USER | _OF_CODEBOOK)(
+            Row((State.ESTIMATING,), (_store_beam,), State.STEERING),
+            Row((State.STEERING,), (_store_beam, _begin_transmission), State.TRANSMITTING,
+                guard=_beam_applied),
+            Row((State.STEERING,), (_store_beam,)),
+            Row((State.TRANSMITTING,), outcome=Outcome.DUPLICATE)),
+        *on(m.Data, 'delivered', _DELIVERED | _OF_USER)(
+            Row((State.TRANSMITTING,), (_finish,), State.RESTING),
+            Row((State.PAUSED, State.RESTING), outcome=Outcome.DUPLICATE)),
     )

@@ -4,24 +4,29 @@ import dataclasses
 import heapq
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from rhs_isac_ros.link import Beam, actual_capacity
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.impairments import DeclaredElements, draw_factors, draw_surface
+from rhs_isac_ros.model.elements import DeclaredElements, draw_surface
+from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import element_signals, feed_signals
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, Event, Outcome, Send, SettingsOffered, Timeout
-from rhs_isac_ros.protocol.role import NewestDict, PlainRole, Role
+from rhs_isac_ros.protocol.events import Event, Outcome, SettingsOffered
+from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, NewestDict, Role
 from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
 from rhs_isac_ros.support import streams
 
 # Number of users whose multipath is kept. With more, the time between two cycles of a user is far
 # longer than the coherence time.
 _MAX_USERS = 32
+# Maximum number of messages of each kind kept until related messages arrive. The cycle of an older
+# message can no longer be completed.
+_MAX_PENDING = 256
 
 
 class Fading:
@@ -52,14 +57,11 @@ class Fading:
         Without memory, they are independent of the previous cycle.
         """
         scenario = self._scenario
+        shape = scenario.n_subbands, scenario.n_frames, scenario.n_elements
         if scenario.channel:
-            shape = scenario.n_subbands, scenario.n_frames, scenario.n_elements
             return [np.zeros(shape, complex)] * scenario.n_bands
-        gains = [
-            draw_multipath(
-                scenario, band, 1,
-                streams.generator(self._seed, streams.CHANNEL, user, cycle_id, band)
-            ).reshape(scenario.n_subbands, scenario.n_frames, scenario.n_elements)
+        gains = [draw_multipath(scenario, band, 1, streams.generator(
+            self._seed, streams.CHANNEL, user, cycle_id, band)).reshape(shape)
             for band in range(scenario.n_bands)]
         if memory and user in self._latest:
             before_s, previous = self._latest[user]
@@ -71,70 +73,55 @@ class Fading:
         return gains
 
 
-# Maximum number of messages of each kind kept until related messages arrive. The cycle of an older
-# message can no longer be completed.
-_MAX_PENDING = 256
-# Number of cycles kept to recognise late and duplicate positions.
-_MAX_REMEMBERED = 8
-
-
-class _Drawn:
-    """Drawn impairments: of the surface, of users and of cycles.
-
-    Each depends on the seed, the user and the cycle alone, so that a failed element remains
-    failed, and a gain stays with its user.
-    """
-
-    def __init__(self, scenario: Scenario, seed: int) -> None:
-        self._scenario, self._seed = scenario, seed
-        self.surface = (
-            None if DeclaredElements(scenario).is_exact
-            else draw_surface(scenario, streams.generator(seed, streams.SURFACE)))
-
-    def blocked(self, truth: m.GroundTruth) -> np.ndarray | None:
-        """Return whether the user has no direct path, bool [1]; None if no user is blocked."""
-        return draw_blocked(self._scenario, 1, streams.generator(
-            self._seed, streams.BLOCKAGE, truth.user))
-
-    def factors(self, truth: m.GroundTruth) -> np.ndarray | None:
-        """Return the factors of the signals of a cycle [N_B, N_SB, F], or None if all are 1."""
-        scenario, seed = self._scenario, self._seed
-        factors = draw_factors(
-            scenario, 1, streams.generator(seed, streams.USER_DEVIATION, truth.user),
-            streams.generator(seed, streams.CYCLE_DEVIATION, truth.user, truth.cycle_id))
-        return None if factors is None else factors.reshape(
-            scenario.n_bands, scenario.n_subbands, scenario.n_frames)
-
-
-class _Cycle:
-    """The true position of a cycle and the channel that results from it.
+class Air:
+    """Loses, duplicates and delays messages at random.
 
     Attributes
     ----------
-    los
-        Gains of the direct path or of the paths of a channel file in each band, complex128
-        [N_SB, N_E].
-    multipath
-        Multipath gains of each band, complex128 [N_SB, F, N_E].
-    blocked
-        Whether the user has no direct path, bool [1]; None if no user is blocked.
-    surface
-        Errors of the elements; None if there are none.
-    factors
-        Factors of all signals, complex128 [N_B, N_SB, F]; None if there are none.
+    in_flight
+        Time of arrival [s], serial number as a tie-break, and message, as a heap.
     """
 
-    def __init__(self, scenario: Scenario, truth: m.GroundTruth, multipath: list[np.ndarray],
-                 drawn: _Drawn) -> None:
-        self.truth, self.multipath = truth, multipath
-        # Computed here rather than on the first pilot, while other roles prepare the cycle.
-        self.blocked = drawn.blocked(truth)
-        self.los = [direct_gain(scenario, truth.position[None], band, self.blocked)[0]
-                    for band in range(scenario.n_bands)]
-        self.surface, self.factors = drawn.surface, drawn.factors(truth)
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng, self._serial = rng, itertools.count()
+        self.in_flight: list[tuple[float, int, m.Message]] = []
+
+    def send(self, message: m.Message, impairments: Impairments, now_s: float) -> str:
+        """Send a message at a time [s]; return the name of the counter if it is impaired."""
+        # The number of draws is fixed, so that the impairments of one message do not affect
+        # those of others.
+        loss, duplication, *delays = self._rng.random(4)
+        if loss < impairments.loss_probability:
+            return 'emulated_loss'
+        is_doubled = duplication < impairments.double_probability
+        for delay in delays[:1 + is_doubled]:
+            arrival_s = now_s + impairments.delay_s + impairments.jitter_s * delay
+            heapq.heappush(self.in_flight, (arrival_s, next(self._serial), message))
+        return 'emulated_double' if is_doubled else ''
+
+    def arrived(self, now_s: float) -> list[m.Message]:
+        """Return the messages that arrive by a time [s]; each arrives once."""
+        messages = []
+        while self.in_flight and self.in_flight[0][0] <= now_s:
+            messages.append(heapq.heappop(self.in_flight)[2])
+        return messages
 
 
-class Channel(PlainRole):
+@dataclasses.dataclass(frozen=True)
+class _Cycle:
+    """The true position of a cycle and the channel that results from it."""
+
+    truth: m.GroundTruth
+    multipath: list[np.ndarray]  # of each band, complex128 [N_SB, F, N_E]
+    # Whether the user has no direct path, bool [1].
+    blocked: np.ndarray
+    # Gains of the other paths of each band, complex128 [N_SB, N_E]: direct, or of a channel file.
+    los: list[np.ndarray]
+    # Factors of all signals, complex128 [N_B, N_SB, F]; None if all are 1.
+    factors: np.ndarray | None
+
+
+class Channel(Role):
     """The role of the channel.
 
     It answers the pilots of a band or a data packet once it has received the true position of the
@@ -146,8 +133,8 @@ class Channel(PlainRole):
     seed
         Seed of the multipath and of the impairments, see `Fading`.
     impairments
-        Initial impairments of the signals; by default those of the scenario. Others take effect
-        with the next cycle after they are offered.
+        Initial impairments; by default those of the scenario. Others take effect with the next
+        cycle after they are offered.
     """
 
     SENDS = (m.FeedSignals, m.Data)
@@ -157,107 +144,139 @@ class Channel(PlainRole):
                  impairments: Impairments | None = None) -> None:
         super().__init__()
         self._scenario, self._seed = scenario, seed
-        self._draw(impairments or Impairments())
+        self._settings = PendingSettings(impairments or Impairments())
+        self._use(self._settings.in_use)
         self._cycle: _Cycle | None = None
         self._fading = Fading(scenario, seed)
+        self._air = Air(streams.generator(seed, streams.AIR))
         # Cycle, user, instance and position of the cycles begun.
-        self._begun: NewestDict[tuple[float, ...], None] = NewestDict(_MAX_REMEMBERED)
+        self._begun: NewestDict[tuple[float, ...], None] = NewestDict(REMEMBERED_CYCLES)
         # Configurations and beams of the current and of future cycles.
         self._configurations: NewestDict[tuple[int, m.Mode, int], np.ndarray] = NewestDict(
             _MAX_PENDING)
         self._beams: NewestDict[tuple[int, int], m.Beam] = NewestDict(_MAX_PENDING)
-        # Messages to answer, in order, by serial number.
-        self._pending: NewestDict[int, m.Pilot | m.Data] = NewestDict(_MAX_PENDING)
+        # Messages to answer, in order, by cycle and serial number.
+        self._pending: NewestDict[tuple[int, int], m.Pilot | m.Data] = NewestDict(_MAX_PENDING)
         self._serial = itertools.count()
 
-    def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Process a message and return feed signals and delivered data."""
-        discarded = 0
-        match event:
-            case SettingsOffered(Impairments() as impairments):
-                self._draw(impairments)
-                return []
-            case m.GroundTruth() if event.cycle_id:
-                self._begin(event, now_s)
-            case m.RhsConfiguration():
-                discarded = self._configurations.put(
-                    (event.cycle_id, event.mode, event.band), event.analog)
-            case m.Beam():
-                discarded = self._keep_beam(event)
-            case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
-                discarded = self._pending.put(next(self._serial), event)
-            case _:
-                return []
-        self.count(Outcome.OVERFLOW, discarded)
-        return self._answer_pending(self._cycle) if self._cycle else []
+    def _use(self, impairments: Impairments) -> None:
+        """Draw the surface, which depends on the seed alone: a failed element remains failed."""
+        self._deviating = impairments.applied_to(self._scenario)
+        self._surface = (
+            None if DeclaredElements(self._deviating).is_exact
+            else draw_surface(self._deviating, streams.generator(self._seed, streams.SURFACE)))
 
-    def _keep_beam(self, beam: m.Beam) -> int:
-        """Store a beam unless another instance sent one for the cycle; return the overflow."""
+    def next_deadline(self) -> float | None:
+        """Return when the next message arrives [s], or None if no message is in flight."""
+        return self._air.in_flight[0][0] if self._air.in_flight else None
+
+    def status(self) -> Mapping[str, str]:
+        """Return the impairments in use and pending, by name."""
+        return self._settings.describe()
+
+    def react(self, event: Event) -> None:
+        """Process a message, then send the signals and data whose delay has passed."""
+        match event:
+            case SettingsOffered(settings):
+                self._settings.latest = settings
+            case m.GroundTruth() if event.cycle_id:
+                self._begin(event)
+            case m.RhsConfiguration():
+                self.count(Outcome.OVERFLOW, self._configurations.put(
+                    (event.cycle_id, event.mode, event.band), event.analog))
+            case m.Beam():
+                self._keep_beam(event)
+            case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
+                self.count(Outcome.OVERFLOW, self._pending.put(
+                    (event.cycle_id, next(self._serial)), event))
+        if self._cycle and isinstance(event, m.Message):
+            self._answer_pending(self._cycle)
+        for message in self._air.arrived(self.now_s):
+            self.send(message)
+
+    def _keep_beam(self, beam: m.Beam) -> None:
+        """Store a beam unless another instance sent one for the cycle."""
         key = beam.cycle_id, beam.user
         known = self._beams.get(key)
         if known and not m.same_instance(known.sender, beam.sender):
             self.count(Outcome.WRONG_INSTANCE)
-            return 0
-        return self._beams.put(key, beam)
+        else:
+            self.count(Outcome.OVERFLOW, self._beams.put(key, beam))
 
-    def _draw(self, impairments: Impairments) -> None:
-        self._has_memory = impairments.multipath_memory
-        self._drawn = _Drawn(impairments.applied_to(self._scenario), self._seed)
-
-    def _begin(self, truth: m.GroundTruth, now_s: float) -> None:
+    def _begin(self, truth: m.GroundTruth) -> None:
         # A restarted base station may repeat a cycle id, with the user at another position.
         key = truth.cycle_id, truth.user, truth.sender, *truth.position.tolist()
         if key in self._begun:
             self.count(Outcome.DUPLICATE)
             return
         self._begun.put(key, None)
+        for change in self._settings.apply():
+            self.act(change)
+            self._use(self._settings.in_use)
         multipath = self._fading.gains(
-            truth.user, truth.cycle_id, truth.time_s(now_s), memory=self._has_memory)
-        self._cycle = _Cycle(self._scenario, truth, multipath, self._drawn)
-        stale = [serial for serial, event in self._pending.items()
-                 if event.cycle_id != truth.cycle_id]
-        for serial in stale:
-            del self._pending[serial]
-        self.count(Outcome.STALE, len(stale))
-        for configured in [key for key in self._configurations if key[0] != truth.cycle_id]:
-            del self._configurations[configured]
-        for steered in [key for key in self._beams if key[0] != truth.cycle_id]:
-            del self._beams[steered]
+            truth.user, truth.cycle_id, truth.time_s(self.now_s),
+            memory=self._settings.in_use.multipath_memory)
+        self._cycle = self._draw(truth, multipath)
+        self.count(Outcome.STALE, sum(key[0] != truth.cycle_id for key in self._pending))
+        stores: tuple[NewestDict[Any, Any], ...] = (
+            self._pending, self._configurations, self._beams)
+        for store in stores:
+            for stale in [key for key in store if key[0] != truth.cycle_id]:
+                del store[stale]
 
-    def _answer_pending(self, cycle: _Cycle) -> list[Action]:
-        actions: list[Action] = []
-        for serial, event in list(self._pending.items()):
+    def _draw(self, truth: m.GroundTruth, multipath: list[np.ndarray]) -> _Cycle:
+        """Draw what depends on the seed, the user and the cycle alone: a user keeps its gain.
+
+        This is done here rather than on the first pilot, while other roles prepare the cycle.
+        """
+        scenario, seed, user = self._scenario, self._seed, truth.user
+        blocked = draw_blocked(
+            self._deviating, 1, streams.generator(seed, streams.BLOCKAGE, user))
+        factors = draw_factors(
+            self._deviating, 1, streams.generator(seed, streams.USER_DEVIATION, user),
+            streams.generator(seed, streams.CYCLE_DEVIATION, user, truth.cycle_id))
+        if factors is not None:
+            factors = factors.reshape(scenario.n_bands, scenario.n_subbands, scenario.n_frames)
+        los = [direct_gain(scenario, truth.position[None], band, blocked)[0]
+               for band in range(scenario.n_bands)]
+        return _Cycle(truth, multipath, blocked, los, factors)
+
+    def _answer_pending(self, cycle: _Cycle) -> None:
+        """Answer the messages of the cycle for which nothing is missing."""
+        for key, event in list(self._pending.items()):
+            answer = None
             if event.cycle_id != cycle.truth.cycle_id:
                 continue
             if event.user != cycle.truth.user:
                 self.count(Outcome.WRONG_USER)
-                del self._pending[serial]
-                continue
-            if _is_from_other_instance(event, cycle.truth):
+            elif _is_from_other_instance(event, cycle.truth):
                 self.count(Outcome.WRONG_INSTANCE)
-                del self._pending[serial]
+            elif answer := self._answer(event, cycle):
+                if impaired := self._air.send(answer, self._settings.in_use, self.now_s):
+                    self.counters[impaired] += 1
+            else:
                 continue
-            answer = self._answer(event, cycle)
-            if answer is not None:
-                actions.append(Send(answer))
-                del self._pending[serial]
-        return actions
+            del self._pending[key]
 
     def _answer(self, event: m.Pilot | m.Data, cycle: _Cycle) -> m.Message | None:
         """Return the answer to a message of the cycle, or None if something is missing."""
-        if isinstance(event, m.Data):
-            return self._deliver(event, cycle)
-        applied = self._applied(m.Mode.POSITIONING, event.band, cycle)
-        return None if applied is None else self._propagate(event, cycle, applied)
-
-    def _applied(self, mode: m.Mode, band: int, cycle: _Cycle) -> np.ndarray | None:
-        """Return the configurations that the surface reported [F or 1, N_E], or None."""
-        return self._configurations.get((cycle.truth.cycle_id, mode, band))
+        beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
+        mode, transmitter = ((m.Mode.POSITIONING, event) if isinstance(event, m.Pilot)
+                             else (m.Mode.TRANSMISSION, beam))
+        applied = None if transmitter is None else self._configurations.get(
+            (cycle.truth.cycle_id, mode, transmitter.band))
+        if applied is None:
+            return None
+        if self._surface is not None:
+            applied = self._surface.applied(applied)
+        if isinstance(event, m.Pilot):
+            return self._propagate(event, cycle, applied)
+        assert beam
+        return self._deliver(event, cycle, beam, applied[0])
 
     def _propagate(self, pilot: m.Pilot, cycle: _Cycle, applied: np.ndarray) -> m.FeedSignals:
+        """Return the signals at the feeds for the configurations applied in each frame."""
         band = pilot.band
-        if cycle.surface is not None:
-            applied = cycle.surface.applied(applied)
         feeds = np.stack([
             feed_signals(self._scenario, band, configuration, element_signals(
                 cycle.los[band], cycle.multipath[band][:, frame], symbol))
@@ -265,120 +284,23 @@ class Channel(PlainRole):
                 zip(applied, pilot.symbols, strict=True))])
         if cycle.factors is not None:
             feeds = feeds * cycle.factors[band].T[:, :, None]
-        return m.FeedSignals(
-            cycle_id=pilot.cycle_id, stamp_ns=pilot.stamp_ns, user=pilot.user,
-            user_instance=pilot.sender, band=band, signals=feeds)
+        return m.derive(m.FeedSignals, pilot, stamp_ns=pilot.stamp_ns, user_instance=pilot.sender,
+                        signals=feeds)
 
-    def _deliver(self, data: m.Data, cycle: _Cycle) -> m.Data | None:
+    def _deliver(self, data: m.Data, cycle: _Cycle, beam: m.Beam, applied: np.ndarray) -> m.Data:
         """Return the data within the capacity of the true channel; the rest is lost."""
-        truth = cycle.truth
-        beam = self._beams.get((truth.cycle_id, truth.user))
-        if beam is None:
-            return None
-        applied = self._applied(m.Mode.TRANSMISSION, beam.band, cycle)
-        if applied is None:
-            return None
-        configuration, digital = applied[0], beam.digital
-        if cycle.surface is not None:
-            configuration = cycle.surface.applied(configuration)
+        digital = beam.digital
         if cycle.factors is not None:
             # Only the magnitude, the gain of the user, changes the capacity.
             digital = digital * np.abs(cycle.factors[beam.band, 0, 0])
-        used = Beam(configuration, digital, beam.band)
         rate_bps = float(actual_capacity(
-            self._scenario, used, truth.position[None], cycle.blocked)[0])
+            self._scenario, Beam(applied, digital, beam.band), cycle.truth.position[None],
+            cycle.blocked)[0])
         bits = min(data.bits, rate_bps * data.duration_s // 1)
         return dataclasses.replace(data, stage=m.Stage.DELIVERED, bits=bits)
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
     """Return whether another node than the one at the true position transmits."""
-    if isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK:
-        return False
-    return not m.same_instance(event.sender, truth.sender)
-
-
-class ImpairedChannel(PlainRole):
-    """A channel role whose outgoing messages are subject to impairments.
-
-    The role receives new impairments as `SettingsOffered`, for the deviations of its signals.
-
-    New impairments take effect at the start of the next cycle, when its true position arrives.
-
-    Parameters
-    ----------
-    role
-        A role without states and deadlines.
-    impairments
-        Initial impairments.
-    rng
-        Random source of losses, duplicates and delays.
-
-    Attributes
-    ----------
-    counters
-        The counters of the role, and ``emulated_loss`` and ``emulated_double``.
-    """
-
-    def __init__(self, role: Role, impairments: Impairments, rng: np.random.Generator) -> None:
-        super().__init__()
-        self.counters, self.SENDS, self.RECEIVES = role.counters, role.SENDS, role.RECEIVES
-        self._role, self._settings, self._rng = role, PendingSettings(impairments), rng
-        self._cycle_id = 0
-        self._serial = itertools.count()
-        # Time of arrival, serial number as a tie-break, message.
-        self._in_flight: list[tuple[float, int, Send]] = []
-
-    def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Pass an event to the role and return the messages that arrive by `now_s` [s]."""
-        arriving: list[Action] = []
-        actions: list[Action] = []
-        match event:
-            case Timeout():
-                pass
-            case SettingsOffered(impairments):
-                self._settings.latest = impairments
-            case _:
-                arriving += self._begin_cycle(event, now_s)
-                actions = self._role.handle(event, now_s)
-        for action in actions:
-            if isinstance(action, Send):
-                self._send(action, now_s)
-            else:
-                arriving.append(action)
-        while self._in_flight and self._in_flight[0][0] <= now_s:
-            arriving.append(heapq.heappop(self._in_flight)[2])
-        return arriving
-
-    def status(self) -> Mapping[str, str]:
-        """Return the impairments in use and pending, by name."""
-        return self._settings.describe()
-
-    def next_deadline(self) -> float | None:
-        """Return when the next message arrives [s], or None if no message is in flight."""
-        return self._in_flight[0][0] if self._in_flight else None
-
-    def _begin_cycle(self, event: Event, now_s: float) -> list[Action]:
-        if not isinstance(event, m.GroundTruth) or event.cycle_id in (0, self._cycle_id):
-            return []
-        self._cycle_id = event.cycle_id
-        notes = self._settings.apply()
-        if notes:
-            self._role.handle(SettingsOffered(self._settings.in_use), now_s)
-        return [*notes]
-
-    def _send(self, action: Send, now_s: float) -> None:
-        impairments = self._settings.in_use
-        # The number of draws is fixed, so that the impairments of one message do not affect
-        # those of others.
-        loss, duplication, *delays = self._rng.random(4)
-        if loss < impairments.loss_probability:
-            self.counters['emulated_loss'] += 1
-            return
-        copies = 1
-        if duplication < impairments.double_probability:
-            copies = 2
-            self.counters['emulated_double'] += 1
-        for delay in delays[:copies]:
-            arrival_s = now_s + impairments.delay_s + impairments.jitter_s * delay
-            heapq.heappush(self._in_flight, (arrival_s, next(self._serial), action))
+    is_downlink = isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK
+    return not is_downlink and not m.same_instance(event.sender, truth.sender)

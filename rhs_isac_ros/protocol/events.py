@@ -2,15 +2,11 @@
 
 import dataclasses
 import enum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.positioning import Estimator, TrackEstimate
 from rhs_isac_ros.protocol.messages import Message
-
-if TYPE_CHECKING:
-    # The settings import the roles of the users, which use the events.
-    from rhs_isac_ros.protocol.settings import PositionerSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,25 +70,17 @@ class LocateRequested:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class EstimatorReady:
-    """The estimator requested by `BuildEstimator` was built in `elapsed_s` seconds."""
+class EstimatorBuilt:
+    """The estimator of `BuildEstimator` was built in `elapsed_s`, or is None for a `failure`."""
 
     codebook: Codebook
-    estimator: Estimator
-    elapsed_s: float
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class EstimatorFailed:
-    """The estimator requested by `BuildEstimator` could not be built."""
-
-    codebook: Codebook
-    reason: str
+    estimator: Estimator | None
+    elapsed_s: float = 0.0
+    failure: str = ''
 
 
 Event = (Message | Timeout | CodebookOffered | SettingsOffered | PeersChanged | StoodBy | Resumed
-         | PauseRequested | ResumeRequested | StepRequested | LocateRequested | EstimatorReady
-         | EstimatorFailed)
+         | PauseRequested | ResumeRequested | StepRequested | LocateRequested | EstimatorBuilt)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,10 +108,10 @@ class Reply:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BuildEstimator:
-    """Build an estimator in the background; reply with `EstimatorReady` or `EstimatorFailed`."""
+    """Build an estimator in the background; reply with `EstimatorBuilt`."""
 
     codebook: Codebook
-    settings: 'PositionerSettings'
+    settings: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,10 +200,7 @@ class Outcome(enum.Enum):
     NO_BEACON = 'no_beacon', Kind.IDLE
 
 
-_BY_COUNTER = {outcome.value: outcome for outcome in Outcome}
-
-
 def kind_of(counter: str) -> Kind:
     """Return the kind of a counter; counters without an `Outcome` count dropped messages."""
-    outcome = _BY_COUNTER.get(counter)
-    return outcome.kind if outcome else Kind.DROPPED
+    kinds = {outcome.value: outcome.kind for outcome in Outcome}
+    return kinds.get(counter, Kind.DROPPED)

@@ -6,9 +6,11 @@ import enum
 import functools
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, TypeVar
 
 import numpy as np
+
+from rhs_isac_ros.support.fields import Field
 
 
 class MessageError(ValueError):
@@ -32,7 +34,7 @@ def array(
         Whether entries may be NaN, for unknown values.
     """
     return dataclasses.field(
-        metadata={'dims': tuple(dims.split()), 'kind': kind, 'low': low, 'high': high,
+        metadata={'dims': tuple(dims.split()), 'declared': Field(kind, low=low, high=high),
                   'nan_allowed': nan_allowed})
 
 
@@ -43,7 +45,8 @@ def index(symbol: str) -> Any:
 
 def number(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
     """Declare a number with an inclusive range."""
-    return dataclasses.field(default=default, metadata={'low': low, 'high': high})
+    return dataclasses.field(
+        default=default, metadata={'declared': Field(float, low=low, high=high)})
 
 
 def size(symbol: str) -> Any:
@@ -56,17 +59,7 @@ def optional_float() -> Any:
     return dataclasses.field(metadata={'nan_allowed': True})
 
 
-class Checkable(Protocol):
-    """A dataclass with the fields declared here."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-    def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return sizes that depend on the content, by symbol."""
-        ...
-
-
-def check(message: Checkable, sizes: Mapping[str, int]) -> None:
+def check(message: 'Message', sizes: Mapping[str, int]) -> None:
     """Check the arrays, indices and numbers of a message.
 
     Parameters
@@ -82,7 +75,8 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
     """
     own = message.own_sizes(sizes)
     sizes = {**sizes, **own} if own else sizes
-    for name, meta in _fields(type(message)):
+    kind: type = type(message)
+    for name, meta in _fields(kind):
         value = getattr(message, name)
         problem = ''
         if 'dims' in meta:
@@ -94,14 +88,16 @@ def check(message: Checkable, sizes: Mapping[str, int]) -> None:
             problem = f'{value}, expected a finite number'
         elif 'equals' in meta and value != sizes[meta['equals']]:
             problem = f'{value}, expected {meta["equals"]} = {sizes[meta["equals"]]}'
-        elif 'low' in meta and not meta['low'] <= value <= meta['high']:
-            problem = f'{value}, expected {meta["low"]:g} to {meta["high"]:g}'
+        elif 'declared' in meta:
+            declared = meta['declared']
+            if not declared.low <= value <= declared.high:
+                problem = f'{value}, expected {declared.range}'
         if problem:
-            raise MessageError(f'{type(message).__name__}.{name}: {problem}')
+            raise MessageError(f'{kind.__name__}.{name}: {problem}')
 
 
 @functools.cache
-def _fields(kind: type[Checkable]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+def _fields(kind: type) -> tuple[tuple[str, Mapping[str, Any]], ...]:
     """Return name and declaration of every field whose values are restricted."""
     return tuple((field.name, field.metadata) for field in dataclasses.fields(kind)
                  if field.metadata or field.type is float)
@@ -117,10 +113,10 @@ def _array_problem(value: np.ndarray, meta: Mapping[str, Any], sizes: Mapping[st
     finite = np.isfinite(value)
     if not finite.all() and not (meta['nan_allowed'] and (finite | np.isnan(value)).all()):
         return 'not finite, expected finite numbers'
-    if meta['low'] > -math.inf and value.size and (
-            value.min() < meta['low'] or value.max() > meta['high']):
-        return (f'{value.min():g} to {value.max():g}, expected '
-                f'{meta["low"]:g} to {meta["high"]:g}')
+    declared = meta['declared']
+    if declared.range and value.size and (
+            value.min() < declared.low or value.max() > declared.high):
+        return f'{value.min():g} to {value.max():g}, expected {declared.range}'
     return ''
 
 
@@ -187,13 +183,7 @@ class Message:
         return 1e-9 * self.stamp_ns if self.stamp_ns else now_s
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return sizes that depend on the content, by symbol.
-
-        Parameters
-        ----------
-        sizes
-            Sizes by symbol, as in `Scenario.sizes`.
-        """
+        """Return sizes that depend on the content, by symbol as in `Scenario.sizes`."""
         return {}
 
 
@@ -207,6 +197,21 @@ def same(one: Message, other: Message) -> bool:
     return type(one) is type(other) and all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name))
         for field in dataclasses.fields(one) if field.name != 'stamp_ns')
+
+
+# The fields that connect the messages of a cycle.
+_SHARED = ('cycle_id', 'user', 'user_instance', 'band', 'codebook_id')
+MessageT = TypeVar('MessageT', bound=Message)
+
+
+def derive(kind: type[MessageT], source: object, **fields: Any) -> MessageT:
+    """Return a message with the fields given, and the cycle, user, band and codebook of a source.
+
+    The source is a message, or another object with attributes of these names.
+    """
+    shared = {name: getattr(source, name) for name in _SHARED
+              if name in kind.__dataclass_fields__ and hasattr(source, name)}
+    return kind(**shared | fields)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -415,3 +420,9 @@ def started(instance: int) -> str:
     """Return the start of an instance [ns since 1970] for a log message."""
     time = datetime.datetime.fromtimestamp(instance // 10**9, datetime.timezone.utc)
     return f'started {time:%Y-%m-%d %H:%M:%S} UTC'
+
+
+def describe_conflict(user: int, instance: int) -> str:
+    """Return a log message about several nodes with one user number, of which one is served."""
+    return (f'user {user}: two nodes have this number; the first one, {started(instance)}, '
+            'is served')

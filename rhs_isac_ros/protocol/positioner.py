@@ -1,10 +1,9 @@
 """The positioner, which estimates positions from received signals, and the tracks of users."""
 
-import collections
 import dataclasses
 import enum
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,27 +21,14 @@ from rhs_isac_ros.positioning import (
     surface_of,
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
-from rhs_isac_ros.positioning.diagnosis import Diagnosis
-from rhs_isac_ros.positioning.innovation_test import InnovationTest
+from rhs_isac_ros.positioning.diagnosis import Diagnosis, InnovationTest
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import MAX_NAMED, MAX_USERS
-from rhs_isac_ros.protocol.events import (
-    Action,
-    BuildEstimator,
-    CodebookOffered,
-    EstimatorFailed,
-    EstimatorReady,
-    Event,
-    LogMessage,
-    Outcome,
-    PublishTrack,
-    RevertSettings,
-    Send,
-    SettingsOffered,
-)
-from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, PlainRole
+from rhs_isac_ros.protocol.events import EstimatorBuilt, Event, Outcome
+from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
+from rhs_isac_ros.protocol.user_registry import MAX_NAMED, MAX_USERS
 
 
 @dataclasses.dataclass
@@ -58,9 +44,10 @@ class _Track:
         return received.sender == self.latest.sender and (
             received.cycle_id <= self.latest.cycle_id)
 
-    def is_of(self, received: m.ReceivedSignals) -> bool:
-        """Return whether signals come from the instance of the user that has the track."""
-        return m.same_instance(received.user_instance, self.latest.user_instance)
+    def may_continue(self, received: m.ReceivedSignals, now_s: float) -> bool:
+        """Return whether signals come from the same instance of the user, and no clock reset."""
+        return now_s >= self.time_s - MAX_GAP_S and m.same_instance(
+            received.user_instance, self.latest.user_instance)
 
 
 class Tracks:
@@ -72,10 +59,6 @@ class Tracks:
 
     def __init__(self) -> None:
         self._tracks: NewestDict[int, _Track] = NewestDict(MAX_USERS)
-
-    def __len__(self) -> int:
-        """Return the number of tracks."""
-        return len(self._tracks)
 
     def clear(self) -> None:
         """End all tracks."""
@@ -98,12 +81,14 @@ class Tracks:
         SignalError
             If the signals cannot be used.
         """
-        signals = received.signals.reshape(len(received.signals), -1)
-        self._end_old(now_s)
+        signals = _stacked(received)
+        # The oldest track comes first.
+        while self._tracks and now_s > next(iter(self._tracks.values())).time_s + MAX_GAP_S:
+            del self._tracks[next(iter(self._tracks))]
         track = self._tracks.get(received.user)
         if not isinstance(estimator, SearchEstimator) or track and track.is_late(received):
             return estimator.estimate(signals)
-        if track is None or not track.is_of(received) or now_s < track.time_s - MAX_GAP_S:
+        if track is None or not track.may_continue(received, now_s):
             track = _Track(Tracker(estimator, Motion(speed_mps)), received, now_s)
         track.tracker.estimator = estimator
         estimate = track.tracker.update(now_s, signals)
@@ -112,13 +97,10 @@ class Tracks:
             self._tracks.put(received.user, track)
         return estimate
 
-    def _end_old(self, now_s: float) -> None:
-        # The oldest track comes first.
-        while self._tracks:
-            user, track = next(iter(self._tracks.items()))
-            if now_s <= track.time_s + MAX_GAP_S:
-                return
-            del self._tracks[user]
+
+def _stacked(received: m.ReceivedSignals) -> np.ndarray:
+    """Return the signals as estimators take them, complex128 [N_B, N_SB F]."""
+    return received.signals.reshape(len(received.signals), -1)
 
 
 # Number of residuals in the mean of a user, which bounds the memory.
@@ -135,29 +117,24 @@ class ResidualWatch:
     def __init__(self) -> None:
         self._codebook_id = ''
         self._all = InnovationTest()
-        self._users: collections.OrderedDict[int, InnovationTest] = collections.OrderedDict()
+        self._users: NewestDict[int, InnovationTest] = NewestDict(MAX_USERS)
         self._warning = ''
         self._diagnosis = Diagnosis()
 
-    def add(self, user: int, codebook_id: str, estimate: Estimate) -> list[LogMessage]:
-        """Add an estimate; return a message if a warning begins or ends."""
+    def add(self, user: int, codebook_id: str, estimate: Estimate) -> tuple[str, bool]:
+        """Add an estimate; return a text if a warning begins or ends, and whether it begins."""
         if codebook_id != self._codebook_id:
             self.clear()
             self._codebook_id = codebook_id
         self._diagnosis.add(estimate)
-        own = self._users.setdefault(user, InnovationTest(_USER_WINDOW))
-        self._users.move_to_end(user)
-        # Beyond the limit, the least recent user is forgotten.
-        if len(self._users) > MAX_USERS:
-            self._users.popitem(last=False)
+        own = self._users.get(user) or InnovationTest(_USER_WINDOW)
+        self._users.put(user, own)
         for monitor in (self._all, own):
             monitor.add(float(estimate.residual), float(estimate.expected_residual))
         before, self._warning = self._warning, self._describe()
-        if self._warning and not before:
-            return [LogMessage(self._warning, warning=True)]
-        if before and not self._warning:
-            return [LogMessage('the residuals match the scenario again')]
-        return []
+        if bool(before) == bool(self._warning):
+            return '', False
+        return self._warning or 'the residuals match the scenario again', bool(self._warning)
 
     def clear(self) -> None:
         """Forget all estimates, because the estimator or the codebook has changed."""
@@ -179,23 +156,20 @@ class ResidualWatch:
             always present.
         """
         values = self._diagnosis.status(bool(self._warning))
-        if not self._all.n_fixes:
-            return values
-        values |= {'residual.ratio': f'{self._all.ratio:.3f}',
-                  'residual.spread': f'{self._all.spread:.3f}',
-                  'residual.fixes': str(self._all.n_fixes)}
+        if self._all.n_fixes:
+            values |= {'residual.ratio': f'{self._all.ratio:.3f}',
+                       'residual.spread': f'{self._all.spread:.3f}',
+                       'residual.fixes': str(self._all.n_fixes)}
         return values | ({'warning.residual': self._warning} if self._warning else {})
 
     def _describe(self) -> str:
         """Describe the deviation; empty if there is none."""
-        users = {user: monitor for user, monitor in self._users.items() if monitor.drifts}
-        if not users and not self._all.drifts:
-            return ''
+        users = sorted(user for user, monitor in self._users.items() if monitor.drifts)
         parts = [_deviation('', self._all)] if self._all.drifts else []
-        parts += [_deviation(f'user {user}: ', users[user]) for user in sorted(users)[:MAX_NAMED]]
+        parts += [_deviation(f'user {user}: ', self._users[user]) for user in users[:MAX_NAMED]]
         if len(users) > MAX_NAMED:
             parts.append(f'{len(users) - MAX_NAMED} more users')
-        return f'the signals do not match the scenario: {"; ".join(parts)}'
+        return f'the signals do not match the scenario: {"; ".join(parts)}' if parts else ''
 
 
 def _deviation(prefix: str, monitor: InnovationTest) -> str:
@@ -229,7 +203,7 @@ class _Built(NamedTuple):
     estimator: Estimator
 
 
-class Positioner(PlainRole):
+class Positioner(Role):
     """The role of the positioner.
 
     The codebook id of the received signals selects the estimator. Estimators are built one at a
@@ -273,24 +247,7 @@ class Positioner(PlainRole):
         self._lost: NewestDict[int, _Loss] = NewestDict(MAX_USERS)
         self._residuals = ResidualWatch()
         # The last signals that were answered, and the answer.
-        self._answered: tuple[m.ReceivedSignals, list[Action]] | None = None
-
-    def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Process an event and return an estimate, or the request to build an estimator."""
-        match event:
-            case CodebookOffered(codebook):
-                self._codebook = codebook
-                return self._request(_Job(codebook, self._settings.latest))
-            case SettingsOffered(settings):
-                return self._offer_settings(settings)
-            case EstimatorReady(codebook, estimator, elapsed_s):
-                return [*self._keep(self._job_of(codebook), estimator, elapsed_s),
-                        *self._continue()]
-            case EstimatorFailed(codebook, reason):
-                return [*self._revert(self._job_of(codebook), reason), *self._continue()]
-            case m.ReceivedSignals():
-                return self._receive(event, now_s)
-        return []
+        self._answered: tuple[m.ReceivedSignals, list[events.Action]] | None = None
 
     def status(self) -> Mapping[str, str]:
         """Return the settings and codebook in use, pending settings and the last failure."""
@@ -298,142 +255,143 @@ class Positioner(PlainRole):
         return (self._settings.describe() | failed | self._residuals.status()
                 | {'codebook_id': self._estimators.in_use})
 
-    def _offer_settings(self, settings: PositionerSettings) -> list[Action]:
-        self._settings.latest, self._failure = settings, ''
-        if self._codebook is None:
-            return [*self._settings.apply()]
-        return self._request(_Job(self._codebook, settings))
+    def react(self, event: Event) -> None:
+        """Process an event: send an estimate, or request an estimator."""
+        match event:
+            case events.CodebookOffered(codebook):
+                self._codebook = codebook
+                self._request(_Job(codebook, self._settings.latest))
+            case events.SettingsOffered(settings):
+                self._settings.latest, self._failure = settings, ''
+                if self._codebook:
+                    self._request(_Job(self._codebook, settings))
+                else:
+                    for change in self._settings.apply():
+                        self.act(change)
+            case EstimatorBuilt(codebook, estimator, elapsed_s, failure):
+                job = self._building or _Job(codebook, self._settings.latest)
+                if estimator is None:
+                    self._revert(job, failure)
+                else:
+                    self._keep(job, estimator, elapsed_s)
+                self._continue()
+            case m.ReceivedSignals():
+                self._receive(event, self.now_s)
 
-    def _request(self, job: _Job) -> list[Action]:
-        built = self._estimators.peek(job.codebook.id)
-        if built and job.equals(built.job):
+    def _request(self, job: _Job) -> None:
+        """Request an estimator, now or after the one that is being built, unless there is one."""
+        built = self._estimators.get(job.codebook.id)
+        if (built and job.equals(built.job)) or job.equals(self._building):
             self._next = None
-            return []
-        if self._building is not None:
-            self._next = None if job.equals(self._building) else job
-            return []
-        self._building = job
-        return [BuildEstimator(job.codebook, job.settings)]
+        elif self._building:
+            self._next = job
+        else:
+            self._building = job
+            self.act(events.BuildEstimator(job.codebook, job.settings))
 
-    def _job_of(self, codebook: Codebook) -> _Job:
-        return self._building or _Job(codebook, self._settings.latest)
-
-    def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> list[Action]:
+    def _keep(self, job: _Job, estimator: Estimator, elapsed_s: float) -> None:
         """Store an estimator, unless other settings were offered meanwhile."""
         codebook = job.codebook
-        is_current = job.settings == self._settings.latest
-        if not is_current and codebook.id in self._estimators:
-            return []
+        if job.settings != self._settings.latest and codebook.id in self._estimators:
+            return
         model = MeasurementModel(self._scenario, codebook, surface_of(estimator)).prepare()
         self._estimators.put(codebook.id, _Built(job, model, estimator))
         self._settings.in_use = job.settings
         self._residuals.clear()
-        return [LogMessage(
-            f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')]
+        self.log(f'{estimator.name} is ready for codebook {codebook.id} after {elapsed_s:.1f} s')
 
-    def _revert(self, job: _Job, reason: str) -> list[Action]:
+    def _revert(self, job: _Job, reason: str) -> None:
         """Revert to the settings in use if new settings caused the failure."""
         kept = self._settings.in_use
         if job.settings == kept:
-            return [LogMessage(
-                f'no estimator for codebook {job.codebook.id}: {reason}', warning=True)]
-        if job.settings != self._settings.latest:
-            return []
-        self._settings.latest = kept
-        self._failure = f'{job.settings.estimator}: {reason}'
-        # A codebook offered meanwhile needs an estimator with the settings in use.
-        self._next = _Job((self._next or job).codebook, kept)
-        text = (f'cannot build estimator {job.settings.estimator}, keeping {kept.estimator}: '
-                f'{reason}')
-        return [LogMessage(text, warning=True), RevertSettings(kept)]
+            self.log(f'no estimator for codebook {job.codebook.id}: {reason}', warning=True)
+        elif job.settings == self._settings.latest:
+            self._settings.latest = kept
+            self._failure = f'{job.settings.estimator}: {reason}'
+            # A codebook offered meanwhile needs an estimator with the settings in use.
+            self._next = _Job((self._next or job).codebook, kept)
+            self.log(f'cannot build estimator {job.settings.estimator}, keeping '
+                     f'{kept.estimator}: {reason}', warning=True)
+            self.act(events.RevertSettings(kept))
 
-    def _continue(self) -> list[Action]:
+    def _continue(self) -> None:
         """Request the next estimator and process the signals that waited for the last one."""
         waiting, job = self._waiting, self._next
         self._building = self._next = self._waiting = None
-        actions = self._request(job) if job else []
-        return actions + (self._receive(*waiting) if waiting else [])
+        if job:
+            self._request(job)
+        if waiting:
+            self._receive(*waiting)
 
-    def _receive(self, received: m.ReceivedSignals, now_s: float) -> list[Action]:
+    def _receive(self, received: m.ReceivedSignals, now_s: float) -> None:
         if self._answered and m.same(self._answered[0], received):
             self.count(Outcome.DUPLICATE)
-            return self._answered[1]
-        if received.codebook_id in self._estimators:
-            self._answered = received, self._locate(received, now_s)
-            return self._answered[1]
-        expected = {job.codebook.id for job in (self._building, self._next) if job}
-        if received.codebook_id in expected:
+            self._actions += self._answered[1]
+        elif received.codebook_id in self._estimators:
+            n_before = len(self._actions)
+            self._locate(received, now_s)
+            self._answered = received, self._actions[n_before:]
+        elif received.codebook_id in {
+                job.codebook.id for job in (self._building, self._next) if job}:
             self._waiting = received, now_s
         else:
             self.count(Outcome.WRONG_CODEBOOK)
-        return []
 
-    def _locate(self, received: m.ReceivedSignals, now_s: float) -> list[Action]:
+    def _locate(self, received: m.ReceivedSignals, now_s: float) -> None:
         job, model, estimator = self._estimators.take(received.codebook_id)
         begin = self._stopwatch()
         try:
-            estimate = self._estimate(received, estimator, job.settings, now_s)
+            if job.settings.prior == TRACK:
+                estimate = self._tracks.locate(
+                    received, estimator, job.settings.track_speed_mps, received.time_s(now_s))
+            else:
+                self._tracks.clear()
+                estimate = estimator.estimate(_stacked(received))
         except SignalError as error:
-            return self._no_fix(received, str(error))
+            self._no_fix(received, str(error))
+            return
         latency_s = self._stopwatch() - begin
-        residuals = self._residuals.add(received.user, received.codebook_id, estimate)
-        if not estimate.fix:
-            return [*self._no_fix(received, str(estimate.reason)), *residuals]
-        return [*self._fix(received, estimate, latency_s), *residuals]
+        if estimate.fix:
+            probabilities = {f'{name}_probability': value
+                             for name, value in probabilities_of(estimate).items()}
+            self.send(m.derive(
+                m.PositionEstimate, received, stamp_ns=received.stamp_ns,
+                position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
+                crlb_m2=float(crlb_of(model, estimate.mean[None])[0]), estimator=estimator.name,
+                latency_s=latency_s, **probabilities))
+            self._publish_track(received, estimate)
+        else:
+            self._no_fix(received, str(estimate.reason))
+        self.log(*self._residuals.add(received.user, received.codebook_id, estimate))
 
-    def _fix(self, received: m.ReceivedSignals, estimate: Estimate,
-             latency_s: float) -> list[Action]:
-        _, model, estimator = self._estimators.take(received.codebook_id)
-        bound = float(crlb_of(model, estimate.mean[None])[0])
-        probabilities: dict[str, Any] = {
-            f'{name}_probability': value for name, value in probabilities_of(estimate).items()}
-        actions: list[Action] = [Send(m.PositionEstimate(
-            cycle_id=received.cycle_id, stamp_ns=received.stamp_ns, user=received.user,
-            user_instance=received.user_instance, codebook_id=received.codebook_id,
-            position=np.array(estimate.mean), covariance_m2=np.array(estimate.covariance),
-            crlb_m2=bound, estimator=estimator.name, latency_s=latency_s,
-            **probabilities))]
-        loss = None
+    def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
+        """Publish the track if there is one; log whether it predicts the position."""
+        user, loss = received.user, None
         if isinstance(estimate, TrackEstimate):
-            actions.append(PublishTrack(received.user, estimate, received.stamp_ns))
+            self.act(events.PublishTrack(user, estimate, received.stamp_ns))
             loss = _Loss.BLOCKED if estimate.is_predicted else None
-        return [*actions, *self._log(
-            received, loss, f'the track of user {received.user} predicts its position: '
-            f'{describe_doubts(estimate)}')]
+        self._log_change(received, loss, f'the track of user {user} predicts its position: '
+                         f'{describe_doubts(estimate)}')
 
-    def _estimate(
-            self, received: m.ReceivedSignals, estimator: Estimator, settings: PositionerSettings,
-            now_s: float) -> Estimate:
-        if settings.prior == TRACK:
-            return self._tracks.locate(
-                received, estimator, settings.track_speed_mps, received.time_s(now_s))
-        self._tracks.clear()
-        return estimator.estimate(received.signals.reshape(len(received.signals), -1))
-
-    def _no_fix(self, received: m.ReceivedSignals, reason: str) -> list[Action]:
+    def _no_fix(self, received: m.ReceivedSignals, reason: str) -> None:
         self.count(Outcome.NO_FIX)
-        sent = Send(m.NoFix(
-            cycle_id=received.cycle_id, stamp_ns=received.stamp_ns, user=received.user,
-            codebook_id=received.codebook_id, reason=reason))
-        return [sent, *self._log(
-            received, _Loss.NO_FIX, f'no fix of user {received.user}: {reason}')]
+        self.send(m.derive(m.NoFix, received, stamp_ns=received.stamp_ns, reason=reason))
+        self._log_change(received, _Loss.NO_FIX, f'no fix of user {received.user}: {reason}')
 
-    def _log(self, received: m.ReceivedSignals, loss: _Loss | None, text: str = ''
-             ) -> list[LogMessage]:
+    def _log_change(self, received: m.ReceivedSignals, loss: _Loss | None, text: str) -> None:
         """Log a change of whether the signals of a user yield a position."""
         before = self._lost.pop(received.user, None)
         if loss:
             self._lost.put(received.user, loss)
         elif before:
             text = f'user {received.user} {before.value}'
-        if before is loss:
-            return []
-        return [LogMessage(f'cycle {received.cycle_id}: {text}', warning=loss is _Loss.NO_FIX)]
+        if before is not loss:
+            self.log(f'cycle {received.cycle_id}: {text}', warning=loss is _Loss.NO_FIX)
 
 
 def build_estimator(
         codebook: Codebook, make: Callable[[Codebook], Estimator],
-        stopwatch: Callable[[], float]) -> EstimatorReady | EstimatorFailed:
+        stopwatch: Callable[[], float]) -> EstimatorBuilt:
     """Build the estimator that `BuildEstimator` requests; this may run in another thread.
 
     Parameters
@@ -448,5 +406,5 @@ def build_estimator(
         estimator = make(codebook)
     # Possible causes: the codebook, the model file, a full disk or memory.
     except (ValueError, OSError, MemoryError) as error:
-        return EstimatorFailed(codebook, str(error) or type(error).__name__)
-    return EstimatorReady(codebook, estimator, stopwatch() - begin)
+        return EstimatorBuilt(codebook, None, failure=str(error) or type(error).__name__)
+    return EstimatorBuilt(codebook, estimator, stopwatch() - begin)

@@ -61,10 +61,10 @@ class Presences:
         self.own = own
         # Nodes in conflict with this one, by instance.
         self._others: NewestDict[int, Presence] = NewestDict(_MAX_OTHERS)
-        self._superseded_by: Presence | None = None
-        self._serves_instead_of: Presence | None = None
-        # The older node that was named last: one that was suspended may return.
-        self._named = 0
+        # The newest other node of the role, and the older one that was logged last, which is not
+        # logged again if it returns after a suspension.
+        self._rival: Presence | None = None
+        self._logged_older = 0
         # By id: the differences of other scenarios.
         self._scenarios: NewestDict[str, str] = NewestDict(_MAX_OTHERS)
         self._n_logged = 0
@@ -104,8 +104,8 @@ class Presences:
         gone = self.gone(announcing)
         for sender in [sender for sender, other in self._others.items() if other.node in gone]:
             del self._others[sender]
-        present = {other.scenario_id for other in self._others.values()}
-        ended = sorted(self._scenarios.keys() - present)
+        ended = sorted(self._scenarios.keys()
+                       - {other.scenario_id for other in self._others.values()})
         for scenario_id in ended:
             del self._scenarios[scenario_id]
         return [*(LogMessage(f'no node with scenario {scenario_id} is left')
@@ -114,7 +114,7 @@ class Presences:
     @property
     def stands_by(self) -> bool:
         """Whether a newer node has the same role."""
-        return self._superseded_by is not None
+        return self.rival > self.own.sender
 
     @property
     def others(self) -> frozenset[int]:
@@ -124,41 +124,31 @@ class Presences:
     @property
     def rival(self) -> int:
         """The newest other instance of the same role; 0 if there is none."""
-        rivals = self._rivals()
-        return rivals[0].sender if rivals else 0
+        return self._rival.sender if self._rival else 0
 
     def conflicts(self) -> dict[str, str]:
         """Return a description of each conflict, by key of the diagnostics."""
         found = {f'conflict.{scenario_id}': text
                  for scenario_id, text in self._scenarios.items()}
-        if self._superseded_by:
-            found['conflict.role'] = f'stands by for {self._superseded_by}'
-        elif self._serves_instead_of:
-            found['conflict.role'] = f'serves instead of {self._serves_instead_of}'
-        return found
+        return found | ({'conflict.role': self._describe()} if self._rival else {})
 
-    def _rivals(self) -> list[Presence]:
-        """Return the other nodes of the same role and scenario, the newest first."""
-        return sorted((other for other in self._others.values() if other.role == self.own.role
-                       and other.scenario_id in ('', self.own.scenario_id)),
-                      key=lambda other: -other.sender)
+    def _describe(self) -> str:
+        return f'{"stands by for" if self.stands_by else "serves instead of"} {self._rival}'
 
     def _update(self) -> list[LogMessage]:
-        """Choose the node that serves, and log a change."""
-        own, rivals = self.own, self._rivals()
-        newest = rivals[0] if rivals and rivals[0].sender > own.sender else None
-        previous, self._superseded_by = self._superseded_by, newest
-        older = rivals[0] if rivals and not newest else None
-        self._serves_instead_of = older
-        if newest and newest != previous:
-            return [LogMessage(f'two nodes act as {own.role}: this one stands by for {newest}',
+        """Find the newest other node of the role, and log whether this one serves."""
+        own, before = self.own, self._rival if self.stands_by else None
+        rivals = [other for other in self._others.values()
+                  if other.role == own.role and other.scenario_id in ('', own.scenario_id)]
+        self._rival = max(rivals, key=lambda other: other.sender, default=None)
+        rival = self._rival
+        if rival and rival != before and rival.sender != self._logged_older:
+            if not self.stands_by:
+                self._logged_older = rival.sender
+            return [LogMessage(f'two nodes act as {own.role}: this one {self._describe()}',
                                warning=True)]
-        if older and older.sender != self._named:
-            self._named = older.sender
-            return [LogMessage(f'two nodes act as {own.role}: this one serves instead of {older}',
-                               warning=True)]
-        if previous and not newest:
-            return [LogMessage(f'{previous.node} has gone; this node acts as {own.role} again')]
+        if before and not self.stands_by:
+            return [LogMessage(f'{before.node} has gone; this node acts as {own.role} again')]
         return []
 
     def _report_scenario(self, other: Presence) -> list[LogMessage]:

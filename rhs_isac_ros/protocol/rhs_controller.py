@@ -5,18 +5,17 @@ from collections.abc import Mapping
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Action, CodebookOffered, LogMessage, Outcome, Send
+from rhs_isac_ros.protocol.events import CodebookOffered, Outcome
 from rhs_isac_ros.protocol.role import (
     ANY,
+    REMEMBERED_CYCLES,
     CodebookCache,
     EventT,
     NewestDict,
     StateMachine,
     Transition,
+    on,
 )
-
-# Number of cycles kept to recognise late and repeated messages.
-_MAX_REMEMBERED = 8
 
 
 class State(enum.Enum):
@@ -27,34 +26,30 @@ class State(enum.Enum):
     TRANSMITTING = 'transmitting'  # applies the configuration of a beam
 
 
-class Row(Transition[State, 'RhsController', EventT]):
+class Row(Transition['RhsController', EventT]):
     """A row of the table."""
 
 
-class RhsController(StateMachine[State]):
+class RhsController(StateMachine):
     """The role of the RHS controller.
 
     It holds the latest codebooks; the commands of the base station select the one to apply.
     """
 
     SENDS = (m.RhsConfiguration,)
-    RECEIVES = (m.Grant, m.RhsCommand, m.Beam)
 
     STATES = State
-    EVENT_NAMES = {CodebookOffered: 'codebook', m.Grant: 'grant', m.RhsCommand: 'command',
-                   m.Beam: 'beam'}
-
 
     def __init__(self) -> None:
-        super().__init__(State.IDLE, {})
+        super().__init__(State.IDLE)
         self._codebooks: CodebookCache[Codebook] = CodebookCache()
         self._cycle_id = 0
         # Instance that sent the beam applied last.
         self._beam_sender = 0
         # The user of each granted cycle.
-        self._granted: NewestDict[int, int] = NewestDict(_MAX_REMEMBERED)
+        self._granted: NewestDict[int, int] = NewestDict(REMEMBERED_CYCLES)
         # Band and codebook of the executed commands of each cycle.
-        self._applied: NewestDict[int, set[tuple[int, str]]] = NewestDict(_MAX_REMEMBERED)
+        self._applied: NewestDict[int, set[tuple[int, str]]] = NewestDict(REMEMBERED_CYCLES)
         # Reset by the next executed command, so that each outage is logged once.
         self._unknown_logged = False
 
@@ -64,97 +59,82 @@ class RhsController(StateMachine[State]):
 
     # Guards
 
-    def unknown_codebook(self, event: m.RhsCommand, now_s: float) -> bool:
+    def _unknown_codebook(self, event: m.RhsCommand) -> bool:
         """Whether the codebook of a command was never offered, or was discarded."""
         return event.codebook_id not in self._codebooks
 
-    def repeats_command(self, event: m.RhsCommand, now_s: float) -> bool:
+    def _repeats_command(self, event: m.RhsCommand) -> bool:
         """Whether a command of the current cycle was executed before."""
         return (self.state is State.POSITIONING and event.cycle_id == self._cycle_id
-                and self._is_applied(event))
+                and self._was_executed(event))
 
-    def stale_command(self, event: m.RhsCommand, now_s: float) -> bool:
-        """Whether a command was executed before, and its cycle or its positioning has ended."""
-        return self._is_applied(event)
+    def _was_executed(self, event: m.RhsCommand) -> bool:
+        return (event.band, event.codebook_id) in self._applied.get(event.cycle_id, ())
 
-    def _is_applied(self, command: m.RhsCommand) -> bool:
-        return (command.band, command.codebook_id) in self._applied.get(command.cycle_id, ())
-
-    def wrong_cycle(self, event: m.Beam, now_s: float) -> bool:
-        """Whether a beam belongs to a cycle other than that of the last command."""
+    def _wrong_cycle(self, event: m.Beam) -> bool:
         return event.cycle_id != self._cycle_id
 
-    def wrong_user(self, event: m.Beam, now_s: float) -> bool:
+    def _wrong_user(self, event: m.Beam) -> bool:
         """Whether the cycle of a beam is known to be granted to another user."""
         return self._granted.get(event.cycle_id, event.user) != event.user
 
-    def wrong_instance(self, event: m.Beam, now_s: float) -> bool:
+    def _wrong_instance(self, event: m.Beam) -> bool:
         """Whether the beam of another sender is applied in the cycle."""
         return (self.state is State.TRANSMITTING
                 and not m.same_instance(self._beam_sender, event.sender))
 
-    def wrong_codebook(self, event: m.Beam, now_s: float) -> bool:
-        """Whether a beam belongs to a codebook other than the one applied."""
+    def _wrong_codebook(self, event: m.Beam) -> bool:
         return event.codebook_id != self._codebooks.in_use
 
-    # Actions
+    # Steps
 
-    def store_codebook(self, event: CodebookOffered, now_s: float) -> None:
-        """Store a codebook."""
+    def _store_codebook(self, event: CodebookOffered) -> None:
+        """Store a codebook; commands can be executed with it."""
         self._codebooks.put(event.codebook.id, event.codebook)
+        self.log(f'serving: codebook {event.codebook.id}')
 
-    def log_codebook(self, event: CodebookOffered, now_s: float) -> list[Action]:
-        """Log that commands with the codebook can be executed."""
-        return [LogMessage(f'serving: codebook {event.codebook.id}')]
-
-    def store_grant(self, event: m.Grant, now_s: float) -> None:
-        """Store the user of a cycle."""
+    def _store_grant(self, event: m.Grant) -> None:
         self._granted.put(event.cycle_id, event.user)
 
-    def apply_band(self, event: m.RhsCommand, now_s: float) -> list[Action]:
+    def _apply_band(self, event: m.RhsCommand) -> None:
         """Report the codebook's configurations of a band."""
         self._cycle_id, self._unknown_logged = event.cycle_id, False
         applied = self._applied.get(event.cycle_id, set())
         self._applied.put(event.cycle_id, applied | {(event.band, event.codebook_id)})
         analog = self._codebooks.take(event.codebook_id).analog[event.band]
-        return [Send(m.RhsConfiguration(
-            cycle_id=event.cycle_id, mode=m.Mode.POSITIONING, band=event.band,
-            codebook_id=event.codebook_id, analog=analog))]
+        self.send(m.derive(m.RhsConfiguration, event, mode=m.Mode.POSITIONING, analog=analog))
 
-    def apply_beam(self, event: m.Beam, now_s: float) -> list[Action]:
+    def _apply_beam(self, event: m.Beam) -> None:
         """Report the configuration of a beam."""
         self._beam_sender = event.sender
-        return [Send(m.RhsConfiguration(
-            cycle_id=event.cycle_id, mode=m.Mode.TRANSMISSION, band=event.band,
-            codebook_id=event.codebook_id, analog=event.analog[None]))]
+        self.send(m.derive(
+            m.RhsConfiguration, event, mode=m.Mode.TRANSMISSION, analog=event.analog[None]))
 
-    def log_unknown_codebook(self, event: m.RhsCommand | m.Beam, now_s: float) -> list[Action]:
+    def _log_unknown_codebook(self, event: m.RhsCommand | m.Beam) -> None:
         """Log the first message of an outage whose codebook cannot be applied."""
-        if self._unknown_logged:
-            return []
-        self._unknown_logged = True
-        return [LogMessage(
-            f'codebook {event.codebook_id!r} rejected; in use: {self._codebooks.in_use!r}, '
-            f'available: {self._codebooks.ids()}', warning=True)]
-
-    # Messages that are dropped in every state, before the rows of the table.
-    DROPS = {m.Beam: {wrong_cycle: Outcome.WRONG_CYCLE, wrong_user: Outcome.WRONG_USER,
-                      wrong_instance: Outcome.WRONG_INSTANCE}}
+        if not self._unknown_logged:
+            self._unknown_logged = True
+            self.log(f'codebook {event.codebook_id!r} rejected; in use: '
+                     f'{self._codebooks.in_use!r}, available: {list(self._codebooks)}',
+                     warning=True)
 
     TABLE = (
-        Row(ANY, CodebookOffered, actions=(store_codebook, log_codebook)),
-        Row(ANY, m.Grant, actions=(store_grant,)),
-
-        Row(ANY, m.RhsCommand, guard=unknown_codebook, actions=(log_unknown_codebook,),
-            outcome=Outcome.WRONG_CODEBOOK),
-        # The base station repeats a command if it may have missed the report.
-        Row(ANY, m.RhsCommand, guard=repeats_command, actions=(apply_band,),
-            outcome=Outcome.DUPLICATE),
-        Row(ANY, m.RhsCommand, guard=stale_command, outcome=Outcome.STALE_COMMAND),
-        Row(ANY, m.RhsCommand, actions=(apply_band,), target=State.POSITIONING),
-
-        Row(ANY, m.Beam, guard=wrong_codebook, actions=(log_unknown_codebook,),
-            outcome=Outcome.WRONG_CODEBOOK),
-        Row((State.POSITIONING,), m.Beam, actions=(apply_beam,), target=State.TRANSMITTING),
-        Row((State.TRANSMITTING,), m.Beam, actions=(apply_beam,), outcome=Outcome.DUPLICATE),
+        *on(CodebookOffered, 'codebook')(
+            Row(ANY, (_store_codebook,))),
+        *on(m.Grant, 'grant')(
+            Row(ANY, (_store_grant,))),
+        *on(m.RhsCommand, 'command')(
+            Row(ANY, (_log_unknown_codebook,), guard=_unknown_codebook,
+                outcome=Outcome.WRONG_CODEBOOK),
+            # The base station repeats a command if it may have missed the report.
+            Row(ANY, (_apply_band,), guard=_repeats_command, outcome=Outcome.DUPLICATE),
+            Row(ANY, guard=_was_executed, outcome=Outcome.STALE_COMMAND),
+            Row(ANY, (_apply_band,), State.POSITIONING)),
+        *on(m.Beam, 'beam', {_wrong_cycle: Outcome.WRONG_CYCLE,
+                     _wrong_user: Outcome.WRONG_USER,
+                     _wrong_instance: Outcome.WRONG_INSTANCE})(
+            Row(ANY, (_log_unknown_codebook,), guard=_wrong_codebook,
+                outcome=Outcome.WRONG_CODEBOOK),
+            Row((State.POSITIONING,), (_apply_beam,), State.TRANSMITTING),
+            Row((State.TRANSMITTING,), (_apply_beam,), outcome=Outcome.DUPLICATE)),
     )

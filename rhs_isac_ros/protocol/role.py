@@ -5,55 +5,72 @@ import dataclasses
 import enum
 import itertools
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
-from rhs_isac_ros.protocol.events import Action, Event, Outcome
+from rhs_isac_ros.protocol.events import Action, Event, LogMessage, Outcome, Send
 from rhs_isac_ros.protocol.messages import Message
 
 
-class Role(Protocol):
+class Role:
     """A role of the protocol. It maps events to actions and does not read a clock.
+
+    A subclass defines `react`, which appends actions with `send`, `log` and `act`.
 
     Attributes
     ----------
     counters
         Number of occurrences of each outcome and of each kind of unexpected event.
+    now_s
+        Time of the latest event [s].
+    state
+        Current state; None if the role has no state machine.
     """
 
-    counters: collections.Counter[str]
+    # Messages that the role sends, and those that it handles.
+    SENDS: ClassVar[tuple[type[Message], ...]] = ()
+    RECEIVES: ClassVar[tuple[type[Message], ...]] = ()
+    # States in which something that the role needs is missing.
+    BLOCKED_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
+    # States whose timeouts are on the clock of the emulated world, and not of the protocol.
+    WORLD_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
 
-    @property
-    def SENDS(self) -> tuple[type[Message], ...]:
-        """Messages that the role sends."""
-        ...
-
-    @property
-    def RECEIVES(self) -> tuple[type[Message], ...]:
-        """Messages that the role handles."""
-        ...
-
-    @property
-    def BLOCKED_STATES(self) -> frozenset[enum.Enum]:
-        """States in which something that the role needs is missing."""
-        ...
-
-    @property
-    def WORLD_STATES(self) -> frozenset[enum.Enum]:
-        """States whose timeouts are on the clock of the emulated world."""
-        ...
-
-    @property
-    def state(self) -> enum.Enum | None:
-        """Current state; None if the role has no state machine."""
-        ...
+    def __init__(self) -> None:
+        self.counters: collections.Counter[str] = collections.Counter()
+        self.now_s = 0.0
+        self.state: enum.Enum | None = None
+        self._actions: list[Action] = []
 
     def handle(self, event: Event, now_s: float) -> list[Action]:
         """Process an event at a time [s] of a monotonic clock and return actions, in order."""
-        ...
+        self.now_s, self._actions = now_s, []
+        self.react(event)
+        return self._actions
+
+    def react(self, event: Event) -> None:
+        """Process an event at the time `now_s`."""
+        raise NotImplementedError
+
+    def act(self, action: Action) -> None:
+        """Append an action to those that `handle` returns."""
+        self._actions.append(action)
+
+    def send(self, message: Message) -> None:
+        """Append an action that publishes a message."""
+        self.act(Send(message))
+
+    def log(self, text: str, warning: bool = False) -> None:
+        """Append an action that logs a text, unless it is empty."""
+        if text:
+            self.act(LogMessage(text, warning))
+
+    def count(self, outcome: Outcome, n: int = 1) -> None:
+        """Add `n` occurrences of an outcome."""
+        if n:
+            self.counters[outcome.value] += n
 
     def next_deadline(self) -> float | None:
         """Return when the role expects a `Timeout` [s], on the clock of `handle`, or None."""
-        ...
+        return None
 
     def status(self) -> Mapping[str, str]:
         """Return the values in use and those pending by name, for the diagnostics.
@@ -61,42 +78,11 @@ class Role(Protocol):
         Examples of names are ``parameter.policy``, ``pending.policy`` and ``codebook_id``; the
         result is empty if the role has no settings.
         """
-        ...
-
-
-class CountingRole:
-    """Base of all roles: counts outcomes and has no settings.
-
-    Attributes
-    ----------
-    counters
-        Number of occurrences of each outcome and of each kind of unexpected event.
-    """
-
-    def __init__(self) -> None:
-        self.counters: collections.Counter[str] = collections.Counter()
-
-    def count(self, outcome: Outcome, n: int = 1) -> None:
-        """Add `n` occurrences of an outcome."""
-        if n:
-            self.counters[outcome.value] += n
-
-    def status(self) -> Mapping[str, str]:
-        """Return an empty mapping, because the role has no settings."""
         return {}
 
 
-class PlainRole(CountingRole):
-    """Base of the roles that only answer messages, without states or deadlines."""
-
-    BLOCKED_STATES: frozenset[enum.Enum] = frozenset()
-    WORLD_STATES: frozenset[enum.Enum] = frozenset()
-    state: enum.Enum | None = None
-
-    def next_deadline(self) -> float | None:
-        """Return None, because the role needs no `Timeout`."""
-        return None
-
+# Number of cycles whose messages roles remember; no message of an older cycle is in transit.
+REMEMBERED_CYCLES = 8
 
 Key = TypeVar('Key')
 Value = TypeVar('Value')
@@ -109,199 +95,148 @@ class NewestDict(dict[Key, Value]):
     ----------
     max_size
         Number of entries that it keeps.
+
+    Attributes
+    ----------
+    pinned
+        Key of an entry that is neither discarded nor counted towards the limit, or None.
     """
 
     def __init__(self, max_size: int) -> None:
         super().__init__()
         self.max_size = max_size
+        self.pinned: Key | None = None
 
-    def put(self, key: Key, value: Value, pinned: Key | None = None) -> int:
-        """Store an entry as the newest and discard the oldest beyond the limit.
-
-        Parameters
-        ----------
-        pinned
-            Key of an entry that is neither discarded nor counted towards the limit.
-
-        Returns
-        -------
-        int
-            Number of entries that were discarded.
-        """
+    def put(self, key: Key, value: Value) -> int:
+        """Store an entry as the newest; return how many beyond the limit were discarded."""
         self.pop(key, None)
         self[key] = value
         # Stops at the last entry to discard, because most calls discard none.
-        n_surplus = len(self) - (pinned in self) - self.max_size
+        n_surplus = len(self) - (self.pinned in self) - self.max_size
         surplus = list(itertools.islice(
-            (known for known in self if known != pinned), max(n_surplus, 0)))
+            (known for known in self if known != self.pinned), max(n_surplus, 0)))
         for known in surplus:
             del self[known]
         return len(surplus)
 
 
-Item = TypeVar('Item')
 # Maximum number of codebooks offered during a cycle before the oldest one is discarded.
 _MAX_OFFERED = 3
 
 
-class CodebookCache(Generic[Item]):
-    """Items by codebook id; the item in use is never discarded.
-
-    Attributes
-    ----------
-    in_use
-        Id of the item that was taken last; empty at first.
-    """
+class CodebookCache(NewestDict[str, Value]):
+    """Items by codebook id; the item in use, which was taken last, is never discarded."""
 
     def __init__(self) -> None:
-        self._items: NewestDict[str, Item] = NewestDict(_MAX_OFFERED)
-        self.in_use = ''
+        super().__init__(_MAX_OFFERED)
 
-    def put(self, codebook_id: str, item: Item) -> None:
-        """Store an item as the latest; the oldest one not in use may be discarded."""
-        self._items.put(codebook_id, item, pinned=self.in_use)
+    @property
+    def in_use(self) -> str:
+        """Id of the item that was taken last; empty at first."""
+        return self.pinned or ''
 
-    def take(self, codebook_id: str) -> Item:
-        """Return the item of a codebook and mark it as in use.
-
-        Raises
-        ------
-        KeyError
-            If the codebook has no item.
-        """
-        item = self._items[codebook_id]
-        self.in_use = codebook_id
+    def take(self, codebook_id: str) -> Value:
+        """Return the item of a codebook, which must be known, and mark it as in use."""
+        item = self[codebook_id]
+        self.pinned = codebook_id
         return item
 
-    def peek(self, codebook_id: str) -> Item | None:
-        """Return the item of a codebook, or None; the item in use stays the same."""
-        return self._items.get(codebook_id)
 
-    def __contains__(self, codebook_id: str) -> bool:
-        """Return whether a codebook has an item."""
-        return codebook_id in self._items
-
-    def ids(self) -> list[str]:
-        """Return the ids of all items, the oldest first."""
-        return list(self._items)
-
-
-StateT = TypeVar('StateT', bound=enum.Enum)
 RoleT = TypeVar('RoleT')
-EventT = TypeVar('EventT')
+EventT = TypeVar('EventT', contravariant=True)
 
-# As a source: any state. As a target: the current state.
+# As a source: any state. As a target: the current state, which is not entered again.
 ANY = None
 SAME = None
 
 
-def always(role: object, event: object, now_s: float) -> bool:
+def always(role: object, event: object) -> bool:
     """Accept every event; this is the guard of a row without a condition."""
     return True
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Transition(Generic[StateT, RoleT, EventT]):
-    """One row of a table.
+class Transition(Generic[RoleT, EventT]):
+    """One row of a table."""
 
-    Attributes
-    ----------
-    source
-        States in which the row applies, or ANY.
-    event
-        Class of the event.
-    guard
-        Condition on role, event and time; it must not have side effects.
-    actions
-        Steps to carry out, in order; each may return protocol actions.
-    target
-        Next state, or SAME.
-    outcome
-        Outcome to count, or None.
-    restart_timeout
-        Whether to restart the timeout although the state does not change.
-    enter_again
-        Whether the state is entered again, although it does not change: the timeout restarts, and
-        `StateMachine.repeats` is 0.
-    """
-
-    source: tuple[StateT, ...] | None
-    event: type[EventT]
-    guard: Callable[[RoleT, EventT, float], bool] = always
-    actions: tuple[Callable[[RoleT, EventT, float], Iterable[Action] | None], ...] = ()
-    target: StateT | None = SAME
-    outcome: Outcome | None = None
-    restart_timeout: bool = False
-    enter_again: bool = False
+    source: tuple[enum.Enum, ...] | None  # states in which it applies, or ANY
+    actions: tuple[Callable[[RoleT, EventT], None], ...] = ()  # steps to carry out, in order
+    target: enum.Enum | None = SAME  # state to enter, with a new timeout, or SAME
+    # Condition on role and event, without side effects.
+    guard: Callable[[RoleT, EventT], bool] = always
+    outcome: Outcome | None = None  # what to count, if anything
+    restart_timeout: bool = False  # whether to restart the timeout of the current state
+    # The class of its event, and the name of the event in the counters; set by `on`.
+    event: type = object
+    event_name: str = ''
 
 
-class StateMachine(CountingRole, Generic[StateT]):
+AnyRow = Transition[Any, Any]
+# Conditions on which a message is dropped in every state, each with the outcome to count, or None.
+Drops = dict[Callable[..., bool], Outcome | None]
+
+
+class on(Generic[EventT]):
+    """Returns the rows of an event, in order: ``on(event, its name, drops)(*rows)``."""
+
+    def __init__(self, event: type[EventT], name: str, drops: Drops | None = None) -> None:
+        self._event, self._name, self._drops = event, name, drops or {}
+
+    def __call__(self, *rows: Transition[Any, EventT]) -> tuple[AnyRow, ...]:
+        """Return the rows that drop messages, followed by others."""
+        drops = [Transition[Any, EventT](ANY, guard=wrong, outcome=outcome)
+                 for wrong, outcome in self._drops.items()]
+        return tuple(dataclasses.replace(row, event=self._event, event_name=self._name)
+                     for row in (*drops, *rows))
+
+
+class StateMachine(Role):
     """A role with states, which takes events and returns actions.
 
     `handle` takes the first row of `TABLE` whose source, event class and guard match. An event
-    without a matching row changes nothing and counts as ``unexpected_<name>``. The machine does
-    not read a clock: every call passes the time.
-
-    Parameters
-    ----------
-    initial
-        First state.
-    timeouts_s
-        Time after which a state expects a `Timeout` [s]; other states have no timeout.
+    without a matching row changes nothing and counts as ``unexpected_<name>``.
 
     Attributes
     ----------
-    state
-        Current state.
     repeats
         Number of times that the timeout was restarted since the current state was entered.
+    outcome
+        Outcome of the row that was taken last, or None.
     """
 
     STATES: ClassVar[type[enum.Enum]]
-    TABLE: ClassVar[tuple[Transition[Any, Any, Any], ...]]
-    # By message: the conditions on which it is dropped in every state, each with the outcome to
-    # count, or None. They precede the rows of the table.
-    DROPS: ClassVar[Mapping[type, Mapping[Callable[..., bool], Outcome | None]]] = {}
-    # Names of the events in the counters of unexpected events.
+    TABLE: ClassVar[tuple[AnyRow, ...]]
+    # All events, and their names in the counters of unexpected events; derived from the table.
     EVENT_NAMES: ClassVar[Mapping[type, str]]
-    # States in which something that the role needs is missing.
-    BLOCKED_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
-    # States whose timeouts are on the clock of the emulated world, and not of the protocol.
-    WORLD_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
 
-    _rows: ClassVar[Mapping[tuple[enum.Enum, type], tuple[Transition[Any, Any, Any], ...]]]
+    _rows: ClassVar[Mapping[tuple[enum.Enum | None, type], tuple[AnyRow, ...]]]
 
     def __init_subclass__(cls) -> None:
-        """Add the rows of `DROPS` to a new table, and group its rows by state and event class."""
+        """Derive the events from a new table, and group its rows by state and event."""
         super().__init_subclass__()
         if 'TABLE' in vars(cls):
-            events = dict.fromkeys(row.event for row in cls.TABLE)
-            cls.TABLE = tuple(row for event in events for row in (
-                *(Transition(ANY, event, guard=wrong, outcome=outcome)
-                  for wrong, outcome in cls.DROPS.get(event, {}).items()),
-                *(row for row in cls.TABLE if row.event is event)))
+            cls.EVENT_NAMES = {row.event: row.event_name for row in cls.TABLE}
+            cls.RECEIVES = tuple(event for event in cls.EVENT_NAMES if issubclass(event, Message))
             cls._rows = {(state, event): tuple(rows_for(cls.TABLE, state, event))
-                         for state in cls.STATES for event in {row.event for row in cls.TABLE}}
+                         for state in cls.STATES for event in cls.EVENT_NAMES}
 
-    def __init__(self, initial: StateT, timeouts_s: Mapping[StateT, float]) -> None:
+    def __init__(self, initial: enum.Enum) -> None:
         super().__init__()
-        self.state = initial
+        self.state: enum.Enum = initial
         self.repeats = 0
-        self._timeouts_s = dict(timeouts_s)
+        self.outcome: Outcome | None = None
         self._deadline_s: float | None = None
 
-    def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Process an event.
+    def timeout_s(self, state: enum.Enum) -> float | None:
+        """Return the time after which a state expects a `Timeout` [s]; None: it has no timeout."""
+        return None
 
-        Parameters
-        ----------
-        now_s
-            Time on any monotonic clock [s].
+    def next_deadline(self) -> float | None:
+        """Return when the machine expects a `Timeout` [s], on the clock of `handle`, or None."""
+        return self._deadline_s
 
-        Returns
-        -------
-        list of Action
-            Actions to carry out, in order.
+    def react(self, event: Event) -> None:
+        """Take the first matching row.
 
         Raises
         ------
@@ -315,41 +250,26 @@ class StateMachine(CountingRole, Generic[StateT]):
             raise TypeError(
                 f'{kind.__name__} is not an event of {type(self).__name__}') from None
         for row in rows:
-            if row.guard(self, event, now_s):
-                return self._take(row, event, now_s)
+            if row.guard(self, event):
+                self._take(row, event)
+                return
         self.counters[f'unexpected_{self.EVENT_NAMES[kind]}'] += 1
-        return []
 
-    def next_deadline(self) -> float | None:
-        """Return when the machine expects a `Timeout`.
-
-        Returns
-        -------
-        float or None
-            Time on the clock of `handle` [s]; None if the state has no timeout.
-        """
-        return self._deadline_s
-
-    def _take(self, row: Transition[Any, Any, Any], event: Event, now_s: float) -> list[Action]:
+    def _take(self, row: AnyRow, event: Event) -> None:
+        self.outcome = row.outcome
         if row.outcome:
             self.count(row.outcome)
-        actions: list[Action] = []
         for action in row.actions:
-            actions += action(self, event, now_s) or ()
-        target = row.target or self.state
-        enters = row.enter_again or target is not self.state
-        if enters or row.restart_timeout:
-            self.state = target
-            self.repeats = 0 if enters else self.repeats + 1
-            # Looked up after the actions, which may have changed the timeouts.
-            timeout_s = self._timeouts_s.get(self.state)
-            self._deadline_s = None if timeout_s is None else now_s + timeout_s
-        return actions
+            action(self, event)
+        if row.target or row.restart_timeout:
+            self.repeats = 0 if row.target else self.repeats + 1
+            self.state = state = row.target or self.state
+            # Read after the actions, which may have changed it.
+            timeout_s = self.timeout_s(state)
+            self._deadline_s = None if timeout_s is None else self.now_s + timeout_s
 
 
-def rows_for(
-        table: Iterable[Transition[Any, Any, Any]], state: enum.Enum, event: type
-) -> list[Transition[Any, Any, Any]]:
+def rows_for(table: Iterable[AnyRow], state: enum.Enum, event: type) -> list[AnyRow]:
     """Return the rows for a state and a class of events, in the order in which they are tried."""
     return [row for row in table
             if row.event is event and (row.source is ANY or state in row.source)]

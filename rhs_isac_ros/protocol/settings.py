@@ -9,36 +9,29 @@ from typing import Any, Generic, TypeVar
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import ESTIMATORS, BayesEstimator
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.user_registry import MAX_USERS, POLICIES, parse_users
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.fields import Field
 
 # Priors of the position.
 REGION, TRACK = PRIORS = ('region', 'track')
 
 
 def setting(
-        default: bool | int | float | str, text: str, *, unit: str = '',
-        low: float | None = None, high: float | None = None, choices: tuple[str, ...] = (),
-        plugins: str = '', dynamic: bool = True) -> Any:
+        default: bool | int | float | str, text: str, *, dynamic: bool = True, **declared: Any
+) -> Any:
     """Return a dataclass field with the declaration of its parameter as metadata.
 
     Parameters
     ----------
-    text
-        Description, one sentence.
-    low, high
-        Range of a number, inclusive.
-    choices
-        Valid strings; empty: any.
-    plugins
-        Entry point group whose names are valid too; empty: none.
     dynamic
         Whether the parameter may change while the node runs.
+    **declared
+        Further attributes of `Field`.
     """
-    metadata = {'text': text, 'unit': unit, 'low': low, 'high': high, 'choices': choices,
-                'plugins': plugins, 'dynamic': dynamic}
-    return dataclasses.field(default=default, metadata=metadata)
+    return dataclasses.field(default=default, metadata={
+        'declared': Field(type(default), text, **declared), 'dynamic': dynamic})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,11 +150,11 @@ def shown(value: Any) -> str:
 
 def _of_scenario(name: str) -> Any:
     """Declare a setting that replaces a field of the scenario."""
-    declared = {field.name: field for field in dataclasses.fields(Scenario)}[name].metadata
-    first_sentence = declared['text'].partition('. ')[0].rstrip('.')
+    declared = Scenario.__dataclass_fields__[name].metadata['declared']
+    first_sentence = declared.text.partition('. ')[0].rstrip('.')
     return setting(
-        -1.0, f'{first_sentence}; negative: the value of the scenario.', unit=declared['unit'],
-        low=-1.0, high=declared['high'])
+        -1.0, f'{first_sentence}; negative: the value of the scenario.', unit=declared.unit,
+        low=-1.0, high=declared.high)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,32 +10,23 @@ import numpy as np
 from rhs_isac_ros.link import (
     Beam,
     CapacityReport,
-    RunningQuartiles,
     applied_beam,
     capacity,
     capacity_report,
     choose_beam,
 )
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    Action,
-    CodebookOffered,
-    Event,
-    LogMessage,
-    Outcome,
-    Send,
-    SettingsOffered,
-    Timeout,
-)
-from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, PlainRole
+from rhs_isac_ros.protocol.events import Event, Outcome
+from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import PendingSettings, TransmissionSettings
 
 # Fields of a report for which statistics are computed, named as in `CapacityStatistics`.
 _FIGURES = ('expected_bps', 'actual_bps', 'perfect_bps', 'loss_bps', 'loss_percent')
-# Number of cycles whose reports may still arrive.
-_MAX_REMEMBERED = 8
+# Reports over which statistics are computed: they follow a changing network in bounded memory.
+_WINDOW = 1000
 # Time without messages of a cycle after which the role computes a report [s]. In a process with
 # other roles, the rest of the cycle then comes first.
 _IDLE_S = 5e-3
@@ -63,7 +54,7 @@ class _Waiting(NamedTuple):
     deadline_s: float
 
 
-class Transmission(PlainRole):
+class Transmission(Role):
     """The role that steers the beam.
 
     The true position affects only the reported capacities, never the beam. As a report takes as
@@ -88,42 +79,42 @@ class Transmission(PlainRole):
         self._settings = PendingSettings(settings or TransmissionSettings())
         self._codebooks: CodebookCache[None] = CodebookCache()
         # By cycle. `_counted` holds the cycles that the statistics already include.
-        self._steered: NewestDict[int, _Steered] = NewestDict(_MAX_REMEMBERED)
+        self._steered: NewestDict[int, _Steered] = NewestDict(REMEMBERED_CYCLES)
         self._truths: NewestDict[tuple[int, int, int], m.GroundTruth] = NewestDict(
-            _MAX_REMEMBERED + _MAX_WAITING)
-        self._counted: NewestDict[int, None] = NewestDict(_MAX_REMEMBERED)
+            REMEMBERED_CYCLES + _MAX_WAITING)
+        self._counted: NewestDict[int, None] = NewestDict(REMEMBERED_CYCLES)
         self._waiting: collections.deque[_Waiting] = collections.deque()
         self._active_s = -math.inf
-        self._quartiles = RunningQuartiles(len(_FIGURES))
+        # Figures of the newest reports, in a ring.
+        self._reported, self._n_reported = np.empty((_WINDOW, len(_FIGURES))), 0
 
-    def handle(self, event: Event, now_s: float) -> list[Action]:
-        """Process an event and return the beam, or the capacity and its statistics."""
-        if isinstance(event, m.GroundTruth | m.PositionEstimate | m.RhsConfiguration) and (
-                event.cycle_id):
-            self._active_s = now_s
+    def react(self, event: Event) -> None:
+        """Process an event: send the beam, or the capacity and its statistics."""
+        if isinstance(event, m.Message) and event.cycle_id:
+            self._active_s = self.now_s
         match event:
-            case Timeout() if self._waiting:
+            case events.Timeout() if self._waiting:
                 # Messages that have arrived meanwhile precede the next report.
-                self._active_s = now_s
-                return self._report_next()
-            case CodebookOffered(codebook):
+                self._active_s = self.now_s
+                self._report_next()
+            case events.CodebookOffered(codebook):
                 self._codebooks.put(codebook.id, None)
-                return [LogMessage(f'serving: codebook {codebook.id}')]
-            case SettingsOffered(settings):
+                self.log(f'serving: codebook {codebook.id}')
+            case events.SettingsOffered(settings):
                 # A cycle that has a beam keeps its bands.
                 self._settings.latest = settings
-                return [*self._settings.apply()]
+                for change in self._settings.apply():
+                    self.act(change)
             case m.GroundTruth() if event.cycle_id:
                 self._truths.put((event.cycle_id, event.user, event.sender), event)
             case m.PositionEstimate() if event.codebook_id not in self._codebooks:
                 self.count(Outcome.WRONG_CODEBOOK)
             case m.PositionEstimate():
-                return self._steer(event)
+                self._steer(event)
             case m.RhsConfiguration(mode=m.Mode.TRANSMISSION):
-                self._await_report(event, now_s)
+                self._await_report(event)
                 if len(self._waiting) > _MAX_WAITING:
-                    return self._report_next()
-        return []
+                    self._report_next()
 
     def next_deadline(self) -> float | None:
         """Return when the next report is due [s], or None."""
@@ -138,38 +129,34 @@ class Transmission(PlainRole):
         """Return the settings and the codebook in use."""
         return self._settings.describe() | {'codebook_id': self._codebooks.in_use}
 
-    def _bands(self) -> Sequence[int]:
-        """Return the bands that a new cycle may use."""
-        band = self._settings.in_use.band
-        return range(self._scenario.n_bands) if band < 0 else (band,)
-
-    def _steer(self, estimate: m.PositionEstimate) -> list[Action]:
+    def _steer(self, estimate: m.PositionEstimate) -> None:
         known = self._steered.get(estimate.cycle_id)
-        if known and m.same(known.estimate, estimate):
-            self.count(Outcome.DUPLICATE)
-            return [Send(known.beam)]
-        if known and not m.same_instance(known.estimate.sender, estimate.sender):
+        is_other = known and not m.same_instance(known.estimate.sender, estimate.sender)
+        if known and (is_other or m.same(known.estimate, estimate)):
             # The first estimate of a cycle stands. A repeated answer is due all the same.
-            self.count(Outcome.WRONG_INSTANCE)
-            return [Send(known.beam)]
+            self.count(Outcome.WRONG_INSTANCE if is_other else Outcome.DUPLICATE)
+            self.send(known.beam)
+            return
         self._codebooks.take(estimate.codebook_id)
-        bands = known.bands if known else self._bands()
-        surface = (known.surface if known
-                   else self._surface_of(self._settings.in_use.calibration_file))
+        if known:
+            bands, surface = known.bands, known.surface
+        else:
+            settings = self._settings.in_use
+            bands = range(self._scenario.n_bands) if settings.band < 0 else (settings.band,)
+            surface = self._surface_of(settings.calibration_file)
         choice = choose_beam(
             self._scenario, estimate.position, estimate.covariance_m2, bands, surface)
         beam = choice.beam
-        sent = m.Beam(
-            cycle_id=estimate.cycle_id, user=estimate.user, codebook_id=estimate.codebook_id,
-            band=beam.band, analog=beam.analog, digital=beam.digital,
+        sent = m.derive(
+            m.Beam, estimate, band=beam.band, analog=beam.analog, digital=beam.digital,
             expected_bps=choice.expected_bps)
         at_estimate_bps = float(capacity(
             self._scenario, applied_beam(beam, surface), estimate.position[None])[0])
         self._steered.put(
             estimate.cycle_id, _Steered(estimate, sent, at_estimate_bps, bands, surface))
-        return [Send(sent)]
+        self.send(sent)
 
-    def _await_report(self, applied: m.RhsConfiguration, now_s: float) -> None:
+    def _await_report(self, applied: m.RhsConfiguration) -> None:
         steered = self._steered.get(applied.cycle_id)
         if steered is None:
             self.count(Outcome.WRONG_CYCLE)
@@ -178,28 +165,24 @@ class Transmission(PlainRole):
         elif applied.band != steered.beam.band:
             self.count(Outcome.WRONG_BAND)
         else:
-            self._waiting.append(_Waiting(steered, applied, now_s + _MAX_DELAY_S))
+            self._waiting.append(_Waiting(steered, applied, self.now_s + _MAX_DELAY_S))
 
-    def _report_next(self) -> list[Action]:
-        """Compute the first report whose true position is known, or the first if none is."""
+    def _report_next(self) -> None:
+        """Report on the first beam whose true position is known, or the first if none is."""
         waiting = next(filter(self._truth_of, self._waiting), self._waiting[0])
         self._waiting.remove(waiting)
-        return self._report(waiting.steered, waiting.applied, self._truth_of(waiting))
-
-    def _report(
-            self, steered: _Steered, applied: m.RhsConfiguration, truth: m.GroundTruth | None
-    ) -> list[Action]:
+        steered, applied, _ = waiting
         beam, result = steered.beam, CapacityReport(math.nan, math.nan)
-        if truth:
+        if truth := self._truth_of(waiting):
             used = Beam(applied.analog[0], beam.digital, beam.band)
             result = capacity_report(
                 self._scenario, used, truth.position, steered.bands, steered.surface)
-        report = m.Capacity(
-            cycle_id=beam.cycle_id, user=beam.user, codebook_id=beam.codebook_id, band=beam.band,
-            expected_bps=beam.expected_bps, actual_bps=result.actual_bps,
+        report = m.derive(
+            m.Capacity, beam, expected_bps=beam.expected_bps, actual_bps=result.actual_bps,
             perfect_bps=result.perfect_bps, loss_bps=result.loss_bps,
             loss_percent=result.loss_percent, at_estimate_bps=steered.at_estimate_bps)
-        return [Send(report), *self._summarize(report)]
+        self.send(report)
+        self._summarize(report)
 
     def _truth_of(self, waiting: _Waiting) -> m.GroundTruth | None:
         """Return the true position of the node whose position was estimated, if known."""
@@ -209,12 +192,15 @@ class Transmission(PlainRole):
                  and m.same_instance(instance, estimate.user_instance)]
         return found[-1] if found else None
 
-    def _summarize(self, report: m.Capacity) -> list[Action]:
-        """Add a report to the statistics, once for each cycle, and return them."""
+    def _summarize(self, report: m.Capacity) -> None:
+        """Add a report to the statistics, once for each cycle, and publish them."""
         if not math.isfinite(report.loss_percent) or report.cycle_id in self._counted:
-            return []
+            return
         self._counted.put(report.cycle_id, None)
-        self._quartiles.add(np.array([getattr(report, name) for name in _FIGURES]))
-        figures = dict(zip(_FIGURES, self._quartiles.quartiles(), strict=True))
-        return [Send(m.CapacityStatistics(
-            cycle_id=report.cycle_id, n_reports=len(self._quartiles), **figures))]
+        self._reported[self._n_reported % len(self._reported)] = [
+            getattr(report, name) for name in _FIGURES]
+        self._n_reported += 1
+        newest = self._reported[:self._n_reported]
+        quartiles = np.quantile(newest, (0.25, 0.5, 0.75), axis=0).T
+        self.send(m.derive(m.CapacityStatistics, report, n_reports=len(newest),
+                           **dict(zip(_FIGURES, quartiles, strict=True))))

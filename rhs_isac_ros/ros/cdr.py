@@ -7,6 +7,7 @@ messages instead: common data representation (CDR), version 1, little endian.
 
 import dataclasses
 import enum
+import json
 import math
 import struct
 from collections.abc import Callable, Sequence
@@ -14,18 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.protocol.messages import Message, MessageError
+from rhs_isac_ros.protocol.messages import MessageError
 
 
 class Type(NamedTuple):
-    """How a type of ROS is encoded.
+    """How a type of ROS is encoded: as items on the wire, each of a type of `struct`.
 
-    Attributes
-    ----------
-    wire
-        Characters of `struct` for numbers, ``s`` for a string, ``*I`` and ``*d`` for sequences.
-    encode, decode
-        From a value to its items on the wire, and back.
+    ``s`` is a string, ``*I`` and ``*d`` are sequences.
     """
 
     wire: tuple[str, ...]
@@ -81,6 +77,17 @@ def _decode_integers(items: Sequence[np.ndarray]) -> np.ndarray:
     return items[0].astype(int)
 
 
+def _decode_mapping(items: Sequence[str]) -> dict[str, Any]:
+    # JSON is YAML without the references that let a short text describe an enormous value.
+    try:
+        mapping = json.loads(items[0])
+    except RecursionError as error:
+        raise ValueError(str(error)) from None
+    if not isinstance(mapping, dict):
+        raise ValueError('expected a mapping in JSON')
+    return mapping
+
+
 # Types of one item on the wire.
 SCALARS = {'uint8': 'B', 'uint32': 'I', 'uint64': 'Q', 'double': 'd', 'string': 's'}
 # The other types.
@@ -93,6 +100,8 @@ TYPES = {
     'sequence<uint32>': Type(('*I',), _encode_integers, _decode_integers),
     'rhs_isac_msgs/RealArray': Type(('*I', '*d'), _encode_real, _decode_real),
     'rhs_isac_msgs/ComplexArray': Type(('*I', '*d', '*d'), _encode_complex, _decode_complex),
+    # A string, in which the class of the messages has a mapping.
+    'mapping': Type(('s',), lambda mapping: (json.dumps(dict(mapping)),), _decode_mapping),
 }
 
 
@@ -106,12 +115,8 @@ _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 class _Run(NamedTuple):
     """Numbers of fixed size, and the string or sequence that follows them, if any.
 
-    Attributes
-    ----------
-    layouts
-        By position in the message modulo 8, on which the padding depends.
-    tail
-        Wire type of what follows; empty for the last run.
+    The layout depends on the position in the message modulo 8. `tail` is the wire type of what
+    follows; empty for the last run.
     """
 
     layouts: tuple[struct.Struct, ...]
@@ -122,10 +127,7 @@ class _Run(NamedTuple):
 class _Field(NamedTuple):
     """A field of a message, and the range of its items on the wire.
 
-    Attributes
-    ----------
-    encode, decode
-        As in `Type`, or None for a single item; `decode` alone converts an enumeration.
+    A single item has no `encode`; then `decode` converts an enumeration, if given.
     """
 
     name: str
@@ -141,7 +143,8 @@ class Codec:
     Parameters
     ----------
     kind
-        Class of the messages.
+        Class of the messages: a dataclass with the fields of the ROS type, and ``stamp_ns`` if it
+        keeps the stamp of the header.
     types
         Types by field, as in ``get_fields_and_field_types`` of the ROS type.
 
@@ -151,10 +154,12 @@ class Codec:
         If the type of a field is not supported.
     """
 
-    def __init__(self, kind: type[Message], types: dict[str, str]) -> None:
+    def __init__(self, kind: type[Any], types: dict[str, str]) -> None:
         self._kind = kind
-        enums = {field.name: field.type for field in dataclasses.fields(kind)
-                 if isinstance(field.type, type) and issubclass(field.type, enum.IntEnum)}
+        own = {field.name: field.type for field in dataclasses.fields(kind)}
+        self._keeps_stamp = 'stamp_ns' in own
+        enums = {name: one for name, one in own.items()
+                 if isinstance(one, type) and issubclass(one, enum.IntEnum)}
         # The stamp and the frame of the header.
         wire = ['i', 'I', 's']
         fields = []
@@ -162,6 +167,8 @@ class Codec:
             if name == 'header':
                 continue
             first = len(wire)
+            if text == 'string' and own[name] is not str:
+                text = 'mapping'
             if text in TYPES:
                 one = TYPES[text]
                 wire += one.wire
@@ -175,8 +182,7 @@ class Codec:
         self._fields, self._runs = tuple(fields), tuple(_runs(wire))
 
     def encode(
-            self, message: Message, frame: str, stamp_ns: int, sender: int, scenario_id: str
-    ) -> bytes:
+            self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
         """Return the bytes of a message; the arguments replace its own values.
 
         Raises
@@ -225,7 +231,7 @@ class Codec:
             raise MessageError(f'{self._kind.__name__}.{name}: {text!r}, expected valid Unicode: '
                                f'{error.reason}') from None
 
-    def decode(self, data: bytes) -> Message:
+    def decode(self, data: bytes) -> Any:
         """Return the message of bytes that begin with `HEADER`; arrays do not share their memory.
 
         Raises
@@ -239,7 +245,9 @@ class Codec:
         except (struct.error, ValueError) as error:
             raise MessageError(f'{self._kind.__name__}: invalid CDR data of {len(data)} bytes: '
                                f'{error}') from None
-        values = {'stamp_ns': _NANOSECONDS * items[0] + items[1]}
+        values: dict[str, Any] = {}
+        if self._keeps_stamp:
+            values['stamp_ns'] = _NANOSECONDS * items[0] + items[1]
         for name, first, last, encode, decode in self._fields:
             if decode is None:
                 values[name] = items[first]

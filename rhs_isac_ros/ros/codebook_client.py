@@ -11,14 +11,13 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.diagnostics import LogOnce
-from rhs_isac_ros.ros.endpoints import create_or_refuse, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import LATCHED, create_or_refuse, steady_timer, subscribe
 from rhs_isac_ros.ros.parameters import CODEBOOK
 
 _NAMES = list(CODEBOOK)
@@ -33,13 +32,6 @@ class CodebookClient:
     service. Two optimizers have the same services, and either may answer. The announced codebook,
     whose id proves its content, therefore replaces a response with another codebook or a missing
     response. The optimizers agree on which of them announces; see `Presences`.
-
-    Parameters
-    ----------
-    scenario
-        Scenario that the codebook must fit.
-    on_codebook
-        Called with each new codebook.
 
     Attributes
     ----------
@@ -63,16 +55,15 @@ class CodebookClient:
         self._log_once = LogOnce(node)
         self.codebook_id = ''
         subscribe(
-            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, qos.LATCHED, raw=True)
+            node, ros.Codebook, topics.CODEBOOK, self._on_announcement, LATCHED, raw=True)
         self._timer = steady_timer(node, _RETRY_S, self._request)
 
     def _on_announcement(self, content: bytes) -> None:
         try:
-            message = deserialize_message(content, ros.Codebook)
-            codebook = convert.codebook_from_ros(message)
-        # Anything may be published on the topic, and rclpy raises a RuntimeError without a public
-        # class.
-        except (CodebookError, RuntimeError, ValueError):
+            message = convert.from_bytes(convert.CodebookMessage, content)
+            codebook = message.codebook()
+        # Anything may be published on the topic.
+        except ValueError:
             return
         if message.codebook_id != codebook.id or not self._fits(message, codebook):
             return
@@ -84,7 +75,7 @@ class CodebookClient:
         self._timer.reset()
         self._request()
 
-    def _fits(self, message: ros.Codebook, codebook: Codebook) -> bool:
+    def _fits(self, message: convert.CodebookMessage, codebook: Codebook) -> bool:
         """Return whether a codebook fits the scenario, or log that it does not."""
         try:
             codebook.check(self._scenario)

@@ -1,11 +1,8 @@
 """Conversions between the plain messages of the protocol and ROS messages."""
 
-from __future__ import annotations
-
-import array
-import json
+import dataclasses
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -20,7 +17,7 @@ from rhs_isac_ros.positioning import TrackEstimate
 from rhs_isac_ros.protocol.events import PublishTrack
 from rhs_isac_ros.protocol.messages import Message, MessageError, PositionEstimate
 from rhs_isac_ros.protocol.presences import Presence
-from rhs_isac_ros.ros import cdr
+from rhs_isac_ros.ros import cdr, frames
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 
@@ -28,44 +25,61 @@ from rhs_isac_ros.ros.topics import NAMES, RHS_FRAME
 _UNKNOWN_ROTATION_VARIANCE = 1e6
 
 
-def ros_type(kind: type[Message]) -> Any:
-    """Return the class of `rhs_isac_msgs.msg` with the name of a message class."""
-    return getattr(ros, kind.__name__)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class CodebookMessage:
+    """A codebook as it is announced; `sender` and `scenario_id` are as in `Message`."""
+
+    sender: int = 0
+    scenario_id: str = ''
+    codebook_id: str
+    analog: np.ndarray
+    digital: np.ndarray
+    average_crlb_m2: float
+
+    @classmethod
+    def of(cls, codebook: Codebook, sender: int = 0, scenario_id: str = '') -> 'CodebookMessage':
+        """Return the announcement of a codebook."""
+        return cls(
+            sender=sender, scenario_id=scenario_id, codebook_id=codebook.id,
+            analog=codebook.analog, digital=codebook.digital,
+            average_crlb_m2=codebook.average_crlb_m2)
+
+    def codebook(self) -> Codebook:
+        """Return the codebook, or raise CodebookError."""
+        return Codebook(self.analog, self.digital, self.average_crlb_m2)
+
+
+_ROS_TYPES: dict[type, Any] = {
+    **{kind: getattr(ros, kind.__name__) for kind in NAMES},
+    CodebookMessage: ros.Codebook, Presence: ros.Presence}
+_CODECS = {kind: cdr.Codec(kind, own.get_fields_and_field_types())
+           for kind, own in _ROS_TYPES.items()}
+_MessageT = TypeVar('_MessageT', bound=Message | CodebookMessage | Presence)
+
+
+def ros_type(kind: type[_MessageT]) -> Any:
+    """Return the class of `rhs_isac_msgs.msg` of a message class."""
+    return _ROS_TYPES[kind]
 
 
 def to_ros(
-        message: Message, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
-    """Convert a message to ROS.
-
-    Parameters
-    ----------
-    stamp
-        Time for the header; None: zero.
-    identity
-        Sender and id of the scenario; by default those of the message.
-
-    Returns
-    -------
-    Any
-        A message of `ros_type`.
-    """
+        message: _MessageT, stamp: Time | None, identity: tuple[int, str] | None = None) -> Any:
+    """Convert a message to ROS; see `to_bytes`."""
     stamp_ns = 10**9 * stamp.sec + stamp.nanosec if stamp is not None else 0
     return deserialize_message(to_bytes(message, stamp_ns, identity), ros_type(type(message)))
 
 
 def to_bytes(
-        message: Message, stamp_ns: int, identity: tuple[int, str] | None = None,
+        message: _MessageT, stamp_ns: int, identity: tuple[int, str] | None = None,
         frame: str = RHS_FRAME) -> bytes:
     """Serialize a message (CDR), as a publisher of `ros_type` accepts it.
 
     Parameters
     ----------
-    stamp_ns
-        Time for the header [ns].
     identity
         Sender and id of the scenario; by default those of the message.
     frame
-        Frame of the surface.
+        Frame of the header.
 
     Raises
     ------
@@ -76,17 +90,8 @@ def to_bytes(
     return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)
 
 
-def from_ros(kind: type[Message], message: Any) -> Message:
-    """Convert a message of `ros_type` from ROS.
-
-    Raises
-    ------
-    MessageError
-        If an array does not fill its shape, or an enumeration field is not one of its
-        constants.
-    RuntimeError
-        If rclpy does not serialize messages as `cdr` decodes them.
-    """
+def from_ros(kind: type[_MessageT], message: Any) -> _MessageT:
+    """Convert a message of `ros_type` from ROS, or raise MessageError, as `from_bytes` does."""
     serialized = serialize_message(message)
     # The options that follow the identifier do not change the encoding.
     if serialized[:2] != cdr.HEADER[:2]:
@@ -96,7 +101,7 @@ def from_ros(kind: type[Message], message: Any) -> Message:
     return _CODECS[kind].decode(serialized)
 
 
-def from_bytes(kind: type[Message], serialized: bytes) -> Message:
+def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     """Convert a serialized message (CDR), as a raw subscription receives it.
 
     Other subscriptions of rclpy silently drop what they cannot deserialize.
@@ -104,7 +109,8 @@ def from_bytes(kind: type[Message], serialized: bytes) -> Message:
     Raises
     ------
     MessageError
-        If the bytes are not a message of `ros_type`, or for the reasons given in `from_ros`.
+        If the bytes are not a message of `ros_type`, an array does not fill its shape, or an
+        enumeration field is not one of its constants.
     """
     if serialized.startswith(cdr.HEADER):
         return _CODECS[kind].decode(serialized)
@@ -119,54 +125,9 @@ def from_bytes(kind: type[Message], serialized: bytes) -> Message:
     return from_ros(kind, message)
 
 
-def codebook_to_ros(
-        codebook: Codebook, stamp: Time, sender: int = 0, scenario_id: str = '') -> ros.Codebook:
-    """Convert a codebook to ROS; `sender` and `scenario_id` are as in `Message`."""
-    return ros.Codebook(
-        header=Header(stamp=stamp, frame_id=RHS_FRAME), sender=sender, scenario_id=scenario_id,
-        codebook_id=codebook.id,
-        analog=_encode_real(codebook.analog), digital=_encode_complex(codebook.digital),
-        average_crlb_m2=float(codebook.average_crlb_m2))
-
-
 def codebook_from_ros(message: ros.Codebook) -> Codebook:
-    """Convert a codebook from ROS.
-
-    Raises
-    ------
-    MessageError
-        If an array does not fill its shape.
-    CodebookError
-        If the arrays are not a valid codebook.
-    """
-    try:
-        analog, digital = _decode_real(message.analog), _decode_complex(message.digital)
-    except ValueError as error:
-        raise MessageError(f'Codebook: {error}') from None
-    return Codebook(analog, digital, message.average_crlb_m2)
-
-
-def presence_to_ros(presence: Presence, stamp: Time) -> ros.Presence:
-    """Convert an announcement to ROS."""
-    return ros.Presence(
-        header=Header(stamp=stamp), sender=presence.sender, scenario_id=presence.scenario_id,
-        role=presence.role, node=presence.node,
-        scenario=json.dumps(dict(presence.scenario)))
-
-
-def presence_from_ros(message: ros.Presence) -> Presence:
-    """Convert an announcement from ROS.
-
-    Raises
-    ------
-    ValueError
-        If the scenario is not a mapping in JSON.
-    """
-    # JSON is YAML without the references that let a short text describe an enormous value.
-    scenario = json.loads(message.scenario)
-    if not isinstance(scenario, dict):
-        raise MessageError('Presence.scenario: expected a mapping of field names to values')
-    return Presence(message.sender, message.scenario_id, message.role, message.node, scenario)
+    """Convert a codebook from ROS, or raise MessageError or CodebookError."""
+    return from_ros(CodebookMessage, message).codebook()
 
 
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
@@ -185,7 +146,7 @@ def pose(
     """
     frame = frame or Frame()
     result = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame.name))
-    result.pose.pose.position = _encode_vector(Point, frame.from_surface(estimate.position))
+    result.pose.pose.position = frames.to_ros(Point, frame.from_surface(estimate.position))
     result.pose.covariance = _with_rotation(
         frame.covariance(estimate.covariance_m2), math.pi**2 / 3)
     return result
@@ -212,8 +173,8 @@ def true_odometry(
     """Return a true position [3] [m] and velocity [3] [m/s] in a frame, without covariances."""
     result = Odometry(header=Header(stamp=stamp, frame_id=frame.name),
                       child_frame_id=frame.user(user))
-    result.pose.pose.position = _encode_vector(Point, frame.from_surface(position))
-    result.twist.twist.linear = _encode_vector(Vector3, frame.rotation @ velocity)
+    result.pose.pose.position = frames.to_ros(Point, frame.from_surface(position))
+    result.twist.twist.linear = frames.to_ros(Vector3, frame.rotation @ velocity)
     return result
 
 
@@ -222,41 +183,3 @@ def _with_rotation(covariance: np.ndarray, variance: float) -> np.ndarray:
     both = variance * np.eye(6)
     both[:3, :3] = covariance
     return both.ravel()
-
-
-def _encode_real(values: np.ndarray) -> ros.RealArray:
-    return ros.RealArray(
-        shape=array.array('I', values.shape), data=array.array('d', values.tobytes()))
-
-
-def _encode_complex(values: np.ndarray) -> ros.ComplexArray:
-    # tobytes is sixty times faster than the conversion of an iterable.
-    return ros.ComplexArray(
-        shape=array.array('I', values.shape), re=array.array('d', values.real.tobytes()),
-        im=array.array('d', values.imag.tobytes()))
-
-
-def _decode_real(message: ros.RealArray) -> np.ndarray:
-    return _reshape(message.data, message.shape)
-
-
-def _decode_complex(message: ros.ComplexArray) -> np.ndarray:
-    real, imag = _reshape(message.re, message.shape), _reshape(message.im, message.shape)
-    result = np.empty(real.shape, complex)
-    result.real, result.imag = real, imag
-    return result
-
-
-def _reshape(values: array.array[float], shape: array.array[int]) -> np.ndarray:
-    if len(values) != math.prod(shape) or not len(values):
-        raise ValueError(
-            f'{len(values)} values, expected shape {list(shape)} with at least one value')
-    return np.frombuffer(values).reshape(tuple(shape))
-
-
-def _encode_vector(kind: Any, values: np.ndarray) -> Any:
-    x, y, z = values.tolist()
-    return kind(x=x, y=y, z=z)
-
-
-_CODECS = {kind: cdr.Codec(kind, ros_type(kind).get_fields_and_field_types()) for kind in NAMES}

@@ -9,21 +9,16 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from rhs_isac_ros.monitoring.role_statistics import Report
-from rhs_isac_ros.ros import qos, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, create_publisher, steady_timer, subscribe
 
 _PERIOD_S = 1.0
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:
-    """Convert the report of a node to one status, OK or WARN.
+    """Convert the report of a node, by its fully qualified name, to one status, OK or WARN.
 
     The hardware id consists of the name of this host and the name of the node.
-
-    Parameters
-    ----------
-    name
-        Fully qualified name of the node.
     """
     level = DiagnosticStatus.WARN if report.fault else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
@@ -49,7 +44,7 @@ def subscribe_reports(node: Node, on_report: Callable[[str, Report], None]) -> N
     def receive(message: DiagnosticArray) -> None:
         for name, report in from_ros(message, namespace):
             on_report(name, report)
-    subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, qos.EXCHANGE)
+    subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, EXCHANGE)
 
 
 class Diagnostics:
@@ -58,7 +53,7 @@ class Diagnostics:
     def __init__(self, node: Node, report: Callable[[], Report]) -> None:
         self._node, self._report = node, report
         self._publisher = create_publisher(
-            node, DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE)
+            node, DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE)
         steady_timer(node, _PERIOD_S, self._publish)
 
     def _publish(self) -> None:
@@ -75,14 +70,7 @@ class LogOnce:
         self._logged: dict[str, str] = {}
 
     def error(self, subject: str, text: str, *, repeat_if_changed: bool = False) -> None:
-        """Log an error unless one was logged for the subject already.
-
-        Parameters
-        ----------
-        repeat_if_changed
-            Whether to log an error again if its text differs from the last one logged for the
-            subject.
-        """
+        """Log the first error of a subject, and on request each that differs from the last."""
         last = self._logged.get(subject)
         if last is None or repeat_if_changed and text != last:
             self._logged[subject] = text

@@ -1,15 +1,18 @@
-"""Timers, and publishers and subscriptions without event handlers.
+"""Timers, quality of service, publishers and subscriptions, and a thread for slow work.
 
-Those of subscriptions slow down executors. Those of publishers end a node that destroys one while
-an observer with an incompatible quality of service is present (ros2/rclpy#1644).
+Publishers and subscriptions have no event handlers. Those of subscriptions slow down executors.
+Those of publishers end a node that destroys one while an observer with an incompatible quality of
+service is present (ros2/rclpy#1644).
 
 The middleware may refuse to create an endpoint, as without a permission. The node then runs
 without it, logs the refusal, and reports it in its diagnostics.
 """
 
+import collections
 import functools
 import weakref
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from rclpy.clock import Clock
@@ -18,12 +21,44 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
+from rhs_isac_ros.ros import convert, topics
+
+
+def _profile(
+        depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
+        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability,
+                      durability=durability)
+
+
+# For handshakes and signals, which must all arrive and are useless to late joiners. The depth
+# holds the acks of the users of a beacon, and messages that arrive during a computation.
+EXCHANGE = _profile(128)
+# For acks: all users answer the beacon of a base station to which they are new.
+ACKS = _profile(MAX_USERS)
+# For the same messages, received by an observer of the whole network: its queue must hold those
+# of several seconds in which a busy machine does not run the observer.
+OBSERVATION = _profile(4096)
+# For a current value, which late joiners receive as well.
+LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
+# For `LATCHED` values of many publishers, of which a subscription keeps one each.
+PRESENCES = _profile(128, DurabilityPolicy.TRANSIENT_LOCAL)
+# For the positions of robots, whose drivers and simulators often publish best effort.
+SENSOR = _profile(10, reliability=ReliabilityPolicy.BEST_EFFORT)
+_LATCHED_MESSAGES = {m.CapacityStatistics}
+
+
+def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSProfile:
+    """Return `LATCHED` for messages of a current value, `exchange` for others, `ACKS` for acks."""
+    if kind is m.Ack and exchange is EXCHANGE:
+        return ACKS
+    return LATCHED if kind in _LATCHED_MESSAGES else exchange
 
 _CreatedT = TypeVar('_CreatedT')
 # By node: descriptions of what was refused, by kind and name.
@@ -105,10 +140,7 @@ def create_publisher(
 ) -> Publisher:
     """Create a publisher of a ROS type on a topic; one that was refused publishes nothing.
 
-    Parameters
-    ----------
-    overridable
-        Whether parameters ``qos_overrides.*`` change its quality of service.
+    Parameters ``qos_overrides.*`` change the quality of service if it is `overridable`.
     """
     publisher = create_or_refuse(node, f'publisher of {name}', lambda: node.create_publisher(
         kind, name, profile, qos_overriding_options=_overriding(overridable),
@@ -119,18 +151,14 @@ def create_publisher(
 def subscribe(
         node: Node, kind: type, name: str, callback: Callable[[Any], None], profile: QoSProfile,
         raw: bool = False, overridable: bool = False) -> None:
-    """Subscribe to a topic.
+    """Subscribe to a topic of a ROS type.
 
     Parameters
     ----------
-    kind
-        ROS type of the topic.
-    name
-        Name of the topic.
     callback
         Called with each message, or with its serialized bytes (CDR) if `raw`.
     overridable
-        Whether parameters ``qos_overrides.*`` change its quality of service.
+        Whether parameters ``qos_overrides.*`` change the quality of service.
     """
     create_or_refuse(node, f'subscription to {name}', lambda: node.create_subscription(
         kind, name, callback, profile, raw=raw,
@@ -141,8 +169,10 @@ def subscribe(
 def subscribe_messages(
         node: Node, kinds: Iterable[type[m.Message]], sizes: Mapping[str, int] | None,
         on_message: Callable[[m.Message], None],
-        on_error: Callable[[m.MessageError], None] | None = None,
-        scenario_id: str = '', exchange: QoSProfile = qos.EXCHANGE) -> None:
+        on_error: Callable[[m.MessageError], None] | None = None, scenario_id: str = '', *,
+        on_foreign: Callable[[m.Message], None] = lambda message: None,
+        on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
+        exchange: QoSProfile = EXCHANGE) -> None:
     """Subscribe to messages of the protocol; malformed ones are dropped.
 
     Parameters
@@ -151,8 +181,10 @@ def subscribe_messages(
         Required array sizes by symbol, as in `Scenario.sizes`; None: any.
     on_error
         Called with the reason why a message was dropped; by default, the node logs it.
-    scenario_id
-        If given, messages of other scenarios are ignored.
+    scenario_id, on_foreign
+        If given, messages of other scenarios are passed to `on_foreign`.
+    on_arrival
+        Called with the class of each message before it is read.
     exchange
         Quality of service for messages that are not latched.
     """
@@ -160,19 +192,21 @@ def subscribe_messages(
         node.get_logger().warning(f'dropped: {error}', throttle_duration_sec=10.0)
 
     def receive(kind: type[m.Message], serialized: bytes) -> None:
+        on_arrival(kind)
         try:
-            plain = convert.from_bytes(kind, serialized)
-            if scenario_id and plain.scenario_id not in ('', scenario_id):
+            message = convert.from_bytes(kind, serialized)
+            if scenario_id and message.scenario_id not in ('', scenario_id):
+                on_foreign(message)
                 return
             if sizes is not None:
-                m.check(plain, sizes)
+                m.check(message, sizes)
         except m.MessageError as error:
             (on_error or log)(error)
             return
-        on_message(plain)
+        on_message(message)
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), topics.NAMES[kind],
-                  functools.partial(receive, kind), qos.profile_for(kind, exchange), raw=True)
+                  functools.partial(receive, kind), profile_for(kind, exchange), raw=True)
 
 
 class UserTopics:
@@ -201,7 +235,7 @@ class UserTopics:
         if user not in self._publishers:
             self._publishers[user] = tuple(
                 create_publisher(
-                    self._node, kind, name.format(user=user), qos.EXCHANGE, overridable=True)
+                    self._node, kind, name.format(user=user), EXCHANGE, overridable=True)
                 for name, kind in self._kinds.items())
         return self._publishers[user]
 
@@ -209,3 +243,53 @@ class UserTopics:
         """Destroy the publishers for a user, if any."""
         for publisher in self._publishers.pop(user, ()):
             self._node.destroy_publisher(publisher)
+
+
+_Result = TypeVar('_Result')
+_IMMEDIATE_S = 1e-6
+
+
+class BackgroundWorker:
+    """A thread that runs jobs one after the other.
+
+    Results are delivered in the thread that spins the node, as messages are.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._is_open = True
+        self._done: collections.deque[tuple[Future[Any], Callable[[Any], None]]] = (
+            collections.deque())
+        self._timer = steady_timer(node, _IMMEDIATE_S, self._deliver)
+        self._timer.cancel()
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=node.get_name())
+
+    def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
+        """Queue a job.
+
+        The thread that spins the node calls `on_result` with the result, or raises the exception
+        of the job.
+        """
+        def hand_over(future: Future[_Result]) -> None:
+            self._done.append((future, on_result))
+            executor = self._node.executor
+            if self._is_open and executor is not None:
+                executor.create_task(self._wake)
+        self._pool.submit(job).add_done_callback(hand_over)
+
+    def close(self) -> None:
+        """Wait for the running job, cancel the others and discard all results."""
+        self._is_open = False
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _wake(self) -> None:
+        # The task only starts the timer: an exception in a task would stop the events executor,
+        # and a task may outlast the node.
+        if self._is_open:
+            self._timer.reset()
+
+    def _deliver(self) -> None:
+        self._timer.cancel()
+        while self._done:
+            future, on_result = self._done.popleft()
+            on_result(future.result())

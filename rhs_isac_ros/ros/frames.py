@@ -35,21 +35,22 @@ def vector(message: Any) -> np.ndarray:
     return np.array([message.x, message.y, message.z])
 
 
+def to_ros(kind: Any, values: np.ndarray) -> Any:
+    """Return a point, vector or quaternion of ROS with the values x, y, z and, if any, w."""
+    return kind(**dict(zip('xyzw', values.tolist(), strict=False)))
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
     """The frame of standard messages.
 
     Attributes
     ----------
-    name
-        Its name.
     prefix
         Namespace of the network with a slash at its end, or empty; precedes the names of the
         frames of the surface and of the users.
-    origin
-        Position of the surface in the frame, float64 [3] [m].
-    orientation
-        Orientation of the surface in the frame: a quaternion x, y, z, w.
+    origin, orientation
+        Pose of the surface in the frame: position, float64 [3] [m], and quaternion x, y, z, w.
     """
 
     name: str = MAP_FRAME
@@ -104,11 +105,11 @@ class Frame:
 
     def pose(self, local: Pose) -> Pose:
         """Return a pose of the surface's frame in this one."""
-        x, y, z = self.from_surface(vector(local.position)).tolist()
         second = local.orientation
-        qx, qy, qz, qw = _product(
-            self.orientation, np.array([second.x, second.y, second.z, second.w])).tolist()
-        return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        turn = _product(
+            self.orientation, np.array([second.x, second.y, second.z, second.w]))
+        return Pose(position=to_ros(Point, self.from_surface(vector(local.position))),
+                    orientation=to_ros(Quaternion, turn))
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:

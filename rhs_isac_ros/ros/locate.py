@@ -33,14 +33,8 @@ class _Goal:
 class LocateServer:
     """Serves the action, from the messages that the base station sends and receives.
 
-    Parameters
-    ----------
-    request
-        Called with the user of each accepted goal.
-    pose
-        Converts an estimate to a pose.
-    max_users
-        Highest number of a user.
+    It calls `request` with the user of each accepted goal, and `pose` with the estimate of a
+    position.
     """
 
     def __init__(
@@ -54,34 +48,31 @@ class LocateServer:
             node, Locate, LOCATE, self._execute, goal_callback=self._accept,
             cancel_callback=self._cancel))
 
-    def observe(self, message: Any) -> None:
+    def observe(self, message: m.ProtocolState | m.PositionEstimate | m.NoFix) -> None:
         """Process a message of the base station."""
-        match message:
-            case m.ProtocolState(phase=m.Phase.BEACONING):
-                for goal in self._of(message):
-                    if goal.cycle_id == message.cycle_id:
-                        # The next cycle of the user tries again.
-                        goal.cycle_id = 0
-                        self._request(message.user)
-                        self._feed_back(goal, m.Phase.BEACONING)
-            case m.ProtocolState():
-                for goal in self._of(message):
-                    if message.phase is m.Phase.POSITIONING:
-                        goal.cycle_id = message.cycle_id
-                    if goal.cycle_id == message.cycle_id:
-                        self._feed_back(goal, message.phase)
-            case m.PositionEstimate() | m.NoFix():
-                for goal in self._of(message):
-                    if goal.cycle_id == message.cycle_id:
-                        self._finish(goal, message)
+        phase = message.phase if isinstance(message, m.ProtocolState) else None
+        for goal in [one for one in self._goals if one.handle.request.user == message.user]:
+            if phase is m.Phase.POSITIONING:
+                goal.cycle_id = message.cycle_id
+            if goal.cycle_id != message.cycle_id:
+                continue
+            if phase is m.Phase.BEACONING:
+                # The next cycle of the user tries again.
+                goal.cycle_id = 0
+                self._request(message.user)
+            match message:
+                case m.ProtocolState():
+                    self._feed_back(goal, message.phase)
+                case m.PositionEstimate():
+                    self._end(goal, '', Locate.Result(
+                        pose=self._pose(message), cycle_id=message.cycle_id))
+                case m.NoFix():
+                    self._end(goal, f'no fix: {message.reason}')
 
     def destroy(self, delay_s: float = 0.0) -> None:
         """Abort all goals, and withdraw the action.
 
-        Parameters
-        ----------
-        delay_s
-            Time in which the node sends the results of the goals [s]; without it, it sends none.
+        The node sends the results of the goals within `delay_s`; without it, it sends none.
         """
         for goal in list(self._goals):
             self._end(goal, 'the base station ends or stands by')
@@ -90,9 +81,6 @@ class LocateServer:
             self._later(delay_s, server.destroy)
         elif server:
             server.destroy()
-
-    def _of(self, message: Any) -> list[_Goal]:
-        return [goal for goal in self._goals if goal.handle.request.user == message.user]
 
     def _accept(self, request: Locate.Goal) -> GoalResponse:
         valid = 1 <= request.user <= self._max_users and 0 <= request.timeout_s <= _MAX_TIMEOUT_S
@@ -133,13 +121,6 @@ class LocateServer:
 
     def _feed_back(self, goal: _Goal, phase: m.Phase) -> None:
         goal.handle.publish_feedback(Locate.Feedback(phase=int(phase), cycle_id=goal.cycle_id))
-
-    def _finish(self, goal: _Goal, message: m.PositionEstimate | m.NoFix) -> None:
-        if isinstance(message, m.NoFix):
-            self._end(goal, f'no fix: {message.reason}')
-        else:
-            self._end(goal, '', Locate.Result(
-                pose=self._pose(message), cycle_id=message.cycle_id))
 
     def _end(self, goal: _Goal, reason: str, result: Locate.Result | None = None) -> None:
         """End a goal: with a result, canceled if that was requested, or aborted."""

@@ -1,165 +1,109 @@
-"""The declarations of all ROS parameters: the source of descriptors, checks and documentation.
+"""The declarations of all ROS parameters, and nodes whose parameters may change while they run.
 
-``python3 -m rhs_isac_ros.ros.parameters`` prints the table of the README. Parameters that belong
-to the settings of a role are declared there.
+Descriptors, checks and documentation derive from the declarations. Parameters that belong to the
+settings of a role are declared there.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
+import functools
 import types
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 
 from rhs_isac_ros.calibration import CalibrationError, load_surface
 from rhs_isac_ros.model import Scenario, mobility
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.settings import BaseStationSettings
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.arguments import ArgumentParser
+from rhs_isac_ros.support.fields import Field
 
 
 class ParameterError(ValueError):
     """A parameter has a value that its node cannot use."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Parameter:
-    """Declaration of a parameter.
-
-    Attributes
-    ----------
-    default
-        Value when none is given; its type is the type of the parameter.
-    text
-        Description, one sentence.
-    low, high
-        Range of a number, inclusive.
-    choices
-        Valid strings; empty: any.
-    plugins
-        Entry point group whose names are valid too; empty: none.
-    dynamic
-        Whether the parameter may change while the node runs; all others are read at the start.
-    """
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Parameter(Field):
+    """Declaration of a parameter; a dynamic one may change while the node runs."""
 
     name: str
     default: bool | int | float | str | list[float]
-    text: str
-    unit: str = ''
-    low: float | None = None
-    high: float | None = None
-    choices: tuple[str, ...] = ()
-    plugins: str = ''
     dynamic: bool = False
 
+    # ROS rejects 1 for 1.0.
+    WORDS = {**Field.WORDS, float: 'a number with a decimal point',
+             list: 'a list of numbers, each with a decimal point'}
+
     @property
-    def kind(self) -> str:
+    def type(self) -> str:
         """ROS type of the parameter."""
         return {bool: 'bool', int: 'integer', float: 'double', str: 'string',
-                list: 'double_array'}[type(self.default)]
+                list: 'double_array'}[self.kind]
 
     @property
-    def range(self) -> str:
-        """Valid values as text; empty if every value of the type is valid."""
-        if self.choices:
-            return ', '.join(self.choices) + (' or a plug-in' if self.plugins else '')
-        if self.low is None:
-            return ''
-        low, high = (format(limit, 'd' if type(self.default) is int else 'g')
-                     for limit in (self.low, self.high))
-        return f'{low} to {high} {self.unit}'.rstrip()
-
-    @property
-    def expected(self) -> str:
-        """Valid values as text, including the type."""
-        if self.choices:
-            return f'one of {self.range}' + (f' of {self.plugins}' if self.plugins else '')
-        words = {'bool': 'true or false', 'integer': 'an integer', 'string': 'a string',
-                 'double': 'a number with a decimal point',
-                 'double_array': 'a list of numbers, each with a decimal point'}[self.kind]
-        return f'{words}, {self.range}' if self.range else words
+    def default_text(self) -> str:
+        """Default as YAML, or ``empty``."""
+        if self.default in ('', []):
+            return 'empty'
+        text = str(self.default)
+        return text.lower() if self.kind is bool else text
 
     def check(self, value: Any) -> None:
-        """Check a value against the declaration.
+        """Raise ParameterError for an invalid value.
 
-        Raises
-        ------
-        ParameterError
-            If the value has the wrong type, is out of range or is not one of the choices.
+        ROS checks neither lists nor the ends of a range exactly.
         """
-        if not self._has_type(value) or not self._is_in_range(value):
-            raise ParameterError(f'{self.name}: {value!r}, expected {self.expected}')
-        if self.choices and value not in self.choices:
-            if not self.plugins:
-                raise ParameterError(f'{self.name}: {value!r}, expected {self.expected}')
-            self._check_plugin(value)
-
-    def _has_type(self, value: Any) -> bool:
-        if not isinstance(self.default, list):
-            return type(value) is type(self.default)
-        return (isinstance(value, Sequence) and not isinstance(value, str)
-                and all(isinstance(number, float) for number in value))
-
-    def _is_in_range(self, value: Any) -> bool:
-        # ROS does not check lists and tolerates small deviations at the ends of a range.
-        numbers = value if isinstance(self.default, list) else [value]
-        if self.low is None or self.high is None:
-            return True
-        return all(math.isfinite(number) and self.low <= number <= self.high
-                   for number in numbers)
-
-    def _check_plugin(self, value: str) -> None:
-        # Listing the installed plug-ins takes time; the built-in choices do not need it.
-        installed = plugins.names(self.plugins)
-        if value not in installed:
-            raise ParameterError(
-                f'{self.name}: {value!r}, expected {self.expected}; '
-                f'installed: {", ".join(installed) or "none"}')
+        if problem := self.problem(value):
+            raise ParameterError(f'{self.name}: {problem}')
 
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
+def _parameter(
+        name: str, default: bool | int | float | str | list[float], text: str,
+        **declared: Any) -> Parameter:
+    return Parameter(kind=type(default), text=text, name=name, default=default, **declared)
 
 
-class _Dataclass(Protocol):
-    """Any dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-
-_Settings = TypeVar('_Settings', bound=_Dataclass)
-
-
-def _declared_by(settings: type[_Dataclass] | None) -> dict[str, Parameter]:
+def _declared_by(settings: type[Any] | None) -> dict[str, Parameter]:
     """Return the parameters, by name, that the fields of a settings class declare."""
     return {} if settings is None else {
-        field.name: Parameter(field.name, getattr(settings, field.name), **field.metadata)
+        field.name: Parameter(
+            **vars(field.metadata['declared']), name=field.name,
+            default=getattr(settings, field.name), dynamic=field.metadata['dynamic'])
         for field in dataclasses.fields(settings)}
 
 
-_SCENARIO = Parameter(
+_SCENARIO = _parameter(
     'scenario_file', '', "YAML file of the scenario; empty: Table I of the paper.")
-_SEED = Parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
-
-_USER_TOPICS = Parameter(
-    'user_topics', 64, 'Highest number of a user that has topics of its own.', low=0,
-    high=MAX_USERS)
+_SEED = _parameter('seed', 0, 'Seed of all random numbers.', low=0, high=2**31 - 1)
+_USER_TOPICS = _parameter(
+    'user_topics', 64, 'Highest number of a user that has topics of its own.',
+    low=0, high=MAX_USERS)
 
 # Mobilities of robots, beside those of the library.
 ODOMETRY, TF = ROBOTS = ('odometry', 'tf')
 _FRAME = (
-    Parameter('frame_id', topics.MAP_FRAME,
-              'Frame of poses, odometry, paths and transforms; messages of the protocol are in '
-              'the frame of the surface.'),
-    Parameter('surface_pose', [],
-              'Pose of the surface in frame_id: x, y, z in metres, roll, pitch, yaw in radians; '
-              'empty: at the origin, with the same axes.', '', -1e6, 1e6),
+    _parameter(
+        'frame_id', topics.MAP_FRAME, 'Frame of poses, odometry, paths and transforms; messages '
+        'of the protocol are in the frame of the surface.'),
+    _parameter(
+        'surface_pose', [], 'Pose of the surface in frame_id: x, y, z in metres, roll, pitch, '
+        'yaw in radians; empty: at the origin, with the same axes.', low=-1e6, high=1e6),
 )
 
 # Parameters of roles that are not settings.
@@ -167,48 +111,49 @@ _OTHERS: Mapping[str, tuple[Parameter, ...]] = {
     'bs': (
         _SEED,
         *_FRAME,
-        Parameter('first_cycle', 0,
-                  'Id of the first cycle; 0: derived from the clock, so that no id is reused '
-                  'after a restart.', low=0, high=2**53),
+        _parameter(
+            'first_cycle', 0, 'Id of the first cycle; 0: derived from the clock, so that no id '
+            'is reused after a restart.', low=0, high=2**53),
     ),
     'user': (
         _SEED,
-        Parameter('user_id', 1, 'Id of the user, or the first of several.', low=1,
-                  high=MAX_USERS),
-        Parameter('user_count', 1, 'Number of users of the node, with consecutive ids.', low=1,
-                  high=MAX_USERS),
-        Parameter('mobility', 'static', 'Mobility model, or a robot.',
-                  choices=(*mobility.KINDS, *ROBOTS), plugins=plugins.MOBILITIES),
-        Parameter('odometry_topic', 'odom',
-                  'Odometry of the robot in frame_id, for the mobility odometry.'),
-        Parameter('robot_frame', 'base_link', 'Frame of the robot, for the mobility tf.'),
-        Parameter('robot_timeout_s', 1.0,
-                  'Time without a position of the robot after which the user does not answer '
-                  'beacons.', 's', 0.05, 3600.0),
+        _parameter('user_id', 1, 'Id of the user, or the first of several.',
+                   low=1, high=MAX_USERS),
+        _parameter('user_count', 1, 'Number of users of the node, with consecutive ids.',
+                   low=1, high=MAX_USERS),
+        _parameter('mobility', 'static', 'Mobility model, or a robot.',
+                   choices=(*mobility.KINDS, *ROBOTS), plugins=plugins.MOBILITIES),
+        _parameter('odometry_topic', 'odom',
+                   'Odometry of the robot in frame_id, for the mobility odometry.'),
+        _parameter('robot_frame', 'base_link', 'Frame of the robot, for the mobility tf.'),
+        _parameter(
+            'robot_timeout_s', 1.0, 'Time without a position of the robot after which the user '
+            'does not answer beacons.', unit='s', low=0.05, high=3600.0),
         *_FRAME,
         _USER_TOPICS,
-        Parameter('position_m', [],
-                  'Initial position x, y, z of each user; empty: random points of the region of '
-                  'interest.',
-                  'm', -1e6, 1e6),
-        Parameter('waypoints_m', [], 'Waypoints: x, y, z of each, in order.', 'm', -1e6, 1e6),
-        Parameter('speed_mps', 1.0, 'Speed, at most max_user_speed_mps of the scenario.',
-                  'm/s', 0.0, 1e4),
-        Parameter('ground_truth_period_s', 0.5,
-                  'Period at which the true position is published.', 's', 0.01, 60.0),
+        _parameter(
+            'position_m', [], 'Initial position x, y, z of each user; empty: random points of '
+            'the region of interest.', unit='m', low=-1e6, high=1e6),
+        _parameter('waypoints_m', [], 'Waypoints: x, y, z of each, in order.',
+                   unit='m', low=-1e6, high=1e6),
+        _parameter('speed_mps', 1.0, 'Speed, at most max_user_speed_mps of the scenario.',
+                   unit='m/s', low=0.0, high=1e4),
+        _parameter('ground_truth_period_s', 0.5, 'Period at which the true position is published.',
+                   unit='s', low=0.01, high=60.0),
         _declared_by(BaseStationSettings)['step_timeout_s'],
-        Parameter('beacon_timeout_s', 1.5,
-                  'Time without a beacon after which a warning is logged.', 's', 0.1, 7200.0),
+        _parameter('beacon_timeout_s', 1.5,
+                   'Time without a beacon after which a warning is logged.',
+                   unit='s', low=0.1, high=7200.0),
     ),
     'channel': (_SEED,),
     'positioner': (
-        Parameter('table_folder', '',
-                  'Directory in which tables are cached; empty: the cache directory of the user.'),
+        _parameter('table_folder', '', 'Directory in which tables are cached; empty: the cache '
+                   'directory of the user.'),
         *_FRAME,
         _USER_TOPICS,
     ),
     topics.OPTIMIZER_NODE: (
-        Parameter('codebook_file', '', 'Codebook file; empty: the default codebook.'),
+        _parameter('codebook_file', '', 'Codebook file; empty: the default codebook.'),
     ),
 }
 
@@ -219,13 +164,12 @@ NODES: Mapping[str, tuple[Parameter, ...]] = {
         _SCENARIO,
         *_FRAME,
         _USER_TOPICS,
-        Parameter('period_s', 0.2, 'Period at which the scene is published.', 's', 0.01, 60.0),
-        Parameter('forget_s', 10.0, 'Time without a message after which a user is removed.', 's',
-                  0.1, 3600.0),
+        _parameter('period_s', 0.2, 'Period at which the scene is published.',
+                   unit='s', low=0.01, high=60.0),
+        _parameter('forget_s', 10.0, 'Time without a message after which a user is removed.',
+                   unit='s', low=0.1, high=3600.0),
     ),
-    'network': (
-        Parameter('users', 2, 'Number of users.', low=1, high=MAX_USERS),
-    ),
+    'network': (_parameter('users', 2, 'Number of users.', low=1, high=MAX_USERS),),
 }
 
 CODEBOOK_PREFIX = 'codebook.'
@@ -242,7 +186,7 @@ CODEBOOK: Mapping[str, str] = {
 
 
 def declare(node: Node, executable: str) -> types.SimpleNamespace:
-    """Declare the parameters of an executable, a key of `NODES`, and return values by name.
+    """Declare the parameters of an executable, and return their values by name.
 
     Raises
     ------
@@ -256,8 +200,7 @@ def declare(node: Node, executable: str) -> types.SimpleNamespace:
 def check_overrides(node: Node) -> None:
     """Warn once of values given to a node at its start that belong to no known parameter.
 
-    Robots share one parameter file among all their nodes; `command_line.check_parameters` rejects
-    unknown names after ``-p``.
+    Robots share one parameter file among all their nodes.
     """
     known = known_names()
     # rclpy has no public access to all overrides. Publishers declare qos_overrides when created.
@@ -281,23 +224,17 @@ def hint(name: str) -> str:
 
 
 def _declare_one(node: Node, parameter: Parameter) -> Any:
-    # Imported here, so that the table can be read without ROS.
-    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-    from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-    from rclpy.parameter import Parameter as RosParameter
-
     default, low, high = parameter.default, parameter.low, parameter.high
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.text + unit, additional_constraints=parameter.expected,
         read_only=not parameter.dynamic)
-    if low is not None and high is not None:
-        if type(default) is int:
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-        elif type(default) is float:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    if parameter.kind is int:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+    elif parameter.kind is float:
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     # ROS cannot infer the element type of an empty list.
-    is_list = isinstance(default, list)
+    is_list = parameter.kind is list
     typed = RosParameter.Type.DOUBLE_ARRAY if is_list else default
     try:
         value: Any = node.declare_parameter(parameter.name, typed, descriptor).value
@@ -311,14 +248,8 @@ def _declare_one(node: Node, parameter: Parameter) -> Any:
     return value
 
 
-def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settings:
-    """Return the settings of a role, a dataclass, from the parameters named as its fields.
-
-    Raises
-    ------
-    ParameterError
-        If the class rejects the values.
-    """
+def settings_of(kind: type[Any], values: types.SimpleNamespace) -> Any:
+    """Return the settings of a role, from the parameters named as the fields of its class."""
     try:
         return kind(**{field.name: getattr(values, field.name)
                        for field in dataclasses.fields(kind)})
@@ -328,13 +259,7 @@ def settings_of(kind: type[_Settings], values: types.SimpleNamespace) -> _Settin
 
 def calibrated_surface(
         values: types.SimpleNamespace, scenario: Scenario) -> SurfaceEstimate | None:
-    """Return the surface of the parameter ``calibration_file``; None if it is empty.
-
-    Raises
-    ------
-    ParameterError
-        If the file is invalid, or belongs to another scenario.
-    """
+    """Return the surface of the parameter ``calibration_file``; None if it is empty."""
     try:
         return load_surface(values.calibration_file, scenario)
     except CalibrationError as error:
@@ -342,36 +267,118 @@ def calibrated_surface(
 
 
 def scenario_of(values: types.SimpleNamespace) -> Scenario:
-    """Return the scenario of the parameter ``scenario_file``.
-
-    Raises
-    ------
-    ScenarioError
-        If the file is invalid.
-    """
+    """Return the scenario of the parameter ``scenario_file``."""
     file = values.scenario_file
     return Scenario.from_yaml(file) if file else Scenario()
 
 
-def table() -> str:
-    """Return a Markdown table of all parameters, with the executables that have each."""
-    rows: dict[str, tuple[Parameter, list[str]]] = {}
-    for executable, parameters in NODES.items():
-        for parameter in parameters:
-            rows.setdefault(parameter.name, (parameter, []))[1].append(executable)
-    lines = ['| parameter | type | default | range | dynamic | nodes | description |',
-             '|---|---|---|---|---|---|---|']
-    for name, (parameter, owners) in rows.items():
-        default = parameter.default
-        shown = str(default).lower() if isinstance(default, bool) else str(default)
-        lines.append(f'| `{name}` | {parameter.kind} | '
-                     f'{"empty" if default in ("", []) else shown} | {parameter.range} | '
-                     f'{"yes" if parameter.dynamic else ""} | {", ".join(owners)} | '
-                     f'{parameter.text} |')
-    return '\n'.join(lines)
+_FLOATING = (RosParameter.Type.DOUBLE, RosParameter.Type.DOUBLE_ARRAY)
 
 
-if __name__ == '__main__':
-    ArgumentParser(prog='python3 -m rhs_isac_ros.ros.parameters',
-                   description='Print the table of all ROS parameters.').parse_args()
-    print(table())
+def same_value(one: RosParameter, other: RosParameter) -> bool:
+    """Return whether two parameters have the same type and value; NaN equals NaN."""
+    return one.type_ == other.type_ and bool(np.array_equal(
+        one.value, other.value, equal_nan=one.type_ in _FLOATING))
+
+
+class ParameterizedNode(Node):
+    """A node that checks each change of its parameters as a whole and converts it to settings.
+
+    The executable determines the parameters; its name is by default that of the node.
+
+    Attributes
+    ----------
+    values
+        Initial values of the parameters, by name.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is invalid.
+    """
+
+    def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
+        super().__init__(name or executable, **node_options)
+        self._executable = executable
+        self.values = declare(self, executable)
+        self._dynamic = {parameter.name: parameter for parameter in NODES[executable]
+                         if parameter.dynamic}
+        self._current_values = self.values
+        # The settings made by the last check; the change that was checked may still be rejected.
+        self._checked_settings: Any = None
+        self._is_reverting = False
+        self.add_on_set_parameters_callback(self._check)
+        self.add_post_set_parameters_callback(self._on_set)
+
+    def make_settings(self, values: types.SimpleNamespace) -> Any:
+        """Return the settings of the role for parameter values, or raise ParameterError."""
+        settings = ROSTER[self._executable].settings
+        return settings and settings_of(settings, values)
+
+    def on_settings_changed(self, settings: Any) -> None:
+        """Handle new settings, made from parameters that were just set."""
+
+    def revert_parameters(self, settings: Any) -> None:
+        """Set the parameters back to the settings in use, which are not checked again."""
+        self._is_reverting = True
+        try:
+            self.set_parameters_atomically([
+                RosParameter(name, value=value)
+                for name, value in dataclasses.asdict(settings).items() if name in self._dynamic])
+        finally:
+            self._is_reverting = False
+
+    def set_parameters_atomically(
+            self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """Set parameters together, as the parameter services do.
+
+        Unlike in rclpy, the reason for a rejection states the value and the valid range. Read-only
+        parameters may be given if they keep their values, as in a dump of the node.
+        """
+        parameter_list = [p for p in parameter_list if not self._is_kept(p)]
+        if not parameter_list:
+            return SetParametersResult(successful=True)
+        try:
+            self._check_each(parameter_list)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        # With use_sim_time, rclpy subscribes to the time of the simulation.
+        what = f'subscription to {topics.CLOCK}'
+        result = create_or_refuse(self, what, functools.partial(
+            super().set_parameters_atomically, parameter_list))
+        if result:
+            return result
+        self._time_source.ros_time_is_active = False
+        return SetParametersResult(successful=False, reason=refusals(self)[what])
+
+    def _is_kept(self, parameter: RosParameter) -> bool:
+        name = parameter.name
+        return (self.has_parameter(name) and self.describe_parameter(name).read_only
+                and same_value(self.get_parameter(name), parameter))
+
+    def _dynamic_values(self, changes: Iterable[RosParameter]) -> dict[str, Any]:
+        return {p.name: p.value for p in changes if p.name in self._dynamic}
+
+    def _check_each(self, changes: Iterable[RosParameter]) -> None:
+        for name, value in self._dynamic_values(changes).items():
+            self._dynamic[name].check(value)
+
+    def _with(self, changes: Iterable[RosParameter]) -> types.SimpleNamespace:
+        return types.SimpleNamespace(
+            **{**vars(self._current_values), **self._dynamic_values(changes)})
+
+    def _check(self, changes: list[RosParameter]) -> SetParametersResult:
+        if self._dynamic_values(changes) and not self._is_reverting:
+            try:
+                self._check_each(changes)
+                self._checked_settings = self.make_settings(self._with(changes))
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _on_set(self, changes: list[RosParameter]) -> None:
+        if not self._dynamic_values(changes):
+            return
+        self._current_values = self._with(changes)
+        if not self._is_reverting:
+            self.on_settings_changed(self._checked_settings)

@@ -8,14 +8,21 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
-from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol.messages import MessageError
 from rhs_isac_ros.protocol.presences import Presence, Presences
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import create_publisher, refusals, steady_timer, subscribe
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import (
+    LATCHED,
+    PRESENCES,
+    create_publisher,
+    refusals,
+    steady_timer,
+    subscribe,
+)
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
 
 # Poll period while a role is missing or nodes are in conflict, and otherwise. A poll takes half a
@@ -59,8 +66,7 @@ class Peers:
         Called with the roles that are missing, by name with a description: as soon as none is
         missing or after a grace period, and then on every change.
     on_rival
-        Called with whether the node stands by whenever nodes with the same role have appeared or
-        gone.
+        Called with whether the node stands by, when nodes with the same role appear or go.
     """
 
     def __init__(
@@ -82,8 +88,8 @@ class Peers:
         # Whether the last poll found that a node in conflict has gone.
         self._is_short = False
         if self._is_announced:
-            self._publisher = create_publisher(node, ros.Presence, topics.PRESENCE, qos.LATCHED)
-            subscribe(node, ros.Presence, topics.PRESENCE, self._receive, qos.PRESENCES, raw=True)
+            self._publisher = create_publisher(node, ros.Presence, topics.PRESENCE, LATCHED)
+            subscribe(node, ros.Presence, topics.PRESENCE, self._receive, PRESENCES, raw=True)
             self._announce()
         self._timer = steady_timer(node, _POLL_S, self._poll)
         self.restart()
@@ -194,15 +200,14 @@ class Peers:
     # Other nodes of the same role
 
     def _announce(self) -> None:
-        self._publisher.publish(convert.presence_to_ros(
-            self._presences.own, self._node.get_clock().now().to_msg()))
+        self._publisher.publish(convert.to_bytes(
+            self._presences.own, self._node.get_clock().now().nanoseconds, frame=''))
 
     def _receive(self, content: bytes) -> None:
         try:
-            presence = convert.presence_from_ros(deserialize_message(content, ros.Presence))
-        # Anything may be published on the topic, and rclpy raises a RuntimeError without a public
-        # class.
-        except (RuntimeError, ValueError):
+            presence = convert.from_bytes(Presence, content)
+        # Anything may be published on the topic.
+        except MessageError:
             return
         self._apply(lambda presences: presences.add(presence, time.time_ns()))
         if self._presences.others:

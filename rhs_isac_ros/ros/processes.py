@@ -1,20 +1,20 @@
 """Executables of the package as child processes, which never outlive their parent."""
 
 import atexit
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from ament_index_python.packages import get_package_prefix
 
 from rhs_isac_ros.executables import PARENT_ID
-from rhs_isac_ros.ros.security import OVERRIDE
+from rhs_isac_ros.ros.startup import OVERRIDE
 
 # Maximum number of users with nodes of their own, unless more are requested; more share one node,
 # because every process takes memory and CPU time, also between its cycles.
@@ -34,17 +34,9 @@ _STOP_SIGNALS = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2
 
 
 def private_domain() -> dict[str, str]:
-    """Return environment variables that isolate a network; existing values are kept.
-
-    Returns
-    -------
-    dict
-        ``ROS_DOMAIN_ID``, see `claim_domain`, and ``ROS_AUTOMATIC_DISCOVERY_RANGE``.
-    """
-    return {
-        'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID') or claim_domain(),
-        _RANGE: _discovery_range(),
-    }
+    """Return environment variables that isolate a network; existing values are kept."""
+    return {'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID') or claim_domain(),
+            _RANGE: _discovery_range()}
 
 
 def _discovery_range() -> str:
@@ -52,13 +44,7 @@ def _discovery_range() -> str:
 
 
 def claim_domain() -> str:
-    """Return a ROS domain that no other process has claimed; the claim ends with this process.
-
-    Raises
-    ------
-    RuntimeError
-        If all domains are claimed.
-    """
+    """Return a ROS domain that no other process has claimed; the claim ends with this process."""
     for offset in range(_DOMAINS):
         domain = 1 + (os.getpid() + offset) % _DOMAINS
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -91,21 +77,11 @@ def max_processes() -> int:
 class Processes:
     """A context manager that runs executables of this package and ends them on exit.
 
-    Parameters
-    ----------
-    logs
-        Directory for the output of the processes, ``<name>.log`` each.
-    environment
-        Environment variables to set for all processes.
-    command_prefix
-        Callable that takes the name of a node and returns a prefix of its command, such as
-        ``ip netns exec lab``.
+    Their output goes to ``<name>.log`` in the directory `logs`.
     """
 
-    def __init__(
-            self, logs: Path, environment: Mapping[str, str],
-            command_prefix: Callable[[str], Sequence[str]] = lambda name: ()) -> None:
-        self._logs, self._command_prefix = logs, command_prefix
+    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
+        self._logs = logs
         self._environment = {**os.environ, **environment, PARENT_ID: str(os.getpid())}
         # The enclave of this process; each node has its own.
         self._environment.pop(OVERRIDE, None)
@@ -114,17 +90,10 @@ class Processes:
 
     def start(
             self, executable: str, name: str = '', process: str = '', **parameters: Any) -> None:
-        """Start an executable.
+        """Start an executable with ROS parameters.
 
-        Parameters
-        ----------
-        name
-            Name of its node; by default that of the executable.
-        process
-            Name of the process; by default that of its node. Processes of nodes with the same name
-            need different names.
-        **parameters
-            ROS parameters.
+        By default, the node has the name of the executable, and the process that of the node.
+        Processes of nodes with the same name need different names.
         """
         program = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros' / executable
         command = [str(program), '--ros-args']
@@ -132,63 +101,30 @@ class Processes:
         if name:
             command += ['-r', f'__node:={name}']
         name = process or name or executable
-        command = [*self._command_prefix(name), *command]
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']
         self._commands[name] = command
-        self._spawn(name, 'wb')
+        self._spawn(name)
 
-    def kill(self, name: str) -> None:
-        """End the process of a node with SIGKILL, as a crash would."""
-        process = self._running.pop(name)
-        process.kill()
-        process.wait()
-
-    def restart(self, name: str) -> None:
-        """Start the process of a node again, with the same command and the same log."""
-        self._spawn(name, 'ab')
-
-    def memory_bytes(self) -> dict[str, int]:
-        """Return the resident memory of the running processes by name [bytes]."""
-        page = os.sysconf('SC_PAGE_SIZE')
-        result = {}
-        for name, process in self._running.items():
-            if process.poll() is None:
-                pages = Path(f'/proc/{process.pid}/statm').read_text(encoding='ascii').split()[1]
-                result[name] = int(pages) * page
-        return result
-
-    def cpu_s(self) -> dict[str, float]:
-        """Return the CPU time of the running processes by name [s]."""
-        ticks_hz = os.sysconf('SC_CLK_TCK')
-        result = {}
-        for name, process in self._running.items():
-            if process.poll() is None:
-                text = Path(f'/proc/{process.pid}/stat').read_text(encoding='utf-8')
-                # User and system time; the name of the program, in parentheses, may have spaces.
-                user, system = text.rpartition(')')[2].split()[11:13]
-                result[name] = (int(user) + int(system)) / ticks_hz
-        return result
-
-    def _spawn(self, name: str, mode: str) -> None:
-        with open(self._logs / f'{name}.log', mode) as log:
+    def _spawn(self, name: str) -> None:
+        with open(self._logs / f'{name}.log', 'ab') as log:
             self._running[name] = subprocess.Popen(
                 self._commands[name], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 env=self._environment, start_new_session=True)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all nodes that were started."""
+        """Names of all processes that were started."""
         return tuple(self._commands)
 
     def ended(self) -> dict[str, int]:
-        """Return the exit codes, by name, of processes that have ended without `kill`."""
+        """Return the exit codes, by name, of processes that have ended."""
         codes = {name: process.poll() for name, process in self._running.items()}
         return {name: code for name, code in codes.items() if code is not None}
 
     def log(self, name: str) -> str:
-        """Return the output of the process of a node."""
+        """Return the output of a process."""
         return (self._logs / f'{name}.log').read_text(encoding='utf-8', errors='replace')
 
     def interrupt(self) -> None:
@@ -204,18 +140,14 @@ class Processes:
                 process.send_signal(number)
             end_s = time.monotonic() + timeout_s
             for process in running:
-                try:
+                with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(max(end_s - time.monotonic(), 0.0))
-                except subprocess.TimeoutExpired:
-                    continue
 
     def __enter__(self) -> 'Processes':
         """Return `self`."""
         return self
 
-    def __exit__(
-            self, kind: type[BaseException] | None, error: BaseException | None,
-            traceback: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         """End all processes, even if Ctrl-C is pressed again."""
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:

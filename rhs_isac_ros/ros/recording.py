@@ -1,12 +1,13 @@
-"""Recordings: self-contained MCAP files in the format of ``ros2 bag``.
+"""Recordings of a network and observation of its cycles.
 
-Foxglove, ``ros2 bag info`` and ``ros2 bag play`` read them. The library mcap is optional.
+Recordings are self-contained MCAP files in the format of ``ros2 bag``. Foxglove, ``ros2 bag info``
+and ``ros2 bag play`` read them. The library mcap is optional.
 """
 
 import contextlib
 import re
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,18 @@ from rclpy.serialization import deserialize_message
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.monitoring import cycle_log
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import (
+    EXCHANGE,
+    LATCHED,
+    OBSERVATION,
+    PRESENCES,
+    profile_for,
+    subscribe,
+    subscribe_messages,
+)
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
@@ -36,12 +47,12 @@ class RecordingError(Exception):
 
 def recorded_topics() -> dict[str, tuple[type, QoSProfile]]:
     """Return the type and the quality of service of each recorded topic, by relative name."""
-    found = {name: (convert.ros_type(kind), qos.profile_for(kind))
+    found = {name: (convert.ros_type(kind), profile_for(kind))
              for kind, name in topics.NAMES.items()}
-    found[topics.POSITION] = PoseWithCovarianceStamped, qos.EXCHANGE
-    found[topics.CODEBOOK] = ros.Codebook, qos.LATCHED
-    found[topics.PRESENCE] = ros.Presence, qos.PRESENCES
-    found[topics.DIAGNOSTICS] = DiagnosticArray, qos.EXCHANGE
+    found[topics.POSITION] = PoseWithCovarianceStamped, EXCHANGE
+    found[topics.CODEBOOK] = ros.Codebook, LATCHED
+    found[topics.PRESENCE] = ros.Presence, PRESENCES
+    found[topics.DIAGNOSTICS] = DiagnosticArray, EXCHANGE
     return found
 
 
@@ -87,15 +98,10 @@ def _parts(text: str, package: str) -> Iterator[str]:
 
 
 class Recorder:
-    """Writes the messages of a network to a file.
+    """Writes the messages of a network, and its scenario, to a file.
 
     The file is ``<name>.part`` until it is closed, so that an interrupted run does not lose its
     messages.
-
-    Parameters
-    ----------
-    scenario
-        Scenario of the network, stored in the file.
 
     Attributes
     ----------
@@ -131,10 +137,8 @@ class Recorder:
             self, node: Node, on_message: Callable[[str, bytes], None] | None = None) -> None:
         """Record all topics in the namespace of a node.
 
-        Parameters
-        ----------
-        on_message
-            Called with the relative name of the topic and each serialized message, once written.
+        `on_message` is called with the relative name of the topic and the serialized message after
+        each was written.
         """
         for name, (kind, profile) in recorded_topics().items():
             channel = self._writer.register_channel(
@@ -196,8 +200,7 @@ def read(
     Raises
     ------
     RecordingError
-        If mcap is not installed, the file is not a recording, or the definition of a message has
-        changed since.
+        If the file cannot be read, or a message had other fields when it was recorded.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     checked: set[int] = set()
@@ -227,14 +230,12 @@ def _fields(text: str) -> list[str]:
 
 
 def read_scenario(path: str | Path) -> Scenario | None:
-    """Read the scenario of a recording.
-
-    Return None if the recording contains none, as when ``ros2 bag`` made it.
+    """Return the scenario of a recording; None if there is none, as when ``ros2 bag`` made it.
 
     Raises
     ------
     RecordingError
-        If mcap is not installed, or the file is not a recording.
+        If the file cannot be read.
     ScenarioError
         If the scenario is invalid.
     """
@@ -269,3 +270,48 @@ def _opened(path: str | Path) -> Iterator[Any]:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except McapError as error:
         raise RecordingError(f'{path}: not a complete recording: {error!r}') from None
+
+
+class CycleObserver(Node):
+    """Collects the cycles of the network in its namespace.
+
+    Parameters
+    ----------
+    recorder
+        Records all topics of the namespace; the caller closes it. If given, the observer
+        receives exactly the recorded messages of the types `cycle_log.RECEIVES`, and ignores
+        the following parameters.
+    receives, sizes, on_malformed
+        As in `subscribe_messages`.
+    log
+        Collects the cycles, with times of `time.monotonic`; by default a new log.
+    """
+
+    def __init__(
+            self, recorder: Recorder | None = None,
+            receives: Iterable[type[m.Message]] = cycle_log.RECEIVES,
+            sizes: Mapping[str, int] | None = None,
+            on_malformed: Callable[[m.MessageError], None] | None = None,
+            log: cycle_log.CycleLog | None = None, **node_options: Any) -> None:
+        super().__init__('cycle_observer', **node_options)
+        self.log = log or cycle_log.CycleLog()
+        if recorder is not None:
+            # One subscription for both, so that a replay yields the same cycles in the same order.
+            kinds = {topics.NAMES[kind]: kind for kind in cycle_log.RECEIVES}
+            recorder.record_topics(self, lambda name, message: self._on_recorded(
+                kinds.get(name), message))
+            return
+        subscribe_messages(self, receives, sizes, self._on_message, on_malformed,
+                           exchange=OBSERVATION)
+
+    def observe(self, message: m.Message, now_s: float) -> None:
+        """Process a message that arrived at `now_s` [s]; subclasses may extend this."""
+        if isinstance(message, cycle_log.RECEIVES):
+            self.log.add(message, now_s)
+
+    def _on_recorded(self, kind: type[m.Message] | None, message: bytes) -> None:
+        if kind is not None:
+            self._on_message(convert.from_bytes(kind, message))
+
+    def _on_message(self, message: m.Message) -> None:
+        self.observe(message, time.monotonic())

@@ -8,8 +8,8 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.time import Time
 
-from rhs_isac_ros.ros import qos, topics
-from rhs_isac_ros.ros.endpoints import create_or_refuse, steady_timer, subscribe
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import SENSOR, create_or_refuse, steady_timer, subscribe
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix, vector
 from rhs_isac_ros.ros.parameters import ParameterError
 
@@ -92,7 +92,7 @@ def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> R
                      vector(message.pose.pose.position),
                      rotation_matrix(orientation) @ vector(message.twist.twist.linear))
     # Drivers and simulators often publish best effort.
-    subscribe(node, Odometry, topic, receive, qos.SENSOR, overridable=True)
+    subscribe(node, Odometry, topic, receive, SENSOR, overridable=True)
     return mobility
 
 

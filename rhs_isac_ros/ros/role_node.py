@@ -1,7 +1,6 @@
 """The adapter between a role of the protocol and ROS 2."""
 
 import dataclasses
-import functools
 import time
 from typing import Any, Generic, TypeVar
 
@@ -10,28 +9,21 @@ from rclpy.publisher import Publisher
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.monitoring.role_statistics import Report, RoleStatistics
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    Action,
-    CodebookOffered,
-    Event,
-    LogMessage,
-    Outcome,
-    PeersChanged,
-    RevertSettings,
-    Send,
-    SettingsOffered,
-    Timeout,
-)
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
 from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
-from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer, subscribe
+from rhs_isac_ros.ros.endpoints import (
+    create_publisher,
+    profile_for,
+    steady_timer,
+    subscribe_messages,
+)
 from rhs_isac_ros.ros.frames import surface_frame
-from rhs_isac_ros.ros.parameterized_node import ParameterizedNode
-from rhs_isac_ros.ros.parameters import scenario_of
+from rhs_isac_ros.ros.parameters import ParameterizedNode, scenario_of
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.roster import ROSTER
 
@@ -67,13 +59,7 @@ class Clocks:
         return self._world_s
 
     def role_s(self, in_world: bool) -> float:
-        """Return the time of the roles [s].
-
-        Parameters
-        ----------
-        in_world
-            Whether the time since the last call belongs to the world.
-        """
+        """Return the time of the roles [s]; `in_world` if they waited for the world until now."""
         self._advance(in_world)
         return self._role_s
 
@@ -97,39 +83,25 @@ class Clocks:
 class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """A node that passes messages to a role and performs the actions that it returns.
 
-    A subclass makes its role from the parameters and passes it to `start`.
-
-    Parameters
-    ----------
-    executable
-        Name of the executable, which determines the parameters.
-    name
-        Name of the node; by default that of the executable.
+    A subclass makes its `role` from the parameters and passes it to `start`.
 
     Attributes
     ----------
-    role
-        The role; set by `start`.
     scenario
         Scenario of the parameter ``scenario_file``.
     instance
         Instance of the node; see `Message.sender`.
-    clocks
-        Clocks of the node.
 
     Raises
     ------
-    ParameterError
-        If a parameter is invalid.
-    ScenarioError
-        If the scenario file is invalid.
+    ParameterError, ScenarioError
+        If a parameter or the scenario file is invalid.
     """
 
     role: _RoleT
 
     def __init__(self, executable: str, name: str = '', **node_options: Any) -> None:
         super().__init__(executable, name, **node_options)
-        self._executable = executable
         self.scenario = scenario_of(self.values)
         self._sizes = self.scenario.sizes
         self.instance = new_instance()
@@ -183,16 +155,15 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         for kind in () if self._stands_by else self.role.SENDS:
             if kind not in self._sending:
                 self._sending[kind] = create_publisher(
-                    self, convert.ros_type(kind), topics.NAMES[kind], qos.profile_for(kind))
+                    self, convert.ros_type(kind), topics.NAMES[kind], profile_for(kind))
 
     def subscribe(self) -> None:
         """Create the subscriptions of the role; the graph then shows that the role is ready."""
-        for kind in self.role.RECEIVES:
-            if kind not in self._receiving:
-                self._receiving.add(kind)
-                subscribe(self, convert.ros_type(kind), topics.NAMES[kind],
-                          functools.partial(self._receive_bytes, kind), qos.profile_for(kind),
-                          raw=True)
+        kinds = [kind for kind in self.role.RECEIVES if kind not in self._receiving]
+        self._receiving.update(kinds)
+        subscribe_messages(
+            self, kinds, self._sizes, self._on_message, self._on_malformed, self.scenario.id,
+            on_foreign=self._on_foreign, on_arrival=self._statistics.count_received)
 
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
@@ -246,7 +217,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         lacking = (self._lacking,) if self._lacking else ()
         self._statistics.missing = (*missing.values(), *lacking)
         if ROSTER[self._executable].requires:
-            self.dispatch(PeersChanged((*(
+            self.dispatch(events.PeersChanged((*(
                 text for role, text in missing.items() if role != topics.OPTIMIZER_NODE),
                 *lacking)))
 
@@ -269,11 +240,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def on_settings_changed(self, settings: Any) -> None:
         """Pass new settings to the role."""
-        self.dispatch(SettingsOffered(settings))
+        self.dispatch(events.SettingsOffered(settings))
 
     def _on_codebook(self, codebook: Codebook) -> None:
-        """Pass a codebook to the role, which may begin to serve with the first."""
-        self.dispatch(CodebookOffered(codebook))
+        self.dispatch(events.CodebookOffered(codebook))
         if self._needs_codebook:
             self.advertise()
             self.subscribe()
@@ -285,12 +255,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _in_world(self) -> bool:
         return self.role.state in self.role.WORLD_STATES
 
-    def dispatch(self, event: Event) -> None:
+    def dispatch(self, event: events.Event) -> None:
         """Pass an event to the role, then a `Timeout` for each deadline that has passed."""
         now_s = self.now_s()
         self._handle(event, now_s)
         while (deadline_s := self.role.next_deadline()) is not None and deadline_s <= now_s:
-            self._handle(Timeout(), now_s)
+            self._handle(events.Timeout(), now_s)
         if deadline_s is not None and (
                 self._timer_due_s is None or deadline_s < self._timer_due_s):
             self._set_timer(deadline_s - now_s, deadline_s)
@@ -313,56 +283,43 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._sending[type(message)].publish(content)
         return True
 
-    def execute(self, action: Action) -> None:
-        """Execute an action that is specific to the role; nodes with such actions override this.
-
-        Raises
-        ------
-        TypeError
-            If the node does not support the action.
-        """
+    def execute(self, action: events.Action) -> None:
+        """Execute an action of the role; nodes of roles with own actions override this."""
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
-    def _receive_bytes(self, kind: type[m.Message], serialized: bytes) -> None:
-        self._statistics.count_received(kind)
-        try:
-            message = convert.from_bytes(kind, serialized)
-            if message.scenario_id not in ('', self.scenario.id):
-                self._drop_foreign(message)
-                return
-            m.check(message, self._sizes)
-        except m.MessageError as error:
-            self.role.counters['malformed'] += 1
-            self._log_error('dropped', error)
-            return
+    def _on_message(self, message: m.Message) -> None:
         if not self._stands_by:
             self.dispatch(message)
 
-    def _drop_foreign(self, message: m.Message) -> None:
+    def _on_malformed(self, error: m.MessageError) -> None:
+        self.role.counters['malformed'] += 1
+        self._log_error('dropped', error)
+
+    def _on_foreign(self, message: m.Message) -> None:
         """Count a message of another scenario, and log the first of each sender."""
-        self.role.counters[Outcome.WRONG_SCENARIO.value] += 1
+        self.role.counters[events.Outcome.WRONG_SCENARIO.value] += 1
         if message.sender not in self._foreign and len(self._foreign) < _MAX_LOGGED:
             self._foreign.add(message.sender)
             self.get_logger().warning(  # type: ignore[no-untyped-call]
                 f'{type(message).__name__} dropped: sent with scenario {message.scenario_id}, '
                 f'expected {self.scenario.id}; sender {started(message.sender)}')
 
-    def _handle(self, event: Event, now_s: float) -> None:
+    def _handle(self, event: events.Event, now_s: float) -> None:
         start_s = time.perf_counter()
         actions = self.role.handle(event, now_s)
         self._statistics.record(event, actions, now_s, time.perf_counter() - start_s)
         for action in actions:
             self._perform(action)
 
-    def _perform(self, action: Action) -> None:
+    def _perform(self, action: events.Action) -> None:
         match action:
-            case Send(message):
+            case events.Send(message):
                 self.publish(message)
-            case LogMessage(text, True):
+            case events.LogMessage(text, True):
                 self.get_logger().warning(text)  # type: ignore[no-untyped-call]
-            case LogMessage(text):
+            case events.LogMessage(text):
                 self.get_logger().info(text)  # type: ignore[no-untyped-call]
-            case RevertSettings(settings):
+            case events.RevertSettings(settings):
                 self.revert_parameters(settings)
             case _:
                 self.execute(action)
@@ -388,6 +345,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         if deadline_s is None:
             return
         if deadline_s <= now_s:
-            self.dispatch(Timeout())
+            self.dispatch(events.Timeout())
         else:
             self._set_timer(deadline_s - now_s, deadline_s)

@@ -1,10 +1,13 @@
-"""Spinning and shutdown of the nodes of an executable."""
+"""Command lines with ROS arguments, and spinning and shutdown of the nodes of an executable."""
 
+import argparse
 import gc
+import itertools
 import os
+import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -12,16 +15,144 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import ok, try_shutdown
+from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import ScenarioError
-from rhs_isac_ros.ros import command_line, parameters
-from rhs_isac_ros.ros.early import leave, use_discovery_profile
-from rhs_isac_ros.ros.parameters import ParameterError
-from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
+from rhs_isac_ros.ros import parameters
+from rhs_isac_ros.ros.parameters import CODEBOOK, NODES, Parameter, ParameterError
+from rhs_isac_ros.ros.startup import SecurityError, leave, one_line, prepare, use_discovery_profile
+from rhs_isac_ros.support.arguments import ArgumentParser
 
+# The highest domain whose ports exist.
+_MAX_DOMAIN = 232
+# Parameters that rclpy declares for each node.
+_OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+# Options that ROS accepts only after --ros-args.
+_ROS_OPTIONS = {'-p', '--param', '-r', '--remap', '--params-file', '--log-level'}
+
+
+def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+    """Parse a command line, without the name of the program, that may contain ROS arguments.
+
+    Print an error as one line and exit with code 2 if an argument or the domain is invalid.
+    """
+    check_domain(parser)
+    try:
+        words = remove_ros_args([parser.prog, *arguments])[1:]
+    except RuntimeError as error:
+        # Positions in the sources of ROS and the tokens of its parser do not help the user.
+        reason = re.sub(r',? at \S+:\d+|\.? Error: Expected lexeme.*', '', str(error))
+        parser.error('invalid ROS arguments: '
+                     + reason.removeprefix('Failed to parse ROS arguments: '))
+    options, unknown = parser.parse_known_args(words)
+    if unknown:
+        advice = ''
+        if any(word in _ROS_OPTIONS or ':=' in word for word in unknown):
+            advice = '; ROS arguments follow --ros-args, as in --ros-args -p NAME:=VALUE'
+        parser.error(f'unrecognized arguments: {" ".join(unknown)}{advice}')
+    return options
+
+
+def check_domain(parser: argparse.ArgumentParser) -> None:
+    """Exit with a usage error if the environment variable ROS_DOMAIN_ID is invalid."""
+    text = os.environ.get('ROS_DOMAIN_ID', '')
+    if text and not (text.isascii() and text.isdigit() and int(text[:9]) <= _MAX_DOMAIN):
+        parser.error(f'environment variable ROS_DOMAIN_ID: {text!r}, '
+                     f'expected an integer from 0 to {_MAX_DOMAIN}')
+
+
+def node_parser(executable: str, description: str) -> ArgumentParser:
+    """Return a parser for an executable whose arguments are all ROS arguments.
+
+    The description is a sentence, which may be preceded by the name of the executable and a colon.
+    """
+    text = description.rpartition('``: ')[2]
+    return ArgumentParser(
+        prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE ...]',
+        description=text[:1].upper() + text[1:], epilog=parameter_help(executable),
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def check_parameters(
+        parser: argparse.ArgumentParser, executable: str, arguments: Sequence[str]) -> None:
+    """Exit with a usage error if ``-p`` sets a parameter that the executable does not have.
+
+    A parameter file may do so, because several nodes may share it; see
+    `parameters.check_overrides`.
+    """
+    accepted = set(_names(executable)).union(*map(_names, _composed(executable)))
+    for name in _assigned(arguments):
+        if name not in parameters.known_names() and not name.startswith(_OF_RCLPY):
+            parser.error(
+                f'argument -p: {name}: unknown parameter{parameters.hint(name)}; see --help')
+        owners = [owner for owner in NODES if name in _names(owner)]
+        if owners and name not in accepted:
+            parser.error(f'argument -p: {name} is a parameter of {", ".join(owners)}, '
+                         f'expected one of {executable}')
+
+
+def _names(executable: str) -> list[str]:
+    """Return the names of the parameters of an executable, without those of composed nodes."""
+    names = [parameter.name for parameter in NODES[executable]]
+    return [*names, *CODEBOOK] if executable == 'optimizer' else names
+
+
+def _assigned(arguments: Sequence[str]) -> Iterator[str]:
+    """Yield the parameters that options set for all nodes of the process."""
+    in_ros_arguments = False
+    for word, following in itertools.pairwise(arguments):
+        if word in ('--ros-args', '--'):
+            in_ros_arguments = word == '--ros-args'
+        elif in_ros_arguments and word in ('-p', '--param'):
+            name, _, _ = following.partition(':=')
+            # A name with a colon begins with the name of the node that it is for.
+            if ':' not in name:
+                yield name
+
+
+def _composed(executable: str) -> list[str]:
+    """Return the other executables whose nodes run in the process of an executable."""
+    return [name for name in NODES if name not in ('network', 'visualizer')
+            ] if executable == 'network' else []
+
+
+def parameter_help(executable: str) -> str:
+    """Return a description of the parameters of an executable, with an example."""
+    own = list(NODES[executable])
+    lines = ['ROS parameters:', *(_describe(parameter) for parameter in own)]
+    if executable == 'optimizer':
+        lines += [f'  {name}\n      {text}' for name, text in CODEBOOK.items()]
+    elif composed := _composed(executable):
+        # The network numbers its users itself.
+        others = {parameter.name: parameter for name in composed for parameter in NODES[name]
+                  if parameter.name != 'user_id'}
+        lines += ['', 'ROS parameters of the composed nodes:', *map(_describe, others.values())]
+    example = _example(own)
+    return '\n'.join([*lines, '', f'example: {executable} --ros-args -p {example}'])
+
+
+def _describe(parameter: Parameter) -> str:
+    details = [parameter.type, f'default {parameter.default_text}']
+    if parameter.range:
+        details.append(parameter.range)
+    if parameter.dynamic:
+        details.append('dynamic')
+    return f'  {parameter.name} ({"; ".join(details)})\n      {parameter.text}'
+
+
+def _example(parameters: Sequence[Parameter]) -> str:
+    """Return an assignment to the most specific parameter with a default."""
+    chosen = next((parameter for parameter in parameters
+                   if parameter.name not in ('scenario_file', 'seed')), parameters[0])
+    value = 'my.yaml' if chosen.default == '' else chosen.default_text
+    return f'{chosen.name}:={value}'
+
+
+# Time for the destruction of the nodes [s]. Fast DDS 2.14 can wait for itself for ever when a
+# publisher is destroyed while another participant times out.
+_DESTRUCTION_S = 10
 # Maximum time between two checks for a signal.
 _POLL_S = 0.1
 
@@ -35,8 +166,6 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
 
     Parameters
     ----------
-    make
-        Creates the nodes.
     args
         Command line with the name of the program; by default that of the process.
     done
@@ -85,12 +214,17 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         print_error(error, program)
         return 2
     finally:
+        # Without a handler, the signal also ends a process whose threads wait for each other in
+        # the middleware, where no handler in Python would run.
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(_DESTRUCTION_S)
         leave()
         for node in nodes:
             node.destroy_node()
         if executor is not None:
             executor.shutdown()
         try_shutdown()
+        signal.alarm(0)
         # Python restores the default handlers when it exits. A further signal, as from Ctrl-C on
         # a launch, would then kill a process that is about to exit normally.
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -99,25 +233,15 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
 
 
 def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
-    """Return the main function of an executable whose arguments are all ROS arguments.
+    """Return the main function of an executable, a key of `NODES`, without own arguments.
 
-    Parameters
-    ----------
-    executable
-        Name of the executable, a key of `parameters.NODES`.
-    make
-        Creates the nodes; the docstring of its module describes the executable.
-
-    Returns
-    -------
-    Callable
-        Takes a command line, by default that of the process, and returns the exit code of `run`.
+    The docstring of the module of `make` describes the executable.
     """
     def main(args: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:] if args is None else list(args)
         first_line = (sys.modules[make.__module__].__doc__ or '').partition('\n')[0]
-        parser = command_line.node_parser(executable, first_line)
-        command_line.parse(parser, arguments)
-        command_line.check_parameters(parser, executable, arguments)
+        parser = node_parser(executable, first_line)
+        parse(parser, arguments)
+        check_parameters(parser, executable, arguments)
         return run(make, [executable, *arguments])
     return main

@@ -1,1 +1,1 @@
-"""Files, command lines, pictures, plug-ins, random streams and threads: nothing of the subject."""
+"""Files, command lines, progress, pictures, plug-ins, random streams and threads."""

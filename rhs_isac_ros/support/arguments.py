@@ -7,13 +7,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import check_writable
 from rhs_isac_ros.support.pictures import picture_format
-
-# Highest seed, which is that of the ROS parameter.
-_MAX_SEED = 2**31 - 1
-# Any larger number of things to do is a mistake.
-_MAX_COUNT = 10**9
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -34,54 +30,31 @@ class HelpFormatter(
     """Shows defaults, and keeps the lines of the description and of the text below."""
 
 
-def integer(low: int, high: int = _MAX_COUNT) -> Callable[[str], int]:
-    """Return a type for argparse: integers from `low` to `high`."""
-    def parse(text: str) -> int:
+def _number(declared: Field) -> Callable[[str], Any]:
+    """Return a type for argparse."""
+    def parse(text: str) -> Any:
         try:
-            number = int(text)
+            number = declared.kind(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f'{text!r}, expected an integer') from None
-        if number < low:
-            raise argparse.ArgumentTypeError(f'{text}, expected at least {low}')
-        if number > high:
-            raise argparse.ArgumentTypeError(f'{text}, expected at most {high}')
+            number = text
+        if problem := declared.problem(number):
+            raise argparse.ArgumentTypeError(problem)
         return number
     return parse
 
 
-def positive_int(text: str) -> int:
-    """Parse an integer of at least 1, or raise argparse.ArgumentTypeError."""
-    return integer(1)(text)
+def integer(low: int, high: int = 10**9) -> Callable[[str], int]:
+    """Return a type for argparse: integers from `low` to `high`."""
+    return _number(Field(int, low=low, high=high))
 
 
-def seed(text: str) -> int:
-    """Parse a seed, which is valid as a ROS parameter too, or raise ArgumentTypeError."""
-    return integer(0, _MAX_SEED)(text)
-
-
-def positive_float(text: str) -> float:
-    """Parse a finite number above 0, or raise argparse.ArgumentTypeError."""
-    return _number(text, lambda number: 0 < number < math.inf, 'a positive number')
-
-
-def nonnegative_float(text: str) -> float:
-    """Parse a finite number of at least 0, or raise argparse.ArgumentTypeError."""
-    return _number(text, lambda number: 0 <= number < math.inf, 'a number of at least 0')
-
-
-def share(text: str) -> float:
-    """Parse a number from 0 to 1, or raise argparse.ArgumentTypeError."""
-    return _number(text, lambda value: 0 <= value <= 1, 'a number from 0 to 1')
-
-
-def _number(text: str, valid: Callable[[float], bool], expected: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not valid(number):
-        raise argparse.ArgumentTypeError(f'{text!r}, expected {expected}')
-    return number
+# Further types for argparse.
+positive_int = integer(1)
+# A seed is valid as a ROS parameter too.
+seed = integer(0, 2**31 - 1)
+positive_float = _number(Field(float, low=0, is_open=True))
+nonnegative_float = _number(Field(float, low=0))
+share = _number(Field(float, low=0, high=1))
 
 
 def interval(text: str) -> tuple[float, float]:

@@ -17,10 +17,10 @@ from typing import Any, BinaryIO
 import numpy as np
 import yaml
 
-# Maximum size of a YAML file [bytes], and depth of its lists and mappings.
-_MAX_YAML_BYTES, _MAX_YAML_DEPTH = 2**28, 16
-# Maximum size of the arrays of a file [bytes].
+# Maximum size of a YAML file, or of the arrays of an archive [bytes].
 _MAX_BYTES = 2**28
+# Maximum depth of the lists and mappings of a YAML file.
+_MAX_YAML_DEPTH = 16
 # The loader in C reads a codebook ten times as fast; some builds of PyYAML lack it.
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
@@ -32,12 +32,8 @@ class ArchiveError(ValueError):
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
     """Write a file atomically: write a temporary file, then rename it to `path`.
 
-    The content is complete, or a callable that writes it to a binary stream.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an existing file is left as it was.
+    The content may be a callable that writes it to a binary stream. Raise OSError if the file
+    cannot be written; an existing file is left as it was.
     """
     path = Path(path)
     # Unlike those of `tempfile`, the file has the permissions of any new file.
@@ -56,10 +52,7 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
 
 
 def check_writable(path: Path) -> None:
-    """Raise OSError unless a file can be written, without writing it.
-
-    Devices are refused because `write_whole` would replace them by a file.
-    """
+    """Raise OSError unless `write_whole` can write a file and would replace no device."""
     if path.is_dir():
         raise IsADirectoryError(f'{path}: a directory, expected a file')
     if path.exists() and not path.is_file():
@@ -79,17 +72,14 @@ def check_writable(path: Path) -> None:
 def read_yaml(path: str | Path) -> Any:
     """Read a YAML file without references, which let a short text describe an enormous value.
 
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, is too large, is not valid YAML, is nested too deeply, or
-        contains a reference.
+    Raise ValueError if the file cannot be read, is invalid, too large or nested too deeply, or
+    contains a reference.
     """
     try:
         with open(path, 'rb') as stream:
-            data = stream.read(_MAX_YAML_BYTES + 1)
-        if len(data) > _MAX_YAML_BYTES:
-            raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
+            data = stream.read(_MAX_BYTES + 1)
+        if len(data) > _MAX_BYTES:
+            raise ValueError(f'more than {_MAX_BYTES} bytes')
         text, depth = data.decode(), 0
         # The C loader ends the process if the nesting is deep.
         for event in yaml.parse(text, _LOADER):
@@ -107,10 +97,7 @@ def read_yaml(path: str | Path) -> Any:
 
 def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
                   about: Mapping[str, Any]) -> None:
-    """Write arrays and a description that JSON can represent to NumPy's format ``.npz``.
-
-    Nothing is pickled. An existing file is replaced at the end, or kept if there is an `OSError`.
-    """
+    """Write arrays and a description that JSON can represent to NumPy's format ``.npz``."""
     content: dict[str, Any] = {**arrays, 'about': json.dumps(about)}
     write_whole(path, lambda stream: np.savez(stream, **content))
 
@@ -118,13 +105,9 @@ def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
 def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np.ndarray]:
     """Read the arrays of a file of NumPy's format ``.npz``.
 
-    With names, the result is empty if the arrays apart from ``about`` have others, or if they are
-    compressed: they may then be far larger than the file.
-
-    Raises
-    ------
-    ArchiveError
-        If the file cannot be read, is damaged, or contains more than 256 MiB.
+    With names, the result is empty if the arrays apart from ``about`` have other names, or if they
+    are compressed: they may then be far larger than the file. Raise ArchiveError if the file
+    cannot be read, is damaged, or contains more than 256 MiB.
     """
     try:
         with open(path, 'rb') as stream:
@@ -137,8 +120,7 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
             if sum(member.file_size for member in members) > _MAX_BYTES:
                 raise ValueError('more than 256 MiB of arrays')
             return {key: file[key] for key in found}
-    # Reading verifies the checksum that the format holds for every array. The shape of an array
-    # may be anything.
+    # Reading verifies the checksum of every array. The shape of an array may be anything.
     except (OSError, ValueError, EOFError, NotImplementedError, SyntaxError, KeyError, MemoryError,
             OverflowError, RecursionError, zipfile.BadZipFile) as error:
         reason = ' '.join(str(error).split())
@@ -147,21 +129,10 @@ def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np
 
 def read_archive(path: str | Path, kind: str, version: int, names: set[str]
                  ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read arrays and their description.
+    """Read arrays and their description, without its ``format``.
 
-    Parameters
-    ----------
-    kind
-        What the file contains, for errors.
-    version
-        Expected value of ``format`` in the description, which the result lacks.
-    names
-        Expected names of the arrays.
-
-    Raises
-    ------
-    ArchiveError
-        If the file cannot be read, is damaged, or has another format or other arrays.
+    Raise ArchiveError if the file cannot be read, is damaged, or has another format than `version`
+    or other arrays than `names`. `kind` describes the content, for errors.
     """
     arrays = read_arrays(path, names)
     try:
@@ -200,12 +171,9 @@ class ArrayFile(abc.ABC):
 
     @classmethod
     def named(cls, text: str) -> 'ArrayFile':
-        """Read a file, given by its path, optionally with ``@`` and the digest that it must have.
+        """Read a file by its path, optionally with ``@`` and the digest that it must have.
 
-        Raises
-        ------
-        ArchiveError
-            If the file is invalid or the digest differs.
+        Raise ArchiveError if the file is invalid or the digest differs.
         """
         path, digest = re.fullmatch(  # type: ignore[union-attr]
             r'(.*?)(?:@([0-9a-f]{16}))?', text, re.DOTALL).groups()

@@ -3,34 +3,27 @@
 import contextlib
 from collections.abc import Iterator
 
+# The group of scripts/setup that installs the libraries of an extra; those of others need none.
+_GROUPS = {'experiments': 'experiments', 'genetic': 'experiments', 'neural': 'experiments',
+           'recording': 'recording', 'view': 'view'}
+
 
 class MissingLibraryError(ImportError):
     """An optional library is not installed."""
 
 
 @contextlib.contextmanager
-def optional_import(purpose: str, extra: str = '', script: str = '') -> Iterator[None]:
-    """Replace an ImportError inside the block by one that names the library and the extra.
+def optional_import(purpose: str, extra: str = '') -> Iterator[None]:
+    """Replace an ImportError inside the block by a MissingLibraryError with instructions.
 
-    Parameters
-    ----------
-    purpose
-        Task that needs the library; the first words of the message.
-    extra
-        Extra of this package that installs the library, if there is one.
-    script
-        Script that installs the library in a clone, if `extra` is not installed there.
-
-    Raises
-    ------
-    MissingLibraryError
-        If an import inside the block fails.
+    `purpose`, the task that needs the library, is the beginning of the message. `extra` is the
+    extra of this package that installs the library.
     """
     try:
         yield
     except ImportError as error:
         library = (error.name or str(error)).partition('.')[0]
-        in_clone = f'; in a clone: {script}' if script else ''
+        in_clone = f'; in a clone: scripts/setup {_GROUPS[extra]}' if extra in _GROUPS else ''
         hint = f" (pip install 'rhs_isac_ros[{extra}]'{in_clone})" if extra else ''
         raise MissingLibraryError(
             f'{purpose} needs {library}, which is not installed{hint}') from error

@@ -45,12 +45,8 @@ _METADATA: dict[str, dict[str, Any]] = {
 class Look(NamedTuple):
     """How to draw one of several series.
 
-    Attributes
-    ----------
-    colour
-        Colour of Okabe and Ito, which colour-blind readers can distinguish.
-    marker, line, hatch
-        Marker, style of a line and pattern of an area, which remain in greyscale.
+    Colour-blind readers can distinguish the colours, of Okabe and Ito. Marker, style of a line and
+    pattern of an area remain in greyscale.
     """
 
     colour: str
@@ -77,10 +73,7 @@ def look(index: int) -> Look:
 
 
 def to_paler(colour: str, share: float = 0.6) -> tuple[float, float, float]:
-    """Return a colour mixed with a share of white: red, green and blue from 0 to 1.
-
-    Unlike transparency, it shows nothing of what is below.
-    """
+    """Return a colour mixed with a share of white, which is opaque: red, green and blue."""
     from matplotlib.colors import to_rgb
 
     red, green, blue = (share + (1 - share) * value for value in to_rgb(colour))
@@ -91,17 +84,7 @@ def to_paler(colour: str, share: float = 0.6) -> tuple[float, float, float]:
 def paper_style(purpose: str = 'drawing') -> Iterator[None]:
     """Draw in the style of the paper inside the block, whatever the user's settings are.
 
-    Functions may have it as a decorator.
-
-    Parameters
-    ----------
-    purpose
-        First words of the error if Matplotlib is not installed.
-
-    Raises
-    ------
-    MissingLibraryError
-        If Matplotlib is not installed.
+    It is also a decorator. Without Matplotlib, `purpose` begins the MissingLibraryError.
     """
     with optional_import(purpose, extra='plot'):
         import matplotlib
@@ -113,9 +96,9 @@ def paper_style(purpose: str = 'drawing') -> Iterator[None]:
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """Return an empty `matplotlib.figure.Figure`; unlike pyplot, it needs no window system.
+    """Return an empty `matplotlib.figure.Figure`, without pyplot's need for a window system.
 
-    Call it inside `paper_style`, as well as all that draws on the figure.
+    Call this and all that draws on the figure inside `paper_style`.
     """
     from matplotlib.figure import Figure
 
@@ -134,12 +117,8 @@ def add_panels(
         place: Any, n_rows: int, n_columns: int, **sharing: bool) -> tuple[Any, Any]:
     """Return panels, an array of axes, and axes above for a legend.
 
-    Parameters
-    ----------
-    place
-        A `matplotlib.gridspec.SubplotSpec`, the part of the figure to use.
-    sharing
-        Arguments ``sharex`` and ``sharey`` of `matplotlib.gridspec.GridSpecBase.subplots`.
+    `place` is a `matplotlib.gridspec.SubplotSpec`; `sharing` are ``sharex`` and ``sharey`` of
+    `matplotlib.gridspec.GridSpecBase.subplots`.
     """
     # The layout adds the height of the legend. A legend of the figure itself gets room from the
     # layout only since Matplotlib 3.7.
@@ -162,7 +141,7 @@ def label_decades(axis: Any) -> None:
 
 
 def picture_format(path: str | Path) -> str:
-    """Return the format that the suffix of `path` names, or raise ValueError."""
+    """Return the format of the suffix of `path`, or raise ValueError."""
     kind = Path(path).suffix.lower().removeprefix('.')
     if kind not in PICTURE_FORMATS:
         raise ValueError(f'{str(path)!r}, expected a file name that ends in '
@@ -171,16 +150,10 @@ def picture_format(path: str | Path) -> str:
 
 
 def write_picture(path: str | Path, figure: Any) -> None:
-    """Write a figure of Matplotlib atomically, in the format that the suffix of `path` names.
+    """Write a figure of Matplotlib atomically, in the format of the suffix of `path`.
 
-    Equal figures give equal files.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an existing file is left as it was.
-    ValueError
-        If the suffix is not one of `PICTURE_FORMATS`.
+    Equal figures give equal files. Raise OSError if the file cannot be written, ValueError if the
+    suffix is not one of `PICTURE_FORMATS`.
     """
     kind = picture_format(path)
     # Matplotlib makes ticks and loads fonts only now.

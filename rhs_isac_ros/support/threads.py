@@ -27,9 +27,8 @@ class _OneBlasThread(contextlib.ContextDecorator):
     """Context manager and decorator that runs BLAS with one thread.
 
     The number of threads is a setting of the process: the first caller to enter changes it, and
-    the last one to leave restores it. A number that was changed in between is left as it is.
-    Libraries that use OpenMP have a setting of each thread, which every caller changes and
-    restores.
+    the last one to leave restores it unless it was changed in between. In libraries that use
+    OpenMP, each thread has a setting, which every caller changes and restores.
     """
 
     def __init__(self) -> None:
@@ -81,10 +80,10 @@ class _OneBlasThread(contextlib.ContextDecorator):
     def find_libraries(self) -> None:
         """Find the BLAS libraries that the process has loaded.
 
-        The search holds the lock of the dynamic loader and needs that of the interpreter, so that
-        it would wait forever for a thread that imports an extension module meanwhile. It is
-        therefore part of the import of this module, and repeated only by functions that load
-        the BLAS of another package, which is that of SciPy.
+        The search holds the lock of the dynamic loader and needs the lock of the interpreter, so
+        that it would wait forever for a thread that imports an extension module meanwhile. It is
+        therefore part of the import of this module. Only functions that load SciPy's own BLAS
+        repeat it.
         """
         found = ThreadpoolController().select(user_api='blas').lib_controllers
         per_thread = [library for library in found
@@ -129,9 +128,9 @@ def map_blocks(
         function: Callable[[_Item], _Result], blocks: Sequence[_Item]) -> list[_Result]:
     """Call a function with each block, on as many threads as BLAS may use, up to all cores.
 
-    The results have the order of the blocks and do not depend on the number of threads. An
-    environment variable such as ``OPENBLAS_NUM_THREADS``, or a limit of threadpoolctl, therefore
-    also applies here. The function must not change data that other blocks use.
+    The results have the order of the blocks and do not depend on the number of threads. A limit of
+    BLAS, such as ``OPENBLAS_NUM_THREADS``, also applies here. The function must not change data
+    that other blocks use.
     """
     with one_blas_thread:
         is_serial = len(blocks) < 2 or getattr(_worker, 'busy', False)
@@ -151,7 +150,7 @@ def _mark_worker() -> None:
 
 
 def _n_cores() -> int:
-    """Return the number of cores that this process may use."""
+    # Only some systems have affinities.
     if hasattr(os, 'sched_getaffinity'):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

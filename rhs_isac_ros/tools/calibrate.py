@@ -32,14 +32,14 @@ from rhs_isac_ros.calibration import (
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import subscribe, subscribe_messages
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import LATCHED, subscribe, subscribe_messages
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
@@ -140,7 +140,7 @@ class CalibratorNode(Node):
         super().__init__('calibrator', **WITHOUT_SERVICES)
         self._log = log
         subscribe_messages(self, RECEIVES, scenario.sizes, log.add, scenario_id=scenario.id)
-        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, qos.LATCHED)
+        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, LATCHED)
 
     def _on_codebook(self, message: ros.Codebook) -> None:
         try:

@@ -22,10 +22,16 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import discard_stdout, print_error
 from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.positioning import ModelError
-from rhs_isac_ros.ros.command_line import check_domain, parse
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
 from rhs_isac_ros.ros.recording import RecordingError
-from rhs_isac_ros.ros.security import SecurityError, is_enabled, one_line, prepare
+from rhs_isac_ros.ros.run import check_domain, parse
+from rhs_isac_ros.ros.startup import (
+    WITHOUT_SERVICES,
+    SecurityError,
+    is_enabled,
+    one_line,
+    prepare,
+    use_discovery_profile,
+)
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct
 from rhs_isac_ros.support.optional import MissingLibraryError

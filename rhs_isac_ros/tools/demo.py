@@ -19,19 +19,23 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import STARTED_S, exit_code_of, print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle, CycleLog, CycleRecord
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
 from rhs_isac_ros.protocol.messages import Phase
 from rhs_isac_ros.protocol.settings import PRIORS, REGION
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES, use_discovery_profile
-from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros.processes import (
     MAX_USER_NODES,
     Processes,
     private_domain,
 )
-from rhs_isac_ros.ros.recording import Recorder, RecordingError
-from rhs_isac_ros.ros.security import SecurityError, one_line, prepare
+from rhs_isac_ros.ros.recording import CycleObserver, Recorder, RecordingError
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import (
+    WITHOUT_SERVICES,
+    SecurityError,
+    one_line,
+    prepare,
+    use_discovery_profile,
+)
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,

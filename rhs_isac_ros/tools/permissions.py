@@ -4,19 +4,18 @@
 """
 
 import argparse
-import itertools
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
-from rclpy.validate_full_topic_name import validate_full_topic_name
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.parameters import TF
 from rhs_isac_ros.ros.recording import recorded_topics
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support.arguments import ArgumentParser, integer
@@ -32,6 +31,8 @@ _CYCLE_SERVICES = (topics.PAUSE, topics.RESUME, topics.STEP)
 _LOCATE_TOPICS = tuple(f'{topics.LOCATE}/_action/{name}' for name in ('feedback', 'status'))
 _LOCATE_SERVICES = tuple(
     f'{topics.LOCATE}/_action/{name}' for name in ('cancel_goal', 'get_result', 'send_goal'))
+# A buffer of tf2 offers its frames.
+_TF_SERVICE = 'tf2_frames'
 _GET_CODEBOOK = f'{topics.OPTIMIZER_NODE}/get_parameters'
 _VERSION = '0.2.0'
 
@@ -55,7 +56,9 @@ class Permissions(NamedTuple):
     request: tuple[str, ...] = ()
 
 
-def permissions(users: int, robots: Mapping[int, str] | None = None) -> dict[str, Permissions]:
+def permissions(
+        users: int, robots: Mapping[int, str] | None = None, is_simulated: bool = False
+) -> dict[str, Permissions]:
     """Return the permissions that the nodes of a network may need, and no others.
 
     Parameters
@@ -63,7 +66,9 @@ def permissions(users: int, robots: Mapping[int, str] | None = None) -> dict[str
     users
         Number of users; they are numbered from 1.
     robots
-        Topic with the positions of each user that is a robot, by number: its odometry or ``/tf``.
+        Topic of the odometry, or ``tf``, of each user that is a robot.
+    is_simulated
+        Whether the nodes follow the clock of a simulation.
 
     Returns
     -------
@@ -79,23 +84,24 @@ def permissions(users: int, robots: Mapping[int, str] | None = None) -> dict[str
             name, numbers if member.is_unique else [number])
         for name, member in sorted(ROSTER.items())
         for number in ((1,) if member.is_unique else numbers)}
-    sources = {f'user_{number}': (topic, topics.TF_STATIC) if topic == topics.TF else (topic,)
-               for number, topic in (robots or {}).items()}
-    for name, source in sources.items():
-        nodes[name] = nodes[name]._replace(subscribe=(*nodes[name].subscribe, *source))
+    for user, source in (robots or {}).items():
+        nodes[f'user_{user}'] = _with_robot(nodes[f'user_{user}'], source)
     nodes['users'] = _of_member('user', numbers)
     nodes['network'] = _together({**nodes, 'network': Permissions(publish=_RCLPY_TOPICS)})
     nodes['visualizer'] = Permissions(
         publish=(*sorted((topics.MARKERS, topics.TF, topics.TF_STATIC,
                           *_of_users(numbers, topics.PATH, topics.TRUE_PATH))), *_RCLPY_TOPICS),
-        subscribe=(*sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES), topics.CLOCK))
+        subscribe=tuple(sorted(topics.NAMES[kind] for kind in SCENE_RECEIVES)))
     optimizer = topics.OPTIMIZER_NODE
     # It provides the recorded codebook, as an optimizer or to the one that is present.
     replay = _together({optimizer: nodes[optimizer], 'replay': Permissions(
         publish=tuple(recorded_topics()), reply=(),
         request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
-    operator = _operator(nodes, numbers, *sources.values())
-    return {**nodes, 'operator': operator, 'replay': replay}
+    nodes |= {'operator': _operator(nodes, numbers), 'replay': replay}
+    if is_simulated:
+        return {name: allowed._replace(subscribe=(*allowed.subscribe, topics.CLOCK))
+                for name, allowed in nodes.items()}
+    return nodes
 
 
 def _together(nodes: Mapping[str, Permissions]) -> Permissions:
@@ -112,10 +118,18 @@ def _of_member(name: str, users: Iterable[int]) -> Permissions:
         _of_users(users, topic) if '{user}' in topic else (topic,))}
     return Permissions(
         publish=(*sorted(sent), *_RCLPY_TOPICS, *(_LOCATE_TOPICS if name == 'bs' else ())),
-        subscribe=(*sorted(member.received), topics.CLOCK),
+        subscribe=tuple(sorted(member.received)),
         reply=(*_OFFERED_SERVICES,
                *((*_CYCLE_SERVICES, *_LOCATE_SERVICES) if name == 'bs' else ())),
         request=(_GET_CODEBOOK,) if member.has_codebook else ())
+
+
+def _with_robot(allowed: Permissions, source: str) -> Permissions:
+    """Return the permissions of a user that is a robot."""
+    if source != TF:
+        return allowed._replace(subscribe=(*allowed.subscribe, source))
+    return allowed._replace(subscribe=(*allowed.subscribe, topics.TF, topics.TF_STATIC),
+                            reply=(*allowed.reply, _TF_SERVICE))
 
 
 def _of_users(users: Iterable[int], *names: str) -> tuple[str, ...]:
@@ -123,14 +137,12 @@ def _of_users(users: Iterable[int], *names: str) -> tuple[str, ...]:
     return tuple(name.format(user=number) for number in users for name in names)
 
 
-def _operator(
-        nodes: Iterable[str], users: Iterable[int], *sources: Iterable[str]) -> Permissions:
+def _operator(nodes: Iterable[str], users: Iterable[int]) -> Permissions:
     """Return the permissions to subscribe to all topics and to set the parameters of all nodes.
 
     The nodes of ``ros2``, whose names end in a number or a type, offer services.
     """
-    readable = {*recorded_topics(), *itertools.chain(*sources), topics.MARKERS, topics.TF,
-                topics.TF_STATIC, topics.CLOCK,
+    readable = {*recorded_topics(), topics.MARKERS, topics.TF, topics.TF_STATIC,
                 *_of_users(users, topics.POSE, topics.ODOMETRY, topics.PATH, topics.TRUE_PATH,
                            topics.TRUE_ODOMETRY)}
     return Permissions(
@@ -142,19 +154,20 @@ def _operator(
 
 
 def policy(
-        namespace: str = '/', users: int = 2, robots: Mapping[int, str] | None = None) -> str:
+        namespace: str = '/', users: int = 2, robots: Mapping[int, str] | None = None,
+        is_simulated: bool = False) -> str:
     """Return the policy of a network in the XML format of SROS2, with one enclave for each node.
 
     Parameters
     ----------
     namespace
         Namespace of the network and of its enclaves.
-    users, robots
-        See `permissions`.
+    users, robots, is_simulated
+        As for `permissions`.
     """
     root = ElementTree.Element('policy', version=_VERSION)
     enclaves = ElementTree.SubElement(root, 'enclaves')
-    for node, allowed in permissions(users, robots).items():
+    for node, allowed in permissions(users, robots, is_simulated).items():
         enclave = ElementTree.SubElement(
             enclaves, 'enclave', path=f'{namespace.rstrip("/")}/{node}')
         profiles = ElementTree.SubElement(enclave, 'profiles')
@@ -179,25 +192,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--namespace', type=_namespace, default='/',
                         help='namespace of the network')
     parser.add_argument('--users', type=integer(0, 1000), default=2, help='number of users')
-    parser.add_argument(
-        '--robot', type=_robot, action='append', default=[], metavar='USER=TOPIC',
-        help='topic with the positions of a user that is a robot, such as 2=odom or 2=/tf; '
-        'may be repeated')
+    parser.add_argument('--robot', type=_robot, action='append', default=[], metavar='USER=TOPIC',
+                        help='user that is a robot, with the topic of its odometry, or tf')
+    parser.add_argument('--use-sim-time', action='store_true', help='permit /clock')
     options = parser.parse_args(arguments)
     robots = dict(options.robot)
-    if unknown := [user for user in robots if user > options.users]:
-        parser.error(f'argument --robot: user {unknown[0]}, expected 1 to {options.users}')
-    print(policy(options.namespace, options.users, robots), end='')
+    if beyond := [user for user in robots if not 1 <= user <= options.users]:
+        parser.error(f'argument --robot: user {beyond[0]}, expected one of {options.users} users')
+    print(policy(options.namespace, options.users, robots, options.use_sim_time), end='')
     return 0
 
 
 def _robot(text: str) -> tuple[int, str]:
-    user, _, topic = text.partition('=')
-    try:
-        validate_full_topic_name(f'/{topic.removeprefix("/")}')
-    except InvalidTopicNameException as error:
-        raise argparse.ArgumentTypeError(str(error).partition(':\n')[0]) from None
-    return integer(1, 1000)(user), topic
+    user, _, source = text.partition('=')
+    if not (user.isascii() and user.isdecimal() and source):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected USER=TOPIC or USER=tf')
+    return int(user), source
 
 
 def _namespace(text: str) -> str:

@@ -13,8 +13,8 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol.settings import REGION, Impairments
 from rhs_isac_ros.ros import parameters
-from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.processes import Processes, max_processes
+from rhs_isac_ros.ros.recording import CycleObserver
 from rhs_isac_ros.ros.roster import ROSTER, UNIQUE
 from rhs_isac_ros.support.arguments import input_file, seed
 

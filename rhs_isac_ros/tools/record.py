@@ -9,9 +9,9 @@ from rclpy.node import Node
 
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file
 from rhs_isac_ros.tools.command import ToolError, run_command
 

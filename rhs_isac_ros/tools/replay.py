@@ -39,11 +39,10 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario, recorded_topics
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.security import is_enabled
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES, is_enabled
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.tools.command import ToolError, run_command

@@ -56,12 +56,12 @@ class RerunStream:
     """
 
     def __init__(self) -> None:
-        with optional_import('view', extra='view', script='scripts/_view'):
+        with optional_import('view', extra='view'):
             import rerun
         if not rerun.__version__.startswith(f'{_VERSION}.'):
             raise MissingLibraryError(
                 f'view needs rerun-sdk {_VERSION}, found {rerun.__version__} '
-                "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/_view)")
+                "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/setup view)")
         self._rerun = rerun
         rerun.set_strict_mode(True)
         self._stream = rerun.new_recording(_APPLICATION)

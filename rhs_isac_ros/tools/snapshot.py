@@ -12,10 +12,10 @@ from rhs_isac_ros.executables import exit_code_of, print_error
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import join_users
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
+from rhs_isac_ros.protocol.user_registry import join_users
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,

@@ -38,13 +38,20 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.protocol.role import NewestDict
-from rhs_isac_ros.ros import convert, diagnostics, qos, topics
-from rhs_isac_ros.ros.background import BackgroundWorker
+from rhs_isac_ros.ros import convert, diagnostics, topics
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
-from rhs_isac_ros.ros.endpoints import steady_timer, subscribe, subscribe_messages
+from rhs_isac_ros.ros.endpoints import (
+    EXCHANGE,
+    LATCHED,
+    OBSERVATION,
+    BackgroundWorker,
+    steady_timer,
+    subscribe,
+    subscribe_messages,
+)
 from rhs_isac_ros.ros.recording import RecordingError, read, read_scenario
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
@@ -185,11 +192,11 @@ class ViewNode(Node):
         self._users: set[int] = set()
         self._beam_s = -math.inf
         write(self.view.begin())
-        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, qos.LATCHED)
+        subscribe(self, ros.Codebook, topics.CODEBOOK, self._on_codebook, LATCHED)
         subscribe_reports(self, lambda node, report: self._write(
             self.view.add_report(node, report)))
         subscribe_messages(self, RECEIVES, scenario.sizes, self._on_message, self._on_mismatch,
-                           exchange=qos.OBSERVATION)
+                           exchange=OBSERVATION)
         self._silence_timer = steady_timer(self, _SILENCE_S, self._log_silence)
 
     @property
@@ -282,7 +289,7 @@ class ViewNode(Node):
             return
         self._users.add(user)
         subscribe(self, Odometry, topics.ODOMETRY.format(user=user),
-                  functools.partial(self._on_track, user), qos.EXCHANGE)
+                  functools.partial(self._on_track, user), EXCHANGE)
 
     def _on_track(self, user: int, message: Odometry) -> None:
         position, velocity = message.pose.pose.position, message.twist.twist.linear

@@ -14,11 +14,11 @@ from rclpy.node import Node
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES
 from rhs_isac_ros.monitoring.network_state import Fix, NodeStatus, Overview
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.ros.diagnostics import subscribe_reports
-from rhs_isac_ros.ros.early import WITHOUT_SERVICES
 from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.run import run
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.tools.command import ToolError, print_now, run_command

@@ -15,11 +15,11 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 from scipy.stats import chi2
 
 from rhs_isac_ros.bounds import crlb
@@ -30,13 +30,9 @@ from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
     input_file,
-    output_file,
     positive_int,
-    seed,
 )
-from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 PLANS = {'Table I': ('table1.yaml', 'codebook_ambiguity.yaml'),
@@ -50,18 +46,13 @@ SEARCHES = 20
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark bandplan', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('bandplan', __doc__)
     parser.add_argument('--positions', type=positive_int, default=10_000,
                         help='number of positions (default: %(default)s)')
-    parser.add_argument('--seed', type=seed, default=1,
-                        help='seed of all random numbers (default: %(default)s)')
     parser.add_argument('--plan', type=input_file, nargs=2, action='append', default=[],
                         metavar=('SCENARIO', 'CODEBOOK'), help='another plan and its codebook')
     parser.add_argument('--only-plans', action='store_true',
                         help='leave out the built-in plans and the comparison of searches')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}, posterior mean\n')
     print('| plan | mean squared error [m^2], 95 % interval | median error [m] | '
@@ -78,8 +69,7 @@ def main() -> None:
               '{average_crlb_m2:.4f} | {coverage:.3f} |'.format(name, **row), flush=True)
     if not options.only_plans:
         figures['search'] = compare_searches()
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
 
 
 def evaluate(scenario: Scenario, codebook: Codebook, options: argparse.Namespace) -> dict:

@@ -21,15 +21,14 @@ import os
 # One thread, as in the positioner node. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import argparse
 import dataclasses
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from parts.array_receiver import ArrayReceiver, posterior_means
+from parts.command import benchmark_parser, write_results
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.starts import SCANS
@@ -38,8 +37,7 @@ from rhs_isac_ros.experiments import markdown_table
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import radiation_matrix
-from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int, seed
-from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.arguments import positive_int
 
 CONFIG = Path(__file__).parents[2] / 'config'
 
@@ -108,15 +106,11 @@ def receivers(scenario: Scenario, seed: int) -> dict[str, Callable[[], ArrayRece
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark baselines', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('baselines', __doc__)
     parser.add_argument('--positions', type=positive_int, default=1000,
                         help='number of positions (default: %(default)s)')
     parser.add_argument('--multipath', type=float, default=0.0, metavar='DB',
                         help='level of the multipath [dB] (default: %(default)s)')
-    parser.add_argument('--seed', type=seed, default=1, help='seed (default: %(default)s)')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario(multipath_to_los_db=options.multipath)
     positions = scenario.sample_positions(
@@ -135,8 +129,7 @@ def main() -> None:
           f'{options.multipath:g} dB\n')
     print(markdown_table(['receiver', 'average CRLB [m²]', 'mean squared error [m²]',
                           'standard error', 'median'], rows))
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
 
 
 if __name__ == '__main__':

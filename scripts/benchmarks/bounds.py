@@ -14,13 +14,13 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import (
@@ -36,14 +36,10 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.positioning import make_estimator, simulate_pairs
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
     input_file,
     integer,
-    output_file,
     positive_int,
-    seed,
 )
-from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 PLANS = {'equal': (2.5e9, 2.667e9, 2.833e9, 3.0e9), 'unequal': (2.5e9, 2.55e9, 2.7e9, 3.0e9)}
@@ -69,26 +65,21 @@ def main() -> None:
     print(markdown_table(HEADER, rows))
     ratios = [entry['mse_to_bound'] for entry in figures]
     print(f'\nMSE / bound from {min(ratios):.3f} to {max(ratios):.3f} over {len(ratios)} pairs')
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
 
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark bounds', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('bounds', __doc__)
     add = parser.add_argument
     add('--positions', type=integer(2), default=2000,
         help='positions of the errors (default: %(default)s)')
     add('--phases', type=integer(2), default=2048,
         help='positioning phases of the bound (default: %(default)s)')
-    add('--seed', type=seed, default=1, help='seed of all random numbers (default: %(default)s)')
     add('--steps', type=positive_int, help='steps of the optimisations')
     add('--plan', type=input_file, nargs=2, action='append', default=[],
         metavar=('SCENARIO', 'CODEBOOK'), help='another scenario and its codebook')
     add('--only-plans', action='store_true', help='leave out the pairs that are built in')
-    add('--json', type=output_file, help='JSON file for the results')
     return parser.parse_args()
 
 

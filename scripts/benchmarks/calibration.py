@@ -19,12 +19,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
 import dataclasses
-import json
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 from scipy.special import chdtri
 
 from rhs_isac_ros.calibration import Calibration, Pilots, calibrate
@@ -39,7 +38,7 @@ from rhs_isac_ros.model import (
 )
 from rhs_isac_ros.positioning import Estimate, make_estimator
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_int, seed
+from rhs_isac_ros.support.arguments import input_file, positive_int
 
 # Squared Mahalanobis radius of the 95 % region.
 REGION_RADIUS = float(chdtri(3, 0.05))
@@ -76,24 +75,19 @@ def main() -> int:
               f'{100 * fixes:.1f} % (limit {100 * MIN_FIXES:.0f} %): '
               f'{"reached" if reached else "NOT reached"}; '
               f'{found}; a calibration takes {took_s:.1f} s', flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+    write_results(options.json, rows)
     return 0 if passed else 1
 
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark calibration', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('calibration', __doc__)
     add = parser.add_argument
-    add('--pilots', type=positive_int, default=200, help='pilots of each surface (200)')
-    add('--surfaces', type=positive_int, default=6, help='number of surfaces (6)')
-    add('--positions', type=positive_int, default=600, help='fresh positions (600)')
+    add('--pilots', type=positive_int, default=200, help='pilots of each surface')
+    add('--surfaces', type=positive_int, default=6, help='number of surfaces')
+    add('--positions', type=positive_int, default=600, help='fresh positions')
     add('--codebook', type=input_file, default=default_codebook_file(), help='codebook file')
-    add('--seed', type=seed, default=1, help='seed of all random numbers (1)')
     add('--silent', action='store_true', help='calibrate with the default prior')
-    add('--json', type=Path, help='JSON file for the results')
     return parser.parse_args()
 
 

@@ -20,15 +20,14 @@ import os
 # One thread, as in the positioner node. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import argparse
 import dataclasses
-import json
 import sys
 import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 from scipy.stats import chi2
 
 from rhs_isac_ros.calibration import SurveyWarning, survey
@@ -38,13 +37,9 @@ from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
-    output_file,
     positive_int,
-    seed,
     share,
 )
-from rhs_isac_ros.support.files import write_whole
 
 ROOT = Path(__file__).parents[2]
 SYSTEMS = {'table1': ('table1.yaml', 'codebook.yaml'),
@@ -79,9 +74,7 @@ class Received(NamedTuple):
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark channels', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('channels', __doc__)
     add = parser.add_argument
     add('folder', type=Path, nargs='?', default=ROOT.parent / 'shared' / 'channels',
         help='folder of the channel files (default: ../shared/channels of the repository)')
@@ -91,8 +84,6 @@ def main() -> None:
         help='sizes of the surveys (default: 10 30 100 300)')
     add('--blocked', type=share, nargs='+', default=[], metavar='SHARE',
         help='also measure with this share of users without direct path, from 0 to 1')
-    add('--seed', type=seed, default=1, help='seed of all random numbers (default: %(default)s)')
-    add('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     print('| hall | system | survey | fix [%] | in the 95 % region [%] | range over surveys [%] | '
           'confidently wrong [%] | rms error [m] |\n|---|---|---|---|---|---|---|---|')
@@ -126,8 +117,7 @@ def main() -> None:
                 for users, found in report(place, name, f'{n} positions', results).items():
                     key = f'{users}, {hidden:g} blocked' if users else 'hall'
                     figures.setdefault(key, {}).setdefault(name, {})[str(n)] = found
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
 
 
 def receive(traced: Scenario, codebook: Codebook, rng: np.random.Generator,

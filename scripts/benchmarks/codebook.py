@@ -11,28 +11,23 @@ import os
 # One thread, as in the positioner node. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import argparse
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, CodebookError, directional_codebook, random_codebook
 from rhs_isac_ros.executables import exit_code_of
-from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.experiments.resampling import replicate
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
     input_file,
-    output_file,
     positive_int,
-    seed,
 )
-from rhs_isac_ros.support.files import write_whole
 
 CONFIG = Path(__file__).parents[2] / 'config'
 BATCH = 50
@@ -40,15 +35,11 @@ BATCH = 50
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark codebook', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = benchmark_parser('codebook', __doc__)
     parser.add_argument('--positions', type=positive_int, default=1000,
                         help='number of positions')
-    parser.add_argument('--seed', type=seed, default=1, help='seed of all random numbers')
     parser.add_argument('--codebook', type=input_file, action='append', default=[],
                         help='another codebook to compare; may be repeated')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario()
     codebooks = {
@@ -77,13 +68,13 @@ def main() -> None:
               '{median_m2:.3f} | {average_crlb_m2:.4f} |'.format(name, **figures[name]))
     print()
     for rival in ('crlb', 'directional', 'random'):
-        percent, low, high = reduction(
-            errors['ambiguity'], errors[rival], lambda values: values.mean(axis=-1))
+        ambiguity, other = (
+            replicate(errors[name][None], 0)[0] for name in ('ambiguity', rival))
+        percent, low, high = ambiguity.reduction_from(other)
         figures[f'reduction_{rival}_percent'] = percent
         print(f'ambiguity is {percent:.1f} % below {rival} '
               f'(95 % interval {low:.1f} to {high:.1f})')
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
 
 
 def draw_positions(scenario: Scenario, n: int, seed: int) -> np.ndarray:

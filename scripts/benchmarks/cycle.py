@@ -11,8 +11,6 @@ receivers and pauses, show how much of a cycle is not due to the nodes. The 10th
 sensitive than the median to other programs on the machine.
 """
 
-import argparse
-import json
 import os
 import sys
 import tempfile
@@ -23,18 +21,19 @@ import numpy as np
 import rclpy
 from parts.bare_cycle import bare_cycles
 from parts.chain import ChainObserver, Cycle
+from parts.command import benchmark_parser, write_results
 from parts.hops import CHAIN, ping_pong
 from rclpy.experimental import EventsExecutor
+from system.trial_processes import TrialProcesses
 
 from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
-from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int
-from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.ros.processes import private_domain
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import use_discovery_profile
+from rhs_isac_ros.support.arguments import positive_int
 from rhs_isac_ros.tools.process_network import check_users, start_network
 
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
@@ -50,14 +49,11 @@ WHERE = {'processes': 'one process per node', 'composed': 'all nodes in one proc
 
 def main() -> int:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark cycle', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = benchmark_parser('cycle', __doc__, default_seed=None)
     parser.add_argument('--users', type=positive_int, default=2, help='number of users')
     parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
     parser.add_argument('--layout', choices=WHERE, action='append',
                         help='only this arrangement of the nodes; by default both')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     check_domain(parser)
     check_users(parser, options.users)
@@ -67,8 +63,7 @@ def main() -> int:
     for layout in options.layout or WHERE:
         results[layout] = measure(options.users, options.cycles, composed=layout == 'composed')
         report(results[layout], layout)
-    if options.json:
-        write_whole(options.json, json.dumps(results, indent=2) + '\n')
+    write_results(options.json, results)
     return 0
 
 
@@ -115,7 +110,7 @@ def run_cycles(
     observer, executor = ChainObserver(), EventsExecutor()
     executor.add_node(observer)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
+        with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             if composed:
                 processes.start('network', users=users, rest_s=REST_S, mobility='random_walk',
                                 speed_mps=scenario.max_user_speed_mps)

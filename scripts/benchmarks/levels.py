@@ -10,11 +10,11 @@ import os
 # One thread. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import argparse
 import dataclasses
-import json
 import sys
 import time
+
+from parts.command import benchmark_parser, write_results
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import Codebook, optimize
@@ -24,13 +24,9 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.model.surface import on_levels
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
     input_file,
-    output_file,
     positive_int,
-    seed,
 )
-from rhs_isac_ros.support.files import write_whole
 
 LEVELS = (2, 3, 4)
 HELD_OUT = 2000
@@ -38,14 +34,10 @@ HELD_OUT = 2000
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark levels', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = benchmark_parser('levels', __doc__, default_seed=0)
     parser.add_argument('--scenario', type=input_file, help='YAML file of the scenario')
     parser.add_argument('--steps', type=positive_int, default=3000,
                         help='maximum number of update steps of each codebook')
-    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     given = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     free = dataclasses.replace(given, amplitude_levels=0)
@@ -71,8 +63,7 @@ def main() -> None:
         ['levels', 'rounded [m²]', 'optimised [m²]', 'CPU time [s]'],
         [[name, f'{row["rounded_m2"]:.4f}' if 'rounded_m2' in row else '–',
           f'{row["optimised_m2"]:.4f}', f'{row["time_s"]:.1f}'] for name, row in figures.items()]))
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
 
 
 if __name__ == '__main__':

@@ -15,19 +15,18 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import argparse
 import dataclasses
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 
 from rhs_isac_ros.bounds import misspecified
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError
 from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int, seed
-from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.arguments import positive_int
 
 CONFIG = Path(__file__).parents[2] / 'config'
 LEVELS_DB = -25.0, -15.0, 0.0
@@ -38,14 +37,10 @@ N_BOOTSTRAP = 1000
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark misspecified', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('misspecified', __doc__)
     add = parser.add_argument
-    add('--positions', type=positive_int, default=60, help='number of positions (60)')
-    add('--phases', type=positive_int, default=100, help='phases at each position (100)')
-    add('--seed', type=seed, default=1, help='seed of all random numbers (1)')
-    add('--json', type=output_file, help='JSON file for the results')
+    add('--positions', type=positive_int, default=60, help='number of positions')
+    add('--phases', type=positive_int, default=100, help='phases at each position')
     options = parser.parse_args()
     codebook = Codebook.load(CONFIG / 'codebook_bandplan.yaml')
     print('| multipath [dB] | field | true value | valid [%] | predicted [m] | simulated [m] | '
@@ -60,8 +55,7 @@ def main() -> None:
         changes += [('multipath_to_los_db', {'multipath_to_los_db': level + change})
                     for change in (3.0, -3.0)]
         rows += [evaluate(assumed, name, change, codebook, options) for name, change in changes]
-    if options.json:
-        write_whole(options.json, json.dumps(rows, indent=2) + '\n')
+    write_results(options.json, rows)
 
 
 def evaluate(assumed: Scenario, name: str, change: dict[str, float], codebook: Codebook,

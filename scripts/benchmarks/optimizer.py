@@ -11,7 +11,6 @@ bands need? Part (e) takes several minutes and is not run by default.
 
 import argparse
 import importlib.util
-import json
 import os
 import sys
 import time
@@ -19,6 +18,7 @@ from collections.abc import Callable
 
 import numpy as np
 from parts.ambiguity_speed import ambiguity_speed
+from parts.command import benchmark_parser, write_results
 from parts.optimizer_growth import POSITIONS, growth, side_by_side, surfaces
 from parts.optimizer_picture import draw
 from peers.jax_crlb import JaxAverageCrlb
@@ -26,22 +26,18 @@ from scipy.optimize import minimize
 
 from rhs_isac_ros.bounds import AverageCrlb, crlb
 from rhs_isac_ros.codebook import METHODS, random_codebook
-from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, monte_carlo, sobol
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
-from rhs_isac_ros.codebook.sampling import monte_carlo, sobol
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
     check_distinct,
     integer,
-    output_file,
     picture_file,
     positive_float,
 )
-from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.pictures import write_picture
 
 HAVE_JAX = importlib.util.find_spec('jax') is not None
@@ -51,15 +47,12 @@ HELD_OUT = 2000
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark optimizer', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = benchmark_parser('optimizer', __doc__, default_seed=None)
     parser.add_argument('--threads', type=integer(1, len(os.sched_getaffinity(0))), default=1,
                         help='number of cores and threads')
     parser.add_argument('--limit', type=positive_float, default=120.0,
                         help='time limit per method in (b) [s]')
     parser.add_argument('--parts', type=parts, default='abcd', help='letters of abcde')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     parser.add_argument('--picture', type=picture_file,
                         help='file for the picture of (a) to (c): PNG, PDF or SVG')
     options = parser.parse_args()
@@ -67,15 +60,14 @@ def main() -> None:
     restrict_to(options.threads)
     if not HAVE_JAX:
         print('JAX is not installed, so its figures are omitted; to install it: '
-              'python3 -m pip install --no-deps -r requirements-peers.txt\n', file=sys.stderr)
+              'scripts/setup peers\n', file=sys.stderr)
     figures: dict = {'threads': options.threads}
     for part, measure in (
             ('a', gradient), ('b', lambda: target(options.limit)), ('c', growth),
             ('d', ambiguity_speed), ('e', surfaces)):
         if part in options.parts:
             figures |= measure()
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
     if options.picture:
         write_picture(options.picture, draw(figures))
 

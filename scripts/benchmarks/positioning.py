@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.exhaustive_posterior import exhaustive_posterior
 from scipy.special import chdtri
 
 from rhs_isac_ros.bounds import crlb
@@ -30,7 +31,6 @@ from rhs_isac_ros.positioning import (
     ESTIMATORS,
     Estimate,
     ModelError,
-    exhaustive_posterior,
     make_estimator,
     simulate_pairs,
 )

@@ -32,23 +32,23 @@ import argparse
 import copy
 import dataclasses
 import itertools
-import json
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 from parts.posterior_ratio import ratio_to_reference, reference_means
 from parts.warning_windows import warnings
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, random_codebook
-from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.positioning import Estimate, Estimator, make_estimator
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import positive_int
 
 DEFAULT_CODEBOOK = Path(__file__).parents[2] / 'config' / 'codebook.yaml'
 # Squared Mahalanobis radius of the 95 % region.
@@ -93,11 +93,9 @@ OUTSIDE = {'x = 18 m': (18.0, 0.0, 0.0), 'x = 30 m': (30.0, 0.0, 0.0),
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('robustness', __doc__)
     add = parser.add_argument
     add('--positions', type=positive_int, default=600, help='number of positions of each row')
-    add('--seed', type=int, default=1, help='seed of all random numbers')
     add('--estimator', choices=['bayes', 'ml'], default='bayes', help='estimator')
     add('--inside', action='store_true',
         help='estimate without reject_outside, as if no user were outside of the region')
@@ -112,7 +110,6 @@ def main() -> None:
     add('--windows', type=positive_int, default=200,
         help='number of windows to which the monitor of the residuals is applied')
     add('--pairs', action='store_true', help='all pairs of declarations, and some triples')
-    add('--json', type=Path, help='JSON file for the results')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}, estimator {options.estimator}\n')
     print('| signals from | scenario | no fix [%] | MSE [m^2] | predicted | in the 95 % region '
@@ -131,21 +128,15 @@ def main() -> None:
             changes = {key: value for name in names for key, value in DECLARATIONS[name].items()}
             if len(changes) == len(names) and wanted(' + '.join(names), options):
                 rows += inside_rows(' + '.join(names), base, codebook, changes, options)
-                save([pair(row) for row in rows], options.json, 'pairs')
+                write_results(options.json, {'pairs': [pair(row) for row in rows]})
         return
     for name, silent, its_codebook, changes in cases:
         if wanted(name, options):
             rows += inside_rows(name, silent, its_codebook, changes, options)
-            save(rows, options.json)
+            # All rows take long.
+            write_results(options.json, rows)
     rows += outside_rows(base, codebook, options)
-    save(rows, options.json)
-
-
-def save(rows: list[dict[str, Any]], path: Path | None, key: str = '') -> None:
-    """Write the rows so far: all of them take long."""
-    if path:
-        content = {key: rows} if key else rows
-        path.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+    write_results(options.json, rows)
 
 
 def pair(row: dict[str, Any]) -> dict[str, Any]:

@@ -11,21 +11,19 @@ import os
 # One thread. This must be set before NumPy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import argparse
-import json
 import sys
 import time
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 
 from rhs_isac_ros.bounds import crlb
 from rhs_isac_ros.codebook import optimize
-from rhs_isac_ros.codebook.sampling import sobol
+from rhs_isac_ros.codebook.objective import sobol
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
-from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int
-from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.support.arguments import positive_int
 
 CHOICES = (('monte_carlo', 300), ('monte_carlo', 600), ('monte_carlo', 1200), ('sobol', 64),
            ('sobol', 128), ('sobol', 256), ('sobol', 1024))
@@ -34,13 +32,10 @@ HELD_OUT, HELD_OUT_SEED = 16384, 1 << 20
 
 def main() -> None:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark sampling', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = benchmark_parser('sampling', __doc__, default_seed=None)
     parser.add_argument('--seeds', type=positive_int, default=5, help='number of runs per choice')
     parser.add_argument('--steps', type=positive_int, default=600,
                         help='update steps of each run')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     scenario = Scenario()
     held_out = sobol(scenario, HELD_OUT, streams.generator(HELD_OUT_SEED, streams.HELD_OUT))
@@ -63,8 +58,7 @@ def main() -> None:
                          'time_s': np.mean(times_s)}
         print('| {} | {mean_m2:.5f} | {std_m2:.5f} | {time_s:.1f} |'.format(name, **figures[name]),
               flush=True)
-    if options.json:
-        write_whole(options.json, json.dumps(figures, indent=2) + '\n')
+    write_results(options.json, figures)
 
 
 if __name__ == '__main__':

@@ -28,13 +28,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.command import benchmark_parser, write_results
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, optimize
-from rhs_isac_ros.experiments import positive_int
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.support.arguments import positive_int
 
 FOLDER = Path(__file__).parents[2] / 'config' / 'scenarios'
 # Scenarios whose codebook is directional, and those with fewer positions.
@@ -82,23 +83,18 @@ def run(options: argparse.Namespace) -> None:
             command, check=True, stdout=subprocess.PIPE, text=True).stdout)
         report(name, row)
         results |= {f'{name}.{key}': value for key, value in row.items()}
-        if options.json:
-            options.json.write_text(json.dumps(results, indent=1) + '\n', encoding='utf-8')
+        write_results(options.json, results)
 
 
 def parse_options() -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        prog='scripts/benchmark scenarios', description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser('scenarios', __doc__)
     add = parser.add_argument
     add('--positions', type=positive_int, default=1000, help='number of positions of each row')
-    add('--seed', type=int, default=1, help='seed of all random numbers')
     add('--only', nargs='*', metavar='NAME', help='only these scenarios')
     add('--inside', action='store_true',
         help='estimate without reject_outside, as if no user were outside of the region')
     add('--codebooks', type=Path, help='folder in which codebooks are kept between runs')
-    add('--json', type=Path, help='JSON file for the results')
     add('--one', help=argparse.SUPPRESS)
     return parser.parse_args()
 

@@ -11,7 +11,7 @@ from resampling; the cycles of a walk are not independent. The 95 % region of an
 ellipsoid of its covariance that contains 95 % of a Gaussian. --bands and --frames replace bands
 and frames of the scenario, with a codebook that is not optimised unless --codebook names one.
 
---peer compares with the particle filter of Stone Soup (requirements-peers.txt). It has the same
+--peer compares with the particle filter of Stone Soup (scripts/setup peers). It has the same
 likelihood and the same movement, and starts from particles that are drawn from the posterior of
 the first cycle.
 """
@@ -101,7 +101,7 @@ def main() -> None:
         'single cycles': lambda: Single(estimator),
         'track': lambda: Track(estimator, motion)}
     for n_particles in options.peer or ():
-        with optional_import('--peer (requirements-peers.txt)'):
+        with optional_import('--peer (scripts/setup peers)'):
             from peers.stonesoup_filter import ParticleFilter
 
         methods[f'Stone Soup, {n_particles} particles'] = (

@@ -5,8 +5,6 @@ or in one process? The networks are compared with one of few users and with the 
 bare rclpy, measured in the same run.
 """
 
-import argparse
-import json
 import os
 import sys
 import tempfile
@@ -15,17 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from parts.command import benchmark_parser, write_results
 from parts.hops import CHAIN, ping_pong
 from system.observer import NetworkObserver
+from system.trial_processes import TrialProcesses
 
 from rhs_isac_ros.codebook import default_codebook_file
 from rhs_isac_ros.executables import exit_code_of
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
-from rhs_isac_ros.ros.processes import Processes, private_domain
-from rhs_isac_ros.support.arguments import ArgumentParser, output_file, positive_int
-from rhs_isac_ros.support.files import write_whole
+from rhs_isac_ros.ros.processes import private_domain
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import use_discovery_profile
+from rhs_isac_ros.support.arguments import positive_int
 from rhs_isac_ros.tools.process_network import max_user_processes, start_network
 
 TIMEOUT_S = 600.0
@@ -35,9 +34,7 @@ MIN_CYCLES = 200
 
 def main() -> int:
     """Run the benchmark."""
-    parser = ArgumentParser(
-        prog='scripts/benchmark users', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = benchmark_parser('users', __doc__, default_seed=None)
     parser.add_argument('--few', type=positive_int, default=2,
                         help='number of users of the network to compare with')
     parser.add_argument('--separate', type=positive_int, default=64,
@@ -48,7 +45,6 @@ def main() -> int:
     parser.add_argument('--only', choices=('separate', 'together'),
                         help='compare only one of the two networks with many users')
     parser.add_argument('--rounds', type=positive_int, default=2, help='cycles for each user')
-    parser.add_argument('--json', type=output_file, help='JSON file for the results')
     options = parser.parse_args()
     check_domain(parser)
     separate = min(options.separate, max_user_processes())
@@ -77,10 +73,8 @@ def main() -> int:
     for run in (*few, *many.values()):
         print(describe(run))
     print(f'bare rclpy: {1e3 * hops * hop_s:.2f} ms for the {hops} hops of a cycle')
-    if options.json:
-        write_whole(options.json, json.dumps({
-            'hop_us': 1e6 * hop_s, 'floor_ms': 1e3 * hops * hop_s, 'few': few, **many},
-            indent=2) + '\n')
+    write_results(options.json, {
+        'hop_us': 1e6 * hop_s, 'floor_ms': 1e3 * hops * hop_s, 'few': few, **many})
     return 0
 
 
@@ -89,7 +83,7 @@ def run_network(scenario: Scenario, users: int, rounds: int, together: bool) -> 
     cycles = max(rounds * users, MIN_CYCLES)
     observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        with Processes(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
+        with TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}) as processes:
             start_network(processes, users, 0, None, default_codebook_file(), scenario,
                           rest_s=0.0, together=together)
             ended = observer.log.ended

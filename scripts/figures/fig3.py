@@ -31,6 +31,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from parts.options import parse_options
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb
@@ -39,15 +40,12 @@ from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.experiments import (
     Job,
     markdown_table,
-    mean_and_std,
-    parse_options,
-    plus_minus,
-    positive_int,
     run_command,
     run_jobs,
 )
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import positive_int
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.pictures import PAGE_IN, look, new_panels, paper_style, write_picture
 
@@ -217,6 +215,30 @@ def reproduce(options: argparse.Namespace) -> None:
         {'version': __version__, 'trials': entries}, indent=1) + '\n')
     write_whole(output / 'fig3.md', f'# Fig. 3\n\n![Fig. 3]({name})\n\n{report}\n')
     print(f'{report}\n\nwritten: {output}/{name}, fig3.md and fig3.json')
+
+
+def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
+    """Return mean and standard deviation of a sample.
+
+    The mean is infinite if a value is. The deviation is NaN if it is undefined: for a single
+    value, or an infinite mean.
+    """
+    mean = float(np.mean(values))
+    if len(values) < 2 or not np.isfinite(mean):
+        return mean, float('nan')
+    return mean, float(np.std(values, ddof=1))
+
+
+def plus_minus(mean: float, std: float, digits: int = 3) -> str:
+    """Format a mean, to some significant digits, and its deviation to the same decimal place.
+
+    A deviation of NaN is omitted.
+    """
+    if not np.isfinite(mean):
+        return str(mean)
+    magnitude = int(np.floor(np.log10(abs(mean)))) if mean else 0
+    places = max(digits - 1 - magnitude, 0)
+    return f'{mean:.{places}f}' + ('' if np.isnan(std) else f' ± {std:.{places}f}')
 
 
 def add_steps(parser: argparse.ArgumentParser) -> None:

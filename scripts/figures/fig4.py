@@ -38,16 +38,15 @@ from typing import Any
 import numpy as np
 from parts import fig4_grid, fig4_report
 from parts.fig4_results import NEURAL, ROWS, Condition, Results, codebook_of
+from parts.options import parse_options
 
 from rhs_isac_ros.codebook import Codebook, directional_codebook, optimize
 from rhs_isac_ros.codebook.optimize import INTERRUPTED
-from rhs_isac_ros.experiments import Job, parse_options, run_command, run_jobs
+from rhs_isac_ros.experiments import Job, run_command, run_jobs
 from rhs_isac_ros.link import capacity, steer
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import make_estimator
-from rhs_isac_ros.positioning.network import INPUTS
-from rhs_isac_ros.positioning.simulate import simulate_pairs
-from rhs_isac_ros.positioning.training import train
+from rhs_isac_ros.positioning import make_estimator, simulate_pairs
+from rhs_isac_ros.positioning.neural import INPUTS, train
 from rhs_isac_ros.support.arguments import integer
 from rhs_isac_ros.support.optional import optional_import
 

@@ -21,12 +21,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from parts.options import parse_options
 from parts.plans import SEED, add_plan_options, read_plans
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import crlb, global_bound
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.experiments import Job, markdown_table, parse_options, run_command, run_jobs
+from rhs_isac_ros.experiments import Job, markdown_table, run_command, run_jobs
 from rhs_isac_ros.experiments.sweep import BLOCK, Sweep, plain_codebook, run_blocks
 from rhs_isac_ros.experiments.sweep_settings import Setting
 from rhs_isac_ros.model import Scenario

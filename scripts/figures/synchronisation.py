@@ -22,9 +22,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from parts.options import parse_options
 from parts.plans import SEED, Plan, add_plan_options, read_plans
 
-from rhs_isac_ros.experiments import markdown_table, parse_options, run_command
+from rhs_isac_ros.experiments import markdown_table, run_command
 from rhs_isac_ros.experiments.sweep import BLOCK, Point, Sweep, run_sweep, table
 from rhs_isac_ros.experiments.sweep_picture import add_legend, draw_panel
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, Axis, Setting
@@ -66,7 +67,8 @@ def advice(points: Sequence[Point], plans: Sequence[str]) -> list[str]:
         for field, values in CURVES.items():
             errors = [point.interval for point in points_of(points, plan, field, 'mse')]
             at = doubling(values, [error.value for error in errors])
-            label, unit = (FIELDS[field].metadata[key] for key in ('label', 'unit'))
+            metadata = FIELDS[field].metadata
+            label, unit = metadata['label'], metadata['declared'].unit
             quantity = label.partition(',')[0]
             limits.append(f'a {quantity} of {at:.3g} {unit}' if np.isfinite(at) else
                           f'no {quantity} up to {values[-1]:.4g} {unit}')

@@ -1,4 +1,4 @@
-"""A scenario with impairments, for bounds that take them into account."""
+"""A scenario with impairments, and a comparison of gradients with differences."""
 
 import numpy as np
 import pytest
@@ -21,3 +21,22 @@ def uncertain() -> Scenario:
 @pytest.fixture(scope='session')
 def uncertain_codebook(uncertain, random_beams) -> Codebook:
     return random_beams(uncertain, np.random.default_rng(0))
+
+
+@pytest.fixture(scope='session')
+def assert_gradients():
+    """Function that compares gradients with differences of a value in random directions."""
+    def check(gradients, value, codebook, rng, slack=0.0, step=1e-5):
+        """Take a function of analog and digital variables; `slack` is its rounding error."""
+        start = {'analog': codebook.analog, 'digital': codebook.digital}
+        for _ in range(2):
+            for (name, values), gradient in zip(start.items(), gradients, strict=True):
+                assert (gradient.shape, gradient.dtype) == (values.shape, values.dtype)
+                way = rng.normal(size=(*values.shape, 2)) @ [1, 1j if name == 'digital' else 0]
+                way = way.astype(values.dtype) * (np.linalg.norm(values) / np.linalg.norm(way))
+                ahead, behind = (value(**start | {name: values + sign * step * way})
+                                 for sign in (1, -1))
+                scale = np.linalg.norm(gradient) * np.linalg.norm(way)
+                assert np.sum(gradient.conj() * way).real == pytest.approx(
+                    (ahead - behind) / (2 * step), abs=slack + 1e-6 * scale)
+    return check

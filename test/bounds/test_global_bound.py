@@ -37,7 +37,7 @@ def test_with_strong_signals_the_bound_is_the_cramer_rao_bound():
 def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
     # In a thin region, only the range is unknown. Its phases repeat every 0.6 m.
     scenario, codebook, bound = bound_and_codebook(
-        1024, multipath_to_los_db=-5.0, roi_center_m=(7.0, 0.0, 0.0), roi_size_m=(3.0, 1e-6, 1e-6))
+        512, multipath_to_los_db=-5.0, roi_center_m=(7.0, 0.0, 0.0), roi_size_m=(3.0, 1e-6, 1e-6))
     rng = np.random.default_rng(3)
     model = MeasurementModel(scenario, codebook)
     grid = np.zeros((1501, 3))
@@ -54,7 +54,6 @@ def test_ambiguous_ranges_are_as_in_a_brute_force_posterior():
     spread = np.hypot(variances.std() / np.sqrt(len(truth)), bound.standard_error)
     assert abs(bound.value - variances.mean()) < 4 * spread
     assert spread < 0.07 * bound.value
-    assert bound.range_part == pytest.approx(bound.value, rel=1e-3)
 
 
 def crlb_of_range(model, truth):
@@ -64,7 +63,7 @@ def crlb_of_range(model, truth):
 
 @pytest.mark.slow
 def test_squared_errors_have_the_mean_of_the_bound():
-    scenario, _, bound = bound_and_codebook(256)
+    scenario, _, bound = bound_and_codebook(256, roi_size_m=(4.0, 4.0, 1.0))
     spread = np.std(bound.squared_errors) / np.sqrt(len(bound.squared_errors))
     assert abs(bound.squared_errors.mean() - bound.value) < 4 * np.hypot(
         spread, bound.standard_error)
@@ -88,7 +87,7 @@ def test_too_few_phases_are_an_error():
 def test_a_flat_region_is_the_limit_of_thin_ones(height):
     flat, thin = (bound_and_codebook(
         1024, multipath_to_los_db=-20.0, roi_center_m=(5.0, 0.0, height),
-        roi_size_m=(2.0, 2.0, size))[2] for size in (0.0, 2e-2))
+        roi_size_m=(1.0, 1.0, size))[2] for size in (0.0, 2e-2))
     spread = np.hypot(flat.standard_error, thin.standard_error)
     assert flat.value == pytest.approx(thin.value, abs=4 * spread + 0.05 * thin.value)
     assert spread < 0.2 * thin.value

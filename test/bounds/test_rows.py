@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import AverageCrlb, rows
-from rhs_isac_ros.bounds.rows import CompressedRows, ExactRows, rows_within
+from rhs_isac_ros.bounds.rows import CompressedRows, Evaluation, ExactRows, rows_within
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.los import los_derivative, los_gain
@@ -57,7 +57,7 @@ def make(scenario, items, tolerance=0.0):
 
 def evaluate(some_rows, model, n_rows, seed=2):
     """Whitened means of all items and the sums for random weights, by band."""
-    evaluation, rng = some_rows.begin(model), np.random.default_rng(seed)
+    evaluation, rng = Evaluation(some_rows, model), np.random.default_rng(seed)
     bands = range(len(model.radiation))
     whitened = [[] for _ in bands]
     for block in rows.blocks(some_rows.n_items):
@@ -94,7 +94,7 @@ def recovered(some_rows, scenario):
     """The rows themselves: their means if each measurement observes one element, not whitened."""
     size = scenario.n_subbands * scenario.n_elements
     elements = np.tile(np.eye(scenario.n_elements, dtype=complex), (scenario.n_subbands, 1))
-    evaluation = some_rows.begin(SimpleNamespace(
+    evaluation = Evaluation(some_rows, SimpleNamespace(
         radiation=np.stack([elements] * scenario.n_bands),
         whitener=np.stack([np.eye(size, dtype=complex)] * scenario.n_bands)))
     blocks = list(rows.blocks(some_rows.n_items))
@@ -230,7 +230,8 @@ def test_a_sketch_that_is_too_small_doubles_until_it_suffices(
     expected = make(wide, items, tolerance)
     assert sizes == [min(128, items.shape[0] * items.shape[1])] * 2
     sizes.clear()
-    monkeypatch.setattr(rows, '_first_sketch', lambda scenario: 2)
+    monkeypatch.setattr(rows, '_MIN_SKETCH', 2)
+    monkeypatch.setattr(rows, '_MAX_RANK', 2)
     grown = make(wide, items, tolerance)
     firsts = [k for k, size in enumerate(sizes) if size == 2]
     assert len(firsts) == 2
@@ -305,7 +306,7 @@ def test_concurrent_evaluations_are_independent(
     some_rows = make(wide, items, tolerance)
     other_model = MeasurementModel(wide, random_beams(wide, np.random.default_rng(5)))
     expected = evaluate(some_rows, model, items.shape[1])
-    first, second = some_rows.begin(model), some_rows.begin(other_model)
+    first, second = Evaluation(some_rows, model), Evaluation(some_rows, other_model)
     rng = np.random.default_rng(2)
     for block in rows.blocks(some_rows.n_items):
         weights = rng.normal(size=(block.stop - block.start, *[items.shape[1]] * 2))

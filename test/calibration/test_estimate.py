@@ -7,8 +7,7 @@ import pytest
 
 from rhs_isac_ros.calibration import Pilots, SurfacePrior, estimate_surface, prior_of
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, Scenario
-from rhs_isac_ros.model.impairments import DeclaredElements
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
+from rhs_isac_ros.model.elements import DeclaredElements, SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
 
 NUISANCE = [

@@ -12,7 +12,7 @@ import yaml
 
 from rhs_isac_ros.bounds import PairwiseErrorCost, crlb
 from rhs_isac_ros.codebook import Codebook, CodebookError, Provenance, directional_codebook
-from rhs_isac_ros.codebook.sampling import draw_confusable
+from rhs_isac_ros.codebook.objective import draw_confusable
 from rhs_isac_ros.model import Scenario
 
 CONFIG = Path(__file__).parents[2] / 'config'

@@ -13,9 +13,9 @@ import yaml
 
 from rhs_isac_ros.bounds import crlb, crlb_of
 from rhs_isac_ros.calibration import Pilots, calibrate, prior_of
-from rhs_isac_ros.codebook import Codebook, Provenance, band_plan, command, directional_codebook
+from rhs_isac_ros.codebook import Codebook, Provenance, __main__, band_plan, directional_codebook
 from rhs_isac_ros.codebook.__main__ import main
-from rhs_isac_ros.codebook.optimize import INTERRUPTED, _PeriodicCall
+from rhs_isac_ros.codebook.optimize import INTERRUPTED, _Report
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import MeasurementModel, Scenario, draw_surface
 from rhs_isac_ros.support import streams
@@ -58,7 +58,7 @@ def test_the_summary_describes_the_codebook_written(call, files, scenario, capsy
     codebook = Codebook.load(files / 'codebook.yaml')
     codebook.check(scenario)
     held_out = scenario.sample_positions(
-        command.HELD_OUT_POSITIONS, streams.generator(3, streams.HELD_OUT))
+        __main__.HELD_OUT_POSITIONS, streams.generator(3, streams.HELD_OUT))
     average = crlb(scenario, codebook, held_out).mean()
     assert codebook.average_crlb_m2 == pytest.approx(average, rel=1e-9)
     assert f'average CRLB {average:.5f} m^2 (standard error ' in capsys.readouterr().out
@@ -115,7 +115,7 @@ def test_resume_prefers_the_partial_file_of_an_unfinished_run(call, files, monke
     """A killed run leaves OUTPUT.part and does not change the last output."""
     assert call('--steps', 5) == 0
     good = (files / 'codebook.yaml').read_bytes()
-    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_KEEP_S', 0.0)
 
     class KilledError(BaseException):
         """An exception that no code handles."""
@@ -252,7 +252,7 @@ def test_a_full_disk_loses_neither_the_last_output_nor_the_result(
     rescue = tmp_path_factory.mktemp('rescue')
     monkeypatch.setattr('tempfile.tempdir', str(rescue))
     full_disk(monkeypatch, files / 'codebook.yaml')
-    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_KEEP_S', 0.0)
     fails_with(call, capsys, ['codebook.yaml', 'No space left', str(rescue)], '--steps', 4)
     assert (files / 'codebook.yaml').read_bytes() == good
     (saved,) = rescue.glob('*/codebook.yaml')
@@ -260,7 +260,7 @@ def test_a_full_disk_loses_neither_the_last_output_nor_the_result(
 
 
 def test_a_partial_file_that_cannot_be_written_is_a_warning(call, files, capsys, monkeypatch):
-    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_KEEP_S', 0.0)
     save = Codebook.save
 
     def save_or_not(codebook, target):
@@ -293,7 +293,7 @@ def test_a_codebook_is_optimised_for_a_calibrated_surface(
     codebook = Codebook.load(files / 'codebook.yaml')
     assert Provenance.parse(codebook.provenance).calibration == calibration.id
     held_out = scenario.sample_positions(
-        command.HELD_OUT_POSITIONS, streams.generator(0, streams.HELD_OUT))
+        __main__.HELD_OUT_POSITIONS, streams.generator(0, streams.HELD_OUT))
     model = MeasurementModel(scenario, codebook, calibration.surface)
     assert codebook.average_crlb_m2 == pytest.approx(crlb_of(model, held_out).mean(), rel=1e-9)
     # A codebook for an ideal surface is worse on the calibrated one.
@@ -344,6 +344,6 @@ def test_the_package_is_executable(files):
 
 def test_options_can_be_added_to_another_parser():
     parser = argparse.ArgumentParser()
-    command.add_options(parser)
+    __main__.add_options(parser)
     options = parser.parse_args([])
     assert (options.method, options.objective, options.seed) == ('lbfgs', None, 0)

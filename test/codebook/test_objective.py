@@ -8,9 +8,14 @@ import pytest
 
 from rhs_isac_ros.bounds import PairwiseErrorCost, crlb
 from rhs_isac_ros.codebook import OBJECTIVES, objective, optimize, random_codebook
-from rhs_isac_ros.codebook.objective import ambiguity, average_bound
+from rhs_isac_ros.codebook.objective import (
+    WIDE,
+    ambiguity,
+    average_bound,
+    confusable_volumes,
+    draw_confusable,
+)
 from rhs_isac_ros.codebook.problem import Problem
-from rhs_isac_ros.codebook.sampling import WIDE, confusable_volumes, draw_confusable
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
 

@@ -22,7 +22,7 @@ from rhs_isac_ros.codebook import (
     optimize,
     random_codebook,
 )
-from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _PeriodicCall, _Report
+from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS, Method, _Report
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -257,7 +257,7 @@ def test_an_interrupt_in_the_progress_callback_returns_the_best_so_far(scenario,
 @pytest.mark.parametrize('objective', OBJECTIVES)
 def test_progress_is_reported_while_the_objective_is_set_up(
         scenario, positions, objective, monkeypatch):
-    monkeypatch.setattr(_Report, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_TICK_S', 0.0)
     seen = []
     result = optimize(scenario, positions, objective=objective, seed=3, max_steps=2,
                       progress=seen.append)
@@ -272,7 +272,7 @@ def test_progress_is_reported_while_the_objective_is_set_up(
 @pytest.mark.parametrize('kept', [False, True])
 def test_an_interrupt_of_the_set_up_returns_the_start(scenario, positions, kept, monkeypatch):
     """Rows that are kept are computed with the first evaluation."""
-    monkeypatch.setattr(_Report, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_TICK_S', 0.0)
     if kept:
         monkeypatch.setattr(rows, '_rank_of_some', lambda *_: 1 << 20)
     start, calls = directional_codebook(scenario), []
@@ -290,7 +290,7 @@ def test_an_interrupt_of_the_set_up_returns_the_start(scenario, positions, kept,
 
 
 def test_an_error_of_the_progress_callback_ends_the_set_up(scenario, positions, monkeypatch):
-    monkeypatch.setattr(_Report, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_TICK_S', 0.0)
 
     def fail(entry):
         raise TimeoutError
@@ -300,7 +300,7 @@ def test_an_error_of_the_progress_callback_ends_the_set_up(scenario, positions, 
 
 
 def test_keep_receives_the_results_so_far(scenario, positions, monkeypatch):
-    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_KEEP_S', 0.0)
     kept, seen = [], []
     result = optimize(scenario, positions, seed=3, max_steps=6, progress=seen.append,
                       keep=kept.append)
@@ -327,7 +327,7 @@ def test_keep_is_not_called_in_the_first_ten_seconds(scenario, positions):
 
 
 def test_keep_does_not_change_the_result(scenario, positions, run, monkeypatch):
-    monkeypatch.setattr(_PeriodicCall, '_PERIOD_S', 0.0)
+    monkeypatch.setattr(_Report, '_KEEP_S', 0.0)
     result = optimize(
         scenario, positions, seed=3, max_steps=STEPS, keep=lambda partial: None)
     assert result.codebook.id == run[0].codebook.id

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from rhs_isac_ros.codebook import provenance as text
+from rhs_isac_ros.codebook import codebook as text
 
 WORDS = ['done', 'max_steps reached', 'null', 'true', 'NaN', '0.1.0', '1e3', '', ' ends ',
          'a, b=c', 'a: b, {c} [d] #e', '"quoted" and \'quoted\'', 'é ∞', 'line\nline', '\x07',

@@ -93,7 +93,7 @@ def test_a_round_without_success_ends_the_search(search_from, monkeypatch):
 def test_optimize_uses_samples_of_many_pairs_only(scenario, monkeypatch):
     used = []
     monkeypatch.setattr(sys.modules[optimize.__module__], 'minimize_sampled',
-                        lambda search: used.append(search.n_pairs) or 'done')
+                        lambda search: used.append(search.problem.n_pairs) or 'done')
     for objective, n_positions in (('ambiguity', 16), ('crlb', N_POSITIONS)):
         optimize(scenario, objective=objective, n_positions=n_positions, max_steps=1)
     assert used == []

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook import SAMPLINGS
-from rhs_isac_ros.codebook.sampling import (
+from rhs_isac_ros.codebook.objective import (
+    NEAR,
     WIDE,
     confusable_volumes,
     draw_confusable,
@@ -190,7 +191,7 @@ def test_volumes_are_relative_to_the_fifth_power_of_the_range():
     near, far = np.array([[6.0, 0, 0]]), np.array([[12.0, 0, 0]])
     turn = np.array([[np.cos(0.1), np.sin(0.1), 0]])
     first, second = (
-        float(confusable_volumes(scenario, position, np.linalg.norm(position) * turn)[0])
+        float(confusable_volumes(scenario, position, np.linalg.norm(position) * turn, NEAR)[0])
         for position in (near, far))
     # The displaced volume itself grows with the square of the range.
     assert second / first == pytest.approx(2.0**(2 - 5))

@@ -72,7 +72,8 @@ def test_pages_have_a_dark_mode_and_a_search(site):
 
 
 @pytest.mark.parametrize(('name', 'words'), [
-    ('model', 'region of interest'), ('band_plans', 'Range ambiguity')])
+    ('model', 'region of interest'), ('band_plans', 'Range ambiguity'),
+    ('own_hall', 'Virtual sources')])
 def test_pictures_are_drawn_with_a_description(site, name, words):
     (picture,) = re.findall(r'<img alt="([^"]+)" class="drawn"[^>]*src="(_images/[^"]+)"',
                             page(site, name))

@@ -13,6 +13,11 @@ SVG = '{http://www.w3.org/2000/svg}'
 each_role = pytest.mark.parametrize('role', diagram.ROLES)
 
 
+def shown(function):
+    """Return the name of a guard or an action as pages show it."""
+    return function.__name__.lstrip('_')
+
+
 def changes(role):
     """Return source, label and target of all changes of state, tried row by row."""
     machine, found = diagram.ROLES[role], set()
@@ -24,7 +29,7 @@ def changes(role):
             if row.guard is always:
                 unguarded.add(row.event)
             if row.target not in (SAME, state):
-                guard = '' if row.guard is always else f' [{row.guard.__name__}]'
+                guard = '' if row.guard is always else f' [{shown(row.guard)}]'
                 found.add((state.value, row.event.__name__ + guard, row.target.value))
     return found
 
@@ -93,9 +98,9 @@ def test_the_table_has_every_row(role, capsys):
         elif not state.startswith('any but'):
             assert state == ', '.join(source.value for source in row.source)
         assert event == row.event.__name__
-        assert guard == ('' if row.guard is always else row.guard.__name__)
+        assert guard == ('' if row.guard is always else shown(row.guard))
         assert target == ('the same' if row.target is SAME else row.target.value)
-        assert actions.split(', ') == [action.__name__ for action in row.actions] or not actions
+        assert actions.split(', ') == [shown(action) for action in row.actions] or not actions
         assert counter == (row.outcome.value if row.outcome else '')
 
 

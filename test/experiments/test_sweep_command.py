@@ -36,20 +36,17 @@ def files(folder):
 
 
 @pytest.mark.slow
-def test_processes_a_cluster_and_an_interrupted_run_write_the_same_files(
+def test_a_cluster_and_an_interrupted_run_write_the_same_files(
         sweep, tmp_path, monkeypatch, capsys):
-    assert sweep('two', '--jobs', '2') == 0
-    shown = capsys.readouterr().out
-    assert 'written: two/sweep.csv and two/sweep.png' in shown
-    assert '| n_frames | ' in shown
-
     distributed = pytest.importorskip('distributed')
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False,
                                   dashboard_address=':0') as cluster:
         # Addresses in the same process are no HOST:PORT.
         monkeypatch.setattr('rhs_isac_ros.experiments.command._address', str)
         assert sweep('dask', '--dask', cluster.scheduler_address) == 0
-    assert files(tmp_path / 'dask') == files(tmp_path / 'two')
+    shown = capsys.readouterr().out
+    assert 'written: dask/sweep.csv and dask/sweep.png' in shown
+    assert '| n_frames | ' in shown
 
     done = []
 
@@ -67,7 +64,7 @@ def test_processes_a_cluster_and_an_interrupted_run_write_the_same_files(
     n_before = len(list((tmp_path / 'again' / 'jobs').iterdir()))
     assert n_before == 2 + 5
     assert sweep('again', '--jobs', '1') == 0
-    assert files(tmp_path / 'again') == files(tmp_path / 'two')
+    assert files(tmp_path / 'again') == files(tmp_path / 'dask')
 
 
 def test_every_setting_and_measure_has_a_row(sweep, tmp_path):

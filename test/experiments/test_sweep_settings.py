@@ -35,7 +35,7 @@ def test_values_have_the_syntax_and_the_types_of_scenario_files():
     ('n_frames=0', 'n_frames: 0, expected 1 to 4096'),
     ('n_frames=1.5', 'n_frames: 1.5, expected an integer'),
     ('n_frames=true', 'n_frames: True, expected an integer'),
-    ('multipath_to_los_db=0,300', 'multipath_to_los_db: 300 dB, expected -200 to 100 dB'),
+    ('multipath_to_los_db=0,300', 'multipath_to_los_db: 300.0, expected -200 to 100 dB'),
     ('roi_center_m=[1,2]', 'roi_center_m: 2 values, expected a list of 3 numbers'),
     ('roi_center_m=1,2,3', 'roi_center_m: 1, expected a list of 3 numbers'),
 ])

@@ -8,14 +8,9 @@ import sys
 
 import pytest
 
-from rhs_isac_ros.experiments import (
-    Job,
-    JobError,
-    MissingLibraryError,
-    ResultStore,
-    run_jobs,
-)
+from rhs_isac_ros.experiments import Job, JobError, run_jobs
 from rhs_isac_ros.experiments import jobs as jobs_module
+from rhs_isac_ros.support.optional import MissingLibraryError
 
 JOBS = [Job(f'square-{number}', {'number': number, 'of': (1, 2)}) for number in range(4)]
 SQUARES = [{'square': number**2} for number in range(4)]
@@ -84,7 +79,7 @@ def test_an_interrupted_run_keeps_its_finished_jobs(tmp_path):
     b'', b'{"version": ', b'\xff\xfe', b'[]', b'{}', b'{"result": 1}'])
 def test_a_job_with_a_damaged_result_is_repeated(tmp_path, content):
     run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
-    ResultStore(tmp_path).path(JOBS[1]).write_bytes(content)
+    (tmp_path / 'square-1.json').write_bytes(content)
     assert numbers_run_again(tmp_path) == [1]
     assert numbers_run_again(tmp_path) == []
 
@@ -97,7 +92,7 @@ def test_a_job_whose_arguments_changed_is_repeated(tmp_path):
 
 def test_a_job_of_another_version_is_repeated(tmp_path):
     run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
-    file = ResultStore(tmp_path).path(JOBS[1])
+    file = tmp_path / 'square-1.json'
     file.write_text(json.dumps(json.loads(file.read_text()) | {'version': '0.0.0'}))
     assert numbers_run_again(tmp_path) == [1]
 
@@ -108,19 +103,31 @@ def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
         run_jobs(Worker(), JOBS, tmp_path, n_jobs=1)
 
 
+def test_a_result_may_be_infinite_or_missing(tmp_path):
+    calls = []
+
+    def work(number, of):
+        calls.append(number)
+        return {'mean': float('inf'), 'low': float('nan')}
+
+    for _ in range(2):
+        (result,) = run_jobs(work, JOBS[:1], tmp_path, n_jobs=1)
+        assert result['mean'] == float('inf') and result['low'] != result['low']
+    assert calls == [0]
+
+
 def test_a_failed_write_leaves_only_the_old_file(tmp_path, monkeypatch):
-    store = ResultStore(tmp_path)
-    store.write(JOBS[0], {'mean': float('inf')})
-    assert store.read(JOBS[0]) == {'mean': float('inf')}
+    run_jobs(Worker(), JOBS[:1], tmp_path, n_jobs=1)
+    (file,) = tmp_path.iterdir()
+    before = file.read_bytes()
 
     def full(*_):
         raise OSError('disk full')
 
     monkeypatch.setattr(os, 'replace', full)
     with pytest.raises(OSError, match='disk full'):
-        store.write(JOBS[0], {'mean': 1.0})
-    assert store.read(JOBS[0]) == {'mean': float('inf')}
-    assert list(tmp_path.iterdir()) == [store.path(JOBS[0])]
+        run_jobs(Worker(), [Job('square-0', {'number': 9, 'of': ()})], tmp_path, n_jobs=1)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [before]
 
 
 @pytest.mark.parametrize('n_jobs', [1, 2])
@@ -196,30 +203,24 @@ def test_jobs_run_on_a_dask_cluster(tmp_path, cluster):
 
 @pytest.fixture
 def two_workers(tmp_path):
-    """Address of a scheduler with two workers, three processes that belong together only by it."""
+    """Address of a scheduler with two workers, processes that it does not restart."""
     distributed = pytest.importorskip('distributed')
-    file, processes = tmp_path / 'scheduler.json', []
-
-    def start(module, *arguments):
-        processes.append(subprocess.Popen(
-            [sys.executable, '-m', f'distributed.cli.{module}', '--scheduler-file', str(file),
-             '--no-dashboard', *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            env=os.environ | {'OPENBLAS_NUM_THREADS': '1'}))
-
-    start('dask_scheduler', '--host', '127.0.0.1', '--port', '0')
-    for _ in range(2):
-        start('dask_worker', '--no-nanny', '--nthreads', '1', '--local-directory', str(tmp_path))
-    try:
-        with distributed.Client(scheduler_file=str(file), timeout=30, set_as_default=False) as (
-                client):
-            client.wait_for_workers(2, timeout=30)
-            address = client.scheduler.address
-        yield address
-    finally:
-        for process in processes:
-            process.kill()
-        for process in processes:
-            process.wait()
+    with distributed.LocalCluster(
+            n_workers=0, protocol='tcp', host='127.0.0.1', dashboard_address=':0') as empty:
+        workers = [subprocess.Popen(
+            [sys.executable, '-m', 'distributed.cli.dask_worker', empty.scheduler_address,
+             '--no-nanny', '--nthreads', '1', '--no-dashboard', '--local-directory',
+             str(tmp_path)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            env=os.environ | {'OPENBLAS_NUM_THREADS': '1'}) for _ in range(2)]
+        try:
+            with distributed.Client(empty, set_as_default=False) as client:
+                client.wait_for_workers(2, timeout=30)
+            yield empty.scheduler_address
+        finally:
+            for worker in workers:
+                worker.kill()
+            for worker in workers:
+                worker.wait()
 
 
 def test_a_cluster_that_loses_a_worker_gives_every_result(tmp_path, two_workers):
@@ -268,7 +269,7 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch, library, purpose):
 
 def test_results_are_plain_json(tmp_path):
     run_jobs(Worker(), JOBS[:1], tmp_path, n_jobs=1)
-    record = json.loads(ResultStore(tmp_path).path(JOBS[0]).read_text())
+    record = json.loads((tmp_path / 'square-0.json').read_text())
     assert record['arguments'] == {'number': 0, 'of': [1, 2]}
     assert record['result'] == {'square': 0}
 

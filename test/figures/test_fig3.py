@@ -1,6 +1,7 @@
 """Fig. 3: a trial, the report of synthetic trials, and the command."""
 
 import json
+import math
 import os
 
 import numpy as np
@@ -128,3 +129,23 @@ def test_the_command_writes_all_files_and_repeats_no_finished_trial(
     out = capsys.readouterr().out
     assert '(1) alternating reaches a lower CRLB' in out
     assert np.all([entry['samples'] == 10 for entry in figures['trials']])
+
+
+def test_mean_and_std_are_those_of_a_sample(fig3):
+    mean, std = fig3.mean_and_std([1.0, 2.0, 6.0])
+    assert mean == 3.0
+    assert std == pytest.approx(math.sqrt((4 + 1 + 9) / 2))
+
+
+@pytest.mark.parametrize('values', [[2.0], [1.0, math.inf], [math.inf, math.inf]])
+def test_an_undefined_deviation_is_nan(fig3, values):
+    mean, std = fig3.mean_and_std(values)
+    assert mean == np.mean(values)
+    assert math.isnan(std)
+
+
+@pytest.mark.parametrize(('mean', 'std', 'text'), [
+    (0.04057, 0.00123, '0.0406 ± 0.0012'), (12.345, 0.5, '12.3 ± 0.5'), (1234.5, 7.0, '1234 ± 7'),
+    (0.0, 0.0, '0.00 ± 0.00'), (-0.0512, math.nan, '-0.0512'), (math.inf, math.nan, 'inf')])
+def test_mean_and_deviation_have_the_same_places(fig3, mean, std, text):
+    assert fig3.plus_minus(mean, std) == text

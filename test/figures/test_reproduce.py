@@ -1,12 +1,11 @@
-"""The help of ``scripts/reproduce``: experiments, durations and common options."""
+"""``scripts/reproduce``: the help, and the options that all experiments share."""
 
 import ast
 import re
 import subprocess
+from pathlib import Path
 
 import pytest
-
-from rhs_isac_ros.experiments import parse_options
 
 FOLDER = 'scripts/figures'
 
@@ -28,6 +27,13 @@ def scripts(pytestconfig):
             for path in (pytestconfig.rootpath / FOLDER).glob('*.py')}
 
 
+@pytest.fixture(scope='module')
+def parse(load_figure):
+    """Callable that parses the arguments of an experiment."""
+    parse_options = load_figure('fig3').parse_options
+    return lambda *arguments: parse_options('About.', 'fig0', 30, 3, arguments)
+
+
 def test_the_help_describes_every_experiment_and_its_duration(reproduce, scripts):
     text = reproduce('--help')
     assert len(scripts) >= 4
@@ -37,9 +43,9 @@ def test_the_help_describes_every_experiment_and_its_duration(reproduce, scripts
         assert f'\n  {name}\n    {first}\n    Takes {duration}\n' in text
 
 
-def test_the_help_has_the_options_that_all_experiments_share(reproduce, capsys):
+def test_the_help_has_the_options_that_all_experiments_share(reproduce, parse, capsys):
     with pytest.raises(SystemExit, match='0'):
-        parse_options('About.', 'fig0', 30, 3, ['--help'])
+        parse('--help')
     options = set(re.findall(r'^  (--\w+)', capsys.readouterr().out, re.M))
     assert '--format' in options
     assert set(re.findall(r'^  (--\w+)', reproduce('--help'), re.M)) == options
@@ -47,3 +53,32 @@ def test_the_help_has_the_options_that_all_experiments_share(reproduce, capsys):
 
 def test_without_arguments_it_lists_the_names(reproduce, scripts):
     assert reproduce().split() == sorted(scripts)
+
+
+def test_defaults_are_those_of_the_full_run(parse):
+    options = parse()
+    assert (options.trials, options.quick, options.jobs, options.dask) == (30, False, -1, None)
+    assert (options.output, options.format) == (Path('results/fig0'), 'png')
+
+
+def test_quick_and_trials_set_the_number_of_trials(parse):
+    assert parse('--quick').trials == 3
+    assert parse('--trials', '7').trials == 7
+
+
+@pytest.mark.parametrize('arguments', [
+    ['--trials', '0'], ['--jobs', '-2'], ['--trials', 'x'],
+    ['--quick', '--trials', '3'], ['--magic']])
+def test_invalid_options_exit_with_code_2(parse, arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        parse(*arguments)
+    assert caught.value.code == 2
+    assert 'error: ' in capsys.readouterr().err
+
+
+def test_another_format_is_refused_with_the_expected_ones(parse, capsys):
+    with pytest.raises(SystemExit) as caught:
+        parse('--format', 'gif')
+    assert caught.value.code == 2
+    error = capsys.readouterr().err.replace("'", '')
+    assert 'argument --format: invalid choice: gif (choose from png, pdf, svg)' in error

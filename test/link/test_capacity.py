@@ -16,8 +16,8 @@ from rhs_isac_ros.link import (
 )
 from rhs_isac_ros.link.capacity import posterior_points
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.multipath import spatial_covariance
-from rhs_isac_ros.model.path_channel import PathChannel
 
 POSITION = np.array([9.0, 1.5, -0.4])
 # Long in range and short across, as are the posteriors of the shipped codebook.

@@ -21,9 +21,9 @@ from rhs_isac_ros.link import (
 )
 from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import matched_configuration, on_levels, onboard_matrix
-from rhs_isac_ros.model.surface_estimate import SurfaceEstimate
 
 POSITION = np.array([9.0, 1.5, -0.4])
 

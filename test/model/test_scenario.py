@@ -109,27 +109,27 @@ BAD = [
     ('n_frames', 5000, '5000', 'expected 1 to 4096'),
     ('elements_per_side', -1, '-1', 'expected 1 to 128'),
     ('subband_width_hz', 'wide', "'wide'", 'expected a number'),
-    ('subband_width_hz', 0, '0 Hz', 'expected 1 to 1e+10 Hz'),
+    ('subband_width_hz', 0, '0.0', 'expected 1 to 1e+10 Hz'),
     ('delay_spread_s', None, 'None', 'expected a number'),
-    ('delay_spread_s', -1e-6, '-1e-06 s', 'expected 0 to 1 s'),
-    ('element_gain', True, 'True', 'expected a finite number'),
-    ('max_power_w', math.nan, 'nan', 'expected a finite number'),
-    ('max_power_w', math.inf, 'inf', 'expected a finite number'),
-    ('max_power_w', 0, '0 W', 'expected 1e-15 to 1e+06 W'),
+    ('delay_spread_s', -1e-6, '-1e-06', 'expected 0 to 1 s'),
+    ('element_gain', True, 'True', 'expected a number'),
+    ('max_power_w', math.nan, 'nan', 'expected 1e-15 to 1e+06 W'),
+    ('max_power_w', math.inf, 'inf', 'expected 1e-15 to 1e+06 W'),
+    ('max_power_w', 0, '0.0', 'expected 1e-15 to 1e+06 W'),
     ('refractive_index', 0.5, '0.5', 'expected 1 to 100'),
     ('center_frequencies_hz', 3e9, '3000000000.0', 'expected a list of numbers'),
     ('center_frequencies_hz', [], '[]', 'expected a list of numbers'),
     ('center_frequencies_hz', [3e9, 'x'], "'x'", 'expected a number'),
-    ('center_frequencies_hz', [1.0], '1 Hz', 'expected 1e+06 to 1e+13 Hz'),
+    ('center_frequencies_hz', [1.0], '1.0', 'expected 1e+06 to 1e+13 Hz'),
     ('roi_center_m', [1, 2], '2 values', 'expected a list of 3 numbers'),
     ('roi_size_m', [1, 2, 3, 4], '4 values', 'expected a list of 3 numbers'),
     ('roi_size_m', '123', "'123'", 'expected a list of 3 numbers'),
     ('elements_per_side', [4, 5, 6], '[4, 5, 6]', 'expected an integer or two'),
     ('elements_per_side', [4, 2.5], '2.5', 'expected an integer'),
     ('elements_per_side', [4, 129], '129', 'expected 1 to 128'),
-    ('roi_size_m', [1, -1, 1], '-1 m', 'expected 0 to 1e+06 m'),
+    ('roi_size_m', [1, -1, 1], '-1.0', 'expected 0 to 1e+06 m'),
     ('roi_size_m', [0, 0, 0], '(0.0, 0.0, 0.0)', 'expected at least one length above 0'),
-    ('multipath_direction_deg', [91, 0], '91 deg', 'expected -90 to 90 deg'),
+    ('multipath_direction_deg', [91, 0], '91.0', 'expected -90 to 90 deg'),
     ('multipath_direction_deg', [0, 0, 0], '3 values', 'expected a list of 2 numbers'),
     ('center_frequencies_hz', [3e9, 2e9, 2.0005e9], '2e+09 and 2.0005e+09 Hz',
      'expected at least 1e+06 Hz apart'),
@@ -141,7 +141,7 @@ BAD = [
     ('roi_center_m', [5, 0, 0], '(5.0, 0.0, 0.0)', 'expected x > 0'),
     ('roi_center_m', [-10, 0, 0], '(-10.0, 0.0, 0.0)', 'expected x > 0'),
     ('amplitude_levels', 1, '1', 'expected 0 for continuous amplitudes, or at least 2'),
-    ('user_gain_std_db', -1, '-1 dB', 'expected 0 to 60 dB'),
+    ('user_gain_std_db', -1, '-1.0', 'expected 0 to 60 dB'),
     ('multipath', 1.0, '1.0', 'expected the path of a file, or null'),
     ('channel', True, 'True', 'expected the path of a file, or null'),
     ('channel', 'none.npz', 'none.npz', 'cannot be read'),
@@ -163,10 +163,10 @@ def test_message_names_field_value_and_expectation(field, value, shown, expected
     'field', [field for field in dataclasses.fields(Scenario)
               if field.name not in ('multipath', 'channel')], ids=lambda field: field.name)
 def test_values_just_outside_the_bounds_are_errors(field, plugin):
+    low, high = field.metadata['declared'].low, field.metadata['declared'].high
     if isinstance(field.default, int):
-        outside = (field.metadata['low'] - 1, field.metadata['high'] + 1)
+        outside = (low - 1, high + 1)
     else:
-        low, high = field.metadata['low'], field.metadata['high']
         outside = (np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
     for value in outside:
         if field.name == 'feed_positions_m':
@@ -251,7 +251,7 @@ def test_an_empty_file_is_table_1(tmp_path):
     ('n_feeds', ['expected a mapping of field names to values']),
     ('n_feeds: [', ['cannot be read']),
     ('n_feeds: 3e0', ["n_feeds: '3e0'", 'expected an integer']),
-    ('max_power_w: -28e9', ['max_power_w: -2.8e+10 W', 'expected 1e-15 to 1e+06 W']),
+    ('max_power_w: -28e9', ['max_power_w: -28000000000.0', 'expected 1e-15 to 1e+06 W']),
     ('roi_center_m: [1, 2]', ['roi_center_m: 2 values', 'expected a list of 3 numbers']),
     ('max_power_w: 2023-99-99', ['cannot be read']),
 ])
@@ -336,9 +336,10 @@ class TestImpairments:
             f'impairments: {value!r}, expected a mapping of names to strengths')
 
     @pytest.mark.parametrize(('strength', 'error'), [
-        ('strong', "'strong', expected a number"), (None, 'None, expected a number'),
-        ([1], r'\[1\], expected a number'), (True, 'True, expected a finite number'),
-        (math.nan, 'nan, expected a finite number'), (-0.1, '-0.1, expected 0 to 1e[+]300')])
+        ('strong', "'strong', expected a number, 0 to 1e[+]300"),
+        (None, 'None, expected a number, 0 to 1e[+]300'),
+        (True, 'True, expected a number, 0 to 1e[+]300'),
+        (math.nan, 'nan, expected 0 to 1e[+]300'), (-0.1, '-0.1, expected 0 to 1e[+]300')])
     def test_a_strength_that_is_no_number_in_range_is_an_error(self, plugin, strength, error):
         with pytest.raises(ScenarioError, match=f'^impairments: {error}$'):
             Scenario(impairments={plugin: strength})

@@ -8,7 +8,7 @@ import pytest
 
 from rhs_isac_ros.monitoring.cycle_log import RECEIVES, CompleteCycle, CycleLog
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 
 
 def log_of(*networks, without=()):

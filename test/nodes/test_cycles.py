@@ -13,11 +13,12 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.receive import receive_feeds
+from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import check
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 SCENARIO = Scenario()
 SIZES = SCENARIO.sizes
@@ -255,7 +256,7 @@ def set_prior(watch, prior):
 def test_users_that_leave_and_return_elsewhere_are_tracked(network, join, processes):
     watch, tracks = network.watch, {1: [], 3: []}
     subscriptions = [watch.node.create_subscription(
-        Odometry, topics.ODOMETRY.format(user=user), of_user.append, qos.EXCHANGE)
+        Odometry, topics.ODOMETRY.format(user=user), of_user.append, EXCHANGE)
         for user, of_user in tracks.items()]
 
     def follows(user, place, since=0):

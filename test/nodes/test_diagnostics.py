@@ -4,7 +4,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.roster import UNIQUE
 
 NODES = {*UNIQUE, 'user_1'}
@@ -18,7 +19,7 @@ def test_every_node_reports_phase_cycles_drops_and_codebook(processes, make_watc
         for status in message.status:
             reported[status.name.removeprefix('diagnosed/')] = status
     watch.node.create_subscription(
-        DiagnosticArray, topics.DIAGNOSTICS, store, qos.EXCHANGE)
+        DiagnosticArray, topics.DIAGNOSTICS, store, EXCHANGE)
     network = processes.start(
         'network', namespace='/diagnosed', users=1, rest_s=0.0,
         scenario_file=small_files / 'scenario.yaml', codebook_file=small_files / 'first.yaml')

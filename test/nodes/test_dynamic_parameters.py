@@ -13,7 +13,8 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Network
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 NAMESPACE = 'dynamic'
 
@@ -26,7 +27,7 @@ class Running:
         self.diagnostics = {}
         self._clients = {}
         watch.node.create_subscription(
-            DiagnosticArray, topics.DIAGNOSTICS, self._store, qos.EXCHANGE)
+            DiagnosticArray, topics.DIAGNOSTICS, self._store, EXCHANGE)
 
     def _store(self, message):
         for status in message.status:
@@ -112,7 +113,7 @@ def test_changes_of_policy_and_noise_are_reported(running):
     ('positioner', {'estimator': 'neural'}, "model_file: '', expected a trained model"),
     ('positioner', {'estimator': 'ml', 'prior': 'track'}, "prior: 'track', expected 'region'"),
     ('transmission', {'band': 7}, 'band: 7, expected 0 to 1 of the scenario'),
-    ('channel', {'loss_probability': 1.5}, 'loss_probability: 1.5, expected a number'),
+    ('channel', {'loss_probability': 1.5}, 'loss_probability: 1.5, expected 0 to 1'),
     ('user_1', {'speed_mps': 2.0}, 'Trying to set a read-only parameter: speed_mps'),
 ])
 def test_an_invalid_value_is_rejected_with_the_reason(running, node, values, reason):
@@ -141,7 +142,7 @@ def test_users_are_tracked_on_request(running):
     watch, before, tracks = running.watch, len(running.watch.given_up), []
     for user in (1, 2):
         watch.node.create_subscription(
-            Odometry, topics.ODOMETRY.format(user=user), tracks.append, qos.EXCHANGE)
+            Odometry, topics.ODOMETRY.format(user=user), tracks.append, EXCHANGE)
     assert running.set('positioner', prior='track').successful
     running.until_reported('positioner', parameter__prior='track', pending__prior=None)
 

@@ -3,11 +3,16 @@
 import gc
 import importlib
 import signal
+from pathlib import Path
 
 import pytest
+import yaml
 from rclpy.node import Node
 
 from rhs_isac_ros.ros import run
+from rhs_isac_ros.ros.parameters import NODES
+
+CONFIG = Path(__file__).parents[2] / 'config'
 
 CASES = {
     'type': ('bs', {'seed': 'abc'}, ['seed', "'abc'", 'expected an integer']),
@@ -148,6 +153,29 @@ def test_a_file_with_the_parameters_of_several_nodes_is_valid(executable, files,
     with pytest.raises(AssertionError, match='the executable starts'):
         importlib.import_module(f'rhs_isac_ros.nodes.{executable}').main(
             ['--ros-args', '--params-file', str(files / 'shared.yaml')])
+
+
+# With the name of the node, which selects a section of the file.
+@pytest.mark.parametrize(('executable', 'name'), [
+    *((name, name) for name in ('bs', 'positioner', 'channel', 'visualizer', 'network')),
+    ('user', 'user_1'), ('user', 'user_2')])
+def test_the_file_to_copy_is_valid(executable, name, never_spins, capfd):
+    with pytest.raises(AssertionError, match='the executable starts'):
+        importlib.import_module(f'rhs_isac_ros.nodes.{executable}').main(
+            ['--ros-args', '--params-file', str(CONFIG / 'parameters.yaml'),
+             *(['-r', f'__node:={name}'] if executable == 'user' else [])])
+    assert 'WARN' not in capfd.readouterr().err
+
+
+def test_the_file_to_copy_contains_known_parameters_at_their_defaults():
+    sections = yaml.safe_load((CONFIG / 'parameters.yaml').read_text(encoding='utf-8'))
+    for section, content in sections.items():
+        # Users have the names user_<n>.
+        owner = section.removeprefix('/**').lstrip('/').partition('_')[0] or 'positioner'
+        declared = {parameter.name: parameter.default for parameter in NODES[owner]}
+        for name, value in content['ros__parameters'].items():
+            # The users of the file move, and a list without elements has no type.
+            assert value == declared[name] or name in ('mobility', 'surface_pose')
 
 
 def test_a_foreign_entry_of_a_file_is_ignored_with_a_warning(files, never_spins, capfd):

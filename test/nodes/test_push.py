@@ -11,7 +11,8 @@ from rclpy.node import Node
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.nodes.optimizer import PushError, push
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import LATCHED
 
 
 @pytest.fixture(scope='module')
@@ -23,7 +24,7 @@ def network(make_watch, module_processes, small_files):
     watch, ids = make_watch('/push'), []
     watch.node.create_subscription(
         ros.Codebook, topics.CODEBOOK, lambda message: ids.append(message.codebook_id),
-        qos.LATCHED)
+        LATCHED)
     watch.until(lambda: ids, 'the codebook', [process])
     return process, watch, ids
 
@@ -99,7 +100,7 @@ def test_with_options_the_command_optimises_writes_and_holds(
         '--method', 'directional', '--positions', '8', '--quiet', '--output', output,
         '--scenario', small_files / 'scenario.yaml'))
     watch, received = make_watch('/hold'), []
-    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, received.append, qos.LATCHED)
+    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, received.append, LATCHED)
     watch.until(lambda: received, 'the codebook', [process])
     written = Codebook.load(output)
     assert received[0].codebook_id == written.id

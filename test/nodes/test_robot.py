@@ -17,7 +17,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from rhs_isac_msgs.action import Locate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.frames import Frame
 
 # The surface is turned by 90 degrees about z, and moved.
@@ -82,9 +83,9 @@ def driven(request, make_processes, make_watch):
         robot = Robot(watch.node, request.param)
         poses, reports = [], []
         watch.node.create_subscription(
-            PoseWithCovarianceStamped, topics.POSE.format(user=2), poses.append, qos.EXCHANGE)
+            PoseWithCovarianceStamped, topics.POSE.format(user=2), poses.append, EXCHANGE)
         watch.node.create_subscription(
-            DiagnosticArray, topics.DIAGNOSTICS, reports.append, qos.EXCHANGE)
+            DiagnosticArray, topics.DIAGNOSTICS, reports.append, EXCHANGE)
         running = [
             processes.start('network', namespace=space, users=1, rest_s=0.0, use_sim_time=True,
                             mobility='waypoints', speed_mps=1.0, ground_truth_period_s=0.01,

@@ -2,6 +2,8 @@
 
 import random
 import signal
+import subprocess
+import sys
 import types
 
 import pytest
@@ -63,3 +65,23 @@ def test_repeated_signals_end_the_process_with_exit_code_0(processes, make_watch
     while process.running:
         process.signal(signal.SIGINT)
     assert process.wait() == 0, process.log
+
+
+def test_a_process_ends_although_the_destruction_of_its_node_never_does():
+    code = '''
+import threading
+from rclpy.node import Node
+from rhs_isac_ros.ros import run
+
+
+class Stuck(Node):
+    def destroy_node(self):
+        threading.Event().wait()
+
+
+run._DESTRUCTION_S = 1
+run.run(lambda: [Stuck('stuck')], done=lambda: True)
+'''
+    done = subprocess.run([sys.executable, '-c', code], timeout=60, check=False,
+                          capture_output=True, text=True)
+    assert done.returncode == -signal.SIGALRM, done.stderr

@@ -10,7 +10,8 @@ from rclpy.parameter_client import AsyncParameterClient
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import qos, topics
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 NAMESPACE = '/surroundings'
 # A small region and enough measurements for a clear decision.
@@ -60,7 +61,7 @@ def test_users_outside_get_no_fix_and_deviations_cause_a_warning(network):
 
     def store(message):
         reported.extend(status for status in message.status if status.name.endswith('positioner'))
-    watch.node.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, store, qos.EXCHANGE)
+    watch.node.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, store, EXCHANGE)
     watch.until(lambda: walked_out_and_in(watch), 'fixes, no fix, and fixes again', processes)
     reasons = [message.reason for message in answers(watch) if isinstance(message, m.NoFix)]
     assert sum(reason.startswith(REASON) for reason in reasons) > len(reasons) / 2

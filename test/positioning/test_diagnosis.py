@@ -1,15 +1,269 @@
-"""The likely cause of signals without a position."""
+"""Whether signals fit the model: those of one phase, and of the latest cycles."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
+from scipy.stats import chi2, gamma
 
 from rhs_isac_ros.model import Scenario, simulate_received
-from rhs_isac_ros.positioning import Estimate, make_estimator
-from rhs_isac_ros.positioning.alternatives import Blocked, describe_doubts
-from rhs_isac_ros.positioning.diagnosis import LEVEL, SPREAD, Diagnosis
-from rhs_isac_ros.positioning.innovation_test import MIN_FIXES, WINDOW
+from rhs_isac_ros.positioning import Estimate, make_estimator, simulate_pairs
+from rhs_isac_ros.positioning.alternatives import (
+    OUTSIDE_LIMIT,
+    Blocked,
+    Outside,
+    describe_doubts,
+    rejection,
+)
+from rhs_isac_ros.positioning.diagnosis import (
+    FALSE_ALARM,
+    LEVEL,
+    MIN_FIXES,
+    MIN_RETURN,
+    SPREAD,
+    WINDOW,
+    Diagnosis,
+    FitTest,
+    InnovationTest,
+)
+
+
+@pytest.fixture(scope='module', params=['bayes', 'ml'])
+def setting(request, random_beams):
+    """A scenario with strong signals, a codebook and an estimator."""
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9, 2.7e9, 3.3e9), elements_per_side=6, angular_spread_deg=2.0,
+        roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1))
+    codebook = random_beams(scenario, np.random.default_rng(1))
+    return scenario, codebook, make_estimator(request.param, scenario, codebook)
+
+
+def assert_no_fix(estimate, message):
+    assert not estimate.fix.any()
+    assert np.isnan(estimate.mean).all()
+    assert np.isnan(estimate.covariance).all()
+    reasons = [estimate.reason] if isinstance(estimate.reason, str) else estimate.reason
+    assert len(reasons) == np.size(estimate.fix)
+    for reason in reasons:
+        assert message in reason
+        assert 'expected at ' in reason
+
+
+def test_limits_are_quantiles_of_the_chi_square_distribution():
+    test = FitTest(64)
+    assert 2 * test.min_energy == pytest.approx(chi2.ppf(FALSE_ALARM, 128))
+    assert 2 * test.max_residual == pytest.approx(chi2.isf(FALSE_ALARM, 128))
+    for check, limit, sign in ((test.min_energy_test, test.min_energy, -1),
+                               (test.residual_test, test.max_residual, 1)):
+        assert check(limit * (1 - 1e-6 * sign)) == ''
+        assert check(limit * (1 + 1e-6 * sign)) != ''
+
+
+def test_weak_signals_are_a_direct_path_or_nothing():
+    """Multipath may be weaker than in the model, as in an empty hall."""
+    test = FitTest(64)
+    assert test.weak_test(1.0, 0.1) == ''
+    assert test.weak_test(test.min_energy, 1e3) == ''
+    assert 'expected at most 0.723 of signals weaker' in test.weak_test(1.0, 0.8)
+
+
+def test_users_without_multipath_keep_their_fix(setting):
+    scenario, codebook, estimator = setting
+    empty = dataclasses.replace(scenario, multipath_to_los_db=-60.0)
+    positions = scenario.sample_positions(60, np.random.default_rng(5))
+    received = simulate_received(empty, codebook, positions, np.random.default_rng(6))
+    estimate = estimator.estimate(received)
+    assert estimate.fix.all()
+    errors = estimate.mean - positions
+    distances = np.einsum(
+        'na,na->n', errors, np.linalg.solve(estimate.covariance, errors[..., None])[..., 0])
+    assert np.mean(distances <= chi2.ppf(0.95, 3)) > 0.95
+
+
+def test_the_largest_energy_is_that_of_the_strongest_position_with_noise():
+    test = FitTest(64)
+    limit = (np.sqrt(500.0) + np.sqrt(test.max_residual))**2
+    assert test.max_energy_test(limit * 0.999, 500.0) == ''
+    assert f'expected at most {limit:.3g}' in test.max_energy_test(limit * 1.001, 500.0)
+
+
+@pytest.mark.parametrize('factor', [0.0, 1e-30, 1e-3], ids=str)
+def test_signals_weaker_than_noise_give_no_fix(setting, factor):
+    scenario, codebook, estimator = setting
+    received = factor * simulate_pairs(scenario, codebook, 1, 0)[1][0]
+    assert_no_fix(estimator.estimate(received), 'energy')
+
+
+@pytest.mark.parametrize('position', [(4.0, 0.0, 1.5), (4.0, -3.0, 0.0), (2.0, 0.0, 0.0)], ids=str)
+def test_a_user_far_outside_the_region_gives_no_fix(setting, position):
+    scenario, codebook, estimator = setting
+    received = simulate_received(
+        scenario, codebook, np.tile(position, (4, 1)), np.random.default_rng(0))
+    assert_no_fix(estimator.estimate(received), 'residual')
+
+
+def test_signals_of_another_codebook_give_no_fix(setting, random_beams):
+    scenario, _, estimator = setting
+    other = random_beams(scenario, np.random.default_rng(2))
+    assert_no_fix(estimator.estimate(simulate_pairs(scenario, other, 20, 0)[1]), 'residual')
+
+
+@pytest.mark.parametrize('change', [
+    lambda received: 3 * received,
+    lambda received: received.conj(),
+    lambda received: received[:, ::-1],
+    lambda received: received * np.exp(2j * np.pi * np.arange(received.shape[2]) / 7),
+], ids=['amplified', 'conjugate', 'bands swapped', 'rotating phase'])
+def test_distorted_signals_give_no_fix(setting, change):
+    scenario, codebook, estimator = setting
+    received = simulate_pairs(scenario, codebook, 20, 0)[1]
+    assert_no_fix(estimator.estimate(change(received)), 'residual')
+
+
+def test_a_user_who_is_almost_certainly_outside_is_rejected():
+    assert rejection(Outside, OUTSIDE_LIMIT) == ''
+    assert rejection(Outside, 0.995) == (
+        'position outside of the region: probability 0.995, expected at most 0.99')
+
+
+def test_valid_signals_are_located_beside_invalid_ones(setting):
+    scenario, codebook, estimator = setting
+    positions, received = simulate_pairs(scenario, codebook, 6, 0)
+    expected = estimator.estimate(received)
+    received[[1, 4]] = 0
+    estimate = estimator.estimate(received)
+    assert estimate.fix.tolist() == [True, False, True, True, False, True]
+    # Sums over a batch depend on its size in the last digits.
+    np.testing.assert_allclose(
+        estimate.mean[estimate.fix], expected.mean[estimate.fix], rtol=0, atol=1e-9)
+    assert [bool(reason) for reason in estimate.reason] == (~estimate.fix).tolist()
+    assert np.linalg.norm(estimate.mean - positions, axis=1)[estimate.fix].max() < 0.1
+
+
+def test_all_valid_signals_are_located(table1_estimator, shipped):
+    """Signals of Table I are weak or strong; each test rejects one in 10^9."""
+    received = simulate_pairs(Scenario(), shipped, 300, 5)[1]
+    assert table1_estimator.estimate(received).fix.all()
+
+
+EXPECTED = 62.5
+
+
+def energies(n, scale=1.0, seed=0):
+    """Residuals of a model whose covariance is too small by a factor."""
+    return scale * gamma(EXPECTED).rvs(n, random_state=np.random.default_rng(seed))
+
+
+def filled(values):
+    test = InnovationTest()
+    for value in values:
+        test.add(float(value), EXPECTED)
+    return test
+
+
+def test_residuals_of_the_model_cause_no_warning():
+    test = InnovationTest()
+    for value in energies(5000):
+        test.add(float(value), EXPECTED)
+        assert not test.drifts
+    assert test.n_fixes == WINDOW
+    assert test.ratio == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize('scale', [0.93, 1.07])
+def test_slightly_wrong_residuals_cause_a_warning_after_some_fixes(scale):
+    values = energies(4 * WINDOW, scale)
+    assert not filled(values[:MIN_FIXES]).drifts
+    # A small deviation does not come and go.
+    for n in range(1, 5):
+        test = filled(values[:n * WINDOW])
+        assert test.drifts
+        assert test.ratio == pytest.approx(scale, abs=0.03)
+
+
+def test_residuals_that_vary_too_much_cause_a_warning():
+    """Their mean alone would not: most of the excess of a few phases is made up by others."""
+    values = energies(WINDOW)
+    mean = EXPECTED * 1.02
+    test = filled(mean + 1.6 * (values - EXPECTED))
+    assert test.drifts
+    assert test.spread == pytest.approx(1.6**2, abs=0.4)
+    assert not filled(mean + values - EXPECTED).drifts
+
+
+@pytest.mark.parametrize('shape', [1.0, 10.0, 62.5])
+def test_the_variance_of_the_model_causes_no_warning(shape):
+    """Energies of few measurements have a skewed distribution."""
+    rng = np.random.default_rng(4)
+    for window in rng.standard_gamma(shape, (200, MIN_RETURN)):
+        test = InnovationTest(MIN_RETURN)
+        for value in window:
+            test.add(float(value), shape)
+            assert not test.drifts
+
+
+def test_few_residuals_are_not_judged():
+    assert not filled([1e6] * (MIN_FIXES - 1)).drifts
+    assert filled([1e6] * MIN_FIXES).drifts
+
+
+@pytest.mark.parametrize('window', [-1, 0, MIN_RETURN - 1])
+def test_a_window_without_an_end_of_warnings_is_an_error(window):
+    with pytest.raises(ValueError, match=f'^window: {window}, expected at least {MIN_RETURN}$'):
+        InnovationTest(window)
+
+
+def test_a_single_signal_causes_no_warning():
+    assert not filled([*energies(MIN_FIXES), 1e9]).drifts
+    assert not filled([*energies(MIN_FIXES), -1e9]).drifts
+
+
+def test_a_warning_ends_after_some_residuals_of_the_model():
+    values = energies(3 * MIN_RETURN)
+    bad = energies(WINDOW, 2.0)
+    assert filled([*bad, *values[:MIN_RETURN // 2]]).drifts
+    test = filled([*bad, *values])
+    assert not test.drifts
+    # What preceded the end of the warning is forgotten.
+    assert test.n_fixes < WINDOW
+    assert filled([*bad, *values, *energies(MIN_RETURN, 2.0, 1)]).drifts
+
+
+def test_residuals_are_forgotten_on_request():
+    test = filled(energies(WINDOW, 2.0))
+    test.clear()
+    assert not test.drifts
+    assert test.n_fixes == 0
+    assert math.isnan(test.ratio)
+    assert math.isnan(test.spread)
+
+
+@pytest.mark.parametrize(('energy', 'expected'), [
+    (math.nan, EXPECTED), (1e6, math.nan), (math.nan, math.nan)])
+def test_estimates_without_a_residual_or_an_expectation_are_ignored(energy, expected):
+    test = InnovationTest()
+    for _ in range(WINDOW):
+        test.add(energy, expected)
+    assert not test.drifts
+    assert test.n_fixes == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('reject_outside', [False, True])
+def test_the_expectation_accounts_for_the_choice_of_the_best_mode(
+        small, random_beams, reject_outside):
+    """With few measurements, there are many modes, of which the best leaves less energy."""
+    codebook = random_beams(small.scenario, np.random.default_rng(0))
+    estimator = make_estimator('bayes', small.scenario, codebook, reject_outside=reject_outside)
+    estimate = estimator.estimate(simulate_pairs(small.scenario, codebook, 400, 1)[1])
+    known = np.isfinite(estimate.expected_residual)
+    residual, expected = estimate.residual[known], estimate.expected_residual[known]
+    error = 4 * residual.std() / np.sqrt(len(residual))
+    assert residual.mean() == pytest.approx(expected.mean(), abs=0.5 + error)
+    n_measurements = codebook.digital[..., 0].size
+    assert (expected <= n_measurements - 1.5).all()
+
 
 N_USERS = 100
 

@@ -9,17 +9,17 @@ from rhs_isac_ros.positioning.estimate import checked_received
 
 def test_signals_of_one_phase_become_a_batch_of_one(small):
     signals = np.arange(12).reshape(2, 1, 6)
-    batch = checked_received(small.scenario, small.codebook, signals)
+    batch = checked_received(small.codebook, signals)
     assert batch.dtype == complex
     np.testing.assert_array_equal(batch, signals)
-    single = checked_received(small.scenario, small.codebook, signals[1].tolist())
+    single = checked_received(small.codebook, signals[1].tolist())
     np.testing.assert_array_equal(single, signals[1:])
 
 
 @pytest.mark.parametrize('shape', [(6,), (1, 5), (2, 6), (6, 1), (1, 1, 1, 6), ()])
 def test_the_error_for_another_shape_names_field_shape_and_expectation(small, shape):
     with pytest.raises(SignalError) as caught:
-        checked_received(small.scenario, small.codebook, np.zeros(shape))
+        checked_received(small.codebook, np.zeros(shape))
     message = str(caught.value)
     assert message.startswith(f'received: shape {shape}, expected [N_B, N_SB F] = (1, 6)')
 
@@ -29,4 +29,4 @@ def test_values_that_are_not_finite_are_errors(small, value):
     signals = np.zeros((3, 1, 6), complex)
     signals[1, 0, 4] = value
     with pytest.raises(SignalError, match='^received: not finite, expected finite signals'):
-        checked_received(small.scenario, small.codebook, signals)
+        checked_received(small.codebook, signals)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.impairments import DeclaredElements, ElementErrors, nuisance_of
+from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
+from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.positioning.coordinates import jacobian, to_polar
 from rhs_isac_ros.positioning.failures import FailureModel, FailureSearch, can_enumerate
@@ -103,7 +104,7 @@ def test_the_likelihood_has_the_moments_of_surfaces_with_a_given_set(codebook, m
     average = np.linalg.slogdet(MeasurementModel(SCENARIO, codebook).covariance())[1].sum()
     assert local.value[0] == pytest.approx(log_prior - energy - volume + average, rel=1e-6)
 
-    value, deviance = model.weigh(model.surface(failed), model.site(POINT, NO_VALUES, signals))
+    value, deviance = model.weigh(failed, model.site(POINT, NO_VALUES, signals))
     # The step exceeds no limit here.
     gain = gradient @ np.linalg.solve(information + floor, gradient) / 2
     prior = 2 * np.log(0.02 / 0.98)
@@ -153,22 +154,23 @@ def tolerance(model):
 
 def test_a_further_failure_is_weighed_as_the_larger_set(weighing):
     model, site = weighing
-    values = model.weigh_extensions(model.surface((5, 20)), site)
+    values = model.weigh_extensions((5, 20), site)
     for element in (0, 12, 35):
-        surface = model.surface(tuple(sorted((5, 20, element))))
-        assert values[element] == pytest.approx(model.weigh(surface, site)[0], **tolerance(model))
+        larger = tuple(sorted((5, 20, element)))
+        assert values[element] == pytest.approx(model.weigh(larger, site)[0], **tolerance(model))
 
 
 def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
     model, site = weighing
-    values = model.weigh_extensions(model.surface((5,)), site, 0.3)
+    values = model.weigh_extensions((5,), site, 0.3)
     remainder = 0.3 * DeclaredElements(SCENARIO).error_covariance(SCENARIO, codebook)
     for element in (0, 35):
-        surface = model.surface(tuple(sorted((5, element))))
+        failed = tuple(sorted((5, element)))
+        surface = model.surface(failed)
         larger = surface._replace(covariance=surface.covariance + remainder)
         whitening = larger.whitening(model.likelihood.nuisance)
         monkeypatch.setattr(model, '_whitening', lambda _, whitening=whitening: whitening)
-        assert values[element] == pytest.approx(model.weigh(larger, site)[0], **tolerance(model))
+        assert values[element] == pytest.approx(model.weigh(failed, site)[0], **tolerance(model))
 
 
 def test_the_second_search_follows_the_covariance_of_a_set(codebook):
@@ -237,7 +239,7 @@ def test_sets_grow_to_the_true_one_or_to_one_that_is_more_probable(ambiguous):
         failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
         search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
         search.grow(sites, 0.3)
-        true, _ = ambiguous.weigh(ambiguous.surface(failed), search.sites[0])
+        true, _ = ambiguous.weigh(failed, search.sites[0])
         assert search.values[search.best] >= true - 1e-6
 
 
@@ -247,7 +249,7 @@ def test_without_a_remainder_the_growth_often_ends_with_another_set(ambiguous):
         failed = tuple(sorted(rng.choice(36, 3, replace=False).tolist()))
         search, sites = search_at_the_truth(ambiguous, sample_with(ambiguous, failed, seed))
         search.grow(sites, n_extended=1)
-        true, _ = ambiguous.weigh(ambiguous.surface(failed), search.sites[0])
+        true, _ = ambiguous.weigh(failed, search.sites[0])
         missed += search.values[search.best] < true - 1.0
     assert missed > 0
 

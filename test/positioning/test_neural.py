@@ -73,7 +73,7 @@ def test_the_pairs_are_split_7_to_1_5_to_1_5(scenario, codebook, training):
             mse(network, scenario, codebook, begin, end - begin), rel=1e-4)
     best = min(epochs, key=lambda epoch: epoch.validation_mse_m2)
     assert about['epochs'] == best.number
-    assert about['validation_mse_m2'] == best.validation_mse_m2 == epochs[-1].best_mse_m2
+    assert about['validation_mse_m2'] == best.validation_mse_m2
 
 
 def test_the_covariance_matches_the_validation_residuals(scenario, codebook, training):
@@ -197,7 +197,7 @@ def test_the_command_writes_the_network_that_train_returns(files, scenario, code
     assert written.about == expected.about
     out, err = capsys.readouterr()
     assert f'{expected.about["test_mse_m2"]:.3f} m^2 in the test' in out
-    assert 'epoch 2' in err
+    assert '2/2' in err or 'epoch 2' in err
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

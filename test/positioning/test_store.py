@@ -9,7 +9,7 @@ import pytest
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.positioning import grid, make_estimator, simulate_pairs, store
-from rhs_isac_ros.positioning.outside import tabulate_outside
+from rhs_isac_ros.positioning.alternatives import tabulate_outside
 
 
 @pytest.fixture(scope='module')

@@ -9,11 +9,11 @@ import pytest
 from in_memory_network import feed
 
 from rhs_isac_ros.link import Beam, capacity, steer
+from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.path_channel import PathChannel
 from rhs_isac_ros.model.surface import onboard_matrix
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.channel import Channel, ImpairedChannel
+from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.events import SettingsOffered
 from rhs_isac_ros.protocol.settings import Impairments
 
@@ -246,9 +246,8 @@ def test_a_deviation_changes_the_signals_and_can_be_switched_off(scenario, codeb
     assert not np.allclose(received(declared, codebooks[0], 1, 4), plain, rtol=1e-3)
 
 
-def test_a_new_deviation_of_the_impaired_channel_applies_from_the_next_cycle(scenario, codebooks):
-    channel = ImpairedChannel(
-        make_deviating(scenario), Impairments(), np.random.default_rng(0))
+def test_a_new_deviation_applies_from_the_next_cycle(scenario, codebooks):
+    channel = make_deviating(scenario)
     before = received(channel, codebooks[0], 1, 1)
     channel.handle(SettingsOffered(Impairments(phase_std_rad=7.0)), 0.0)
     ((again,),) = feed(channel, [pilots_of(scenario, 1, 1)])

@@ -3,7 +3,7 @@
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 
 IN_A_CYCLE = [State.BEACONING, State.CONFIGURING, State.SOUNDING, State.ESTIMATING,
               State.STEERING, State.TRANSMITTING]

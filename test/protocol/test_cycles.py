@@ -11,7 +11,7 @@ from rhs_isac_ros.link import Beam, capacity, choose_beam, expected_capacity, st
 from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 
 PACKAGE = Path(rhs_isac_ros.__file__).parent
 # Messages of one cycle with two bands of two frames.

@@ -7,7 +7,7 @@ import pytest
 from system.invariants import RECEIVES, InvariantChecker
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import PauseRequested, PeersChanged, Resumed, StoodBy
 
 

@@ -14,7 +14,7 @@ from rhs_isac_ros.link import Beam, CapacityReport
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import transmission
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 
 STEP_S, ACK_S, REST_S = 0.2, 0.05, 0.08
 # Duration of the faults, and the time within which every user must be served after it.

@@ -9,7 +9,7 @@ from in_memory_network import LosesFirst, matches
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import INVITED
+from rhs_isac_ros.protocol.user_registry import INVITED
 
 N_USERS = 2 * INVITED
 

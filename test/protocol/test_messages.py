@@ -53,6 +53,15 @@ def test_messages_are_the_same_if_all_fields_are_equal(example):
     assert not m.same(m.Ack(cycle_id=1, user=2), m.Grant(cycle_id=1, user=2))
 
 
+def test_a_message_takes_the_fields_of_its_cycle_from_another():
+    request = m.PilotRequest(cycle_id=3, user=2, user_instance=5, band=1, last_band=1, n_frames=2,
+                             sender=9, scenario_id='sc', stamp_ns=7)
+    pilot = m.derive(m.Pilot, request, symbols=np.ones(2, complex))
+    assert (pilot.cycle_id, pilot.user, pilot.band) == (3, 2, 1)
+    assert (pilot.sender, pilot.scenario_id, pilot.stamp_ns) == (0, '', 0)
+    assert m.derive(m.Pilot, request, band=0, symbols=pilot.symbols).band == 0
+
+
 def test_events_without_arrays_compare_by_value():
     assert Timeout() == Timeout()
     assert PeersChanged(('a',)) == PeersChanged(('a',)) != PeersChanged(('b',))
@@ -110,7 +119,7 @@ def test_a_surface_reports_all_frames_or_the_one_of_the_beam(
 
 
 ARRAYS = [(kind, field) for kind in KINDS for field in dataclasses.fields(kind)
-          if 'dims' in field.metadata and field.metadata['kind'] is not int]
+          if 'dims' in field.metadata and field.metadata['declared'].kind is not int]
 
 
 @pytest.mark.parametrize(('kind', 'field'), ARRAYS, ids=name_of)
@@ -128,7 +137,8 @@ def test_an_array_with_a_value_that_is_not_finite_is_named(example, scenario, ki
 
 
 @pytest.mark.parametrize(('kind', 'field'), [
-    (kind, field) for kind, field in ARRAYS if field.metadata['kind'] is complex], ids=name_of)
+    (kind, field) for kind, field in ARRAYS
+    if field.metadata['declared'].kind is complex], ids=name_of)
 def test_an_imaginary_part_that_is_not_finite_is_named(example, scenario, kind, field):
     message = example(kind)
     getattr(message, field.name).flat[0] = complex(0, math.nan)
@@ -193,23 +203,24 @@ def test_a_number_must_be_finite_unless_it_may_be_unknown(example, scenario, kin
 
 
 RANGES = [(kind, field) for kind in KINDS for field in dataclasses.fields(kind)
-          if 'low' in field.metadata and 'dims' not in field.metadata]
+          if 'declared' in field.metadata and 'dims' not in field.metadata]
 
 
 @pytest.mark.parametrize(('kind', 'field'), RANGES, ids=name_of)
 def test_a_number_out_of_range_is_named(example, scenario, kind, field):
-    low, high = field.metadata['low'], field.metadata['high']
+    declared = field.metadata['declared']
+    low, high = declared.low, declared.high
     for good in (low, high):
         m.check(example(kind, **{field.name: field.type(good)}), scenario.sizes)
     for bad in (low - 1, high + 1):
         with pytest.raises(m.MessageError) as caught:
             m.check(example(kind, **{field.name: field.type(bad)}), scenario.sizes)
         assert str(caught.value) == (
-            f'{kind.__name__}.{field.name}: {field.type(bad)}, expected {low:g} to {high:g}')
+            f'{kind.__name__}.{field.name}: {field.type(bad)}, expected {declared.range}')
 
 
 def test_users_start_at_one_and_amounts_are_not_negative():
-    ranges = {(kind, field.name): field.metadata['low'] for kind, field in RANGES}
+    ranges = {(kind, field.name): field.metadata['declared'].low for kind, field in RANGES}
     for kind in KINDS:
         for field in dataclasses.fields(kind):
             if field.name == 'user':

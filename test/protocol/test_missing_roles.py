@@ -6,7 +6,7 @@ import pytest
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import PeersChanged
 
 ROLE_FAULTS = [

@@ -3,7 +3,7 @@
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 
 
 def test_a_late_user_is_waited_for_in_the_next_cycle(network):

@@ -6,7 +6,7 @@ from in_memory_network import LosesFirst
 
 from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import State
+from rhs_isac_ros.protocol.base_station import State
 
 
 class NoFixInCycles:

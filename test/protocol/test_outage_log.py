@@ -1,25 +1,47 @@
 """Log messages about outages."""
 
+import numpy as np
 import pytest
 
-from rhs_isac_ros.protocol.base_station_memory import OutageLog
-from rhs_isac_ros.protocol.events import LogMessage
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.base_station import BaseStation, State
+from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Timeout
+from rhs_isac_ros.protocol.settings import BaseStationSettings
+
+# The state in which a timeout ends the cycle for a reason.
+SILENT = {'rhs_silent': State.CONFIGURING, 'user_gone': State.SOUNDING,
+          'positioner_silent': State.ESTIMATING}
 
 
-def served(outages, cycle_id, user):
-    """Return the messages of a served cycle other than the one that service begins."""
-    return [message for message in outages.log_served_cycle(cycle_id, user, 'cb1', 2)
-            if not message.text.startswith('serving: ')]
+@pytest.fixture
+def outages(scenario):
+    return Outages(BaseStation(
+        scenario, BaseStationSettings(retries=0), np.random.default_rng(0), None))
 
 
-def test_the_beginning_of_service_is_logged_and_again_after_a_wait():
-    outages = OutageLog()
-    begins = [LogMessage('serving: codebook cb1, 2 users')]
-    assert outages.log_served_cycle(1, 1, 'cb1', 2) == begins
-    assert outages.log_served_cycle(2, 2, 'cb1', 2) == []
-    outages.log_waiting(['channel'])
-    assert outages.log_served_cycle(3, 1, 'cb2', 1) == [
-        LogMessage('serving: codebook cb2, 1 user')]
+class Outages:
+    """A base station whose cycles end as requested; all methods return what it logs."""
+
+    def __init__(self, station):
+        self.station = station
+
+    def end(self, user, state, event):
+        self.station._cycle.user, self.station.state = user, state
+        self.station._cycle.cycle_id = event.cycle_id if isinstance(event, m.Message) else 1
+        return [action for action in self.station.handle(event, 0.0)
+                if isinstance(action, LogMessage)]
+
+    def lose(self, user, reason):
+        event = m.NoFix(cycle_id=1, user=user, codebook_id='', reason='')
+        return self.end(user, SILENT.get(reason, State.ESTIMATING),
+                        event if reason == 'no_fix' else Timeout())
+
+    def serve(self, user):
+        """Return all messages but the one that service begins."""
+        data = m.Data(cycle_id=1, user=user, direction=m.Direction.UPLINK,
+                      stage=m.Stage.DELIVERED, duration_s=1e-3, bits=1.0)
+        return [message for message in self.end(user, State.TRANSMITTING, data)
+                if not message.text.startswith('serving: ')]
 
 
 def test_the_base_station_logs_that_it_serves(network, codebooks):
@@ -46,58 +68,57 @@ def test_a_user_that_is_no_longer_allowed_is_logged_as_removed(network):
     assert net.served()[-5:] == [1] * 5
 
 
-def test_a_reason_is_logged_once_until_a_cycle_is_served():
-    outages = OutageLog()
-    assert outages.log_lost_cycle(3, 1, 'rhs_silent') == [
-        LogMessage('cycle 3 of user 1 given up: rhs_silent', warning=True)]
-    assert outages.log_lost_cycle(4, 2, 'rhs_silent') == []
-    assert len(outages.log_lost_cycle(5, 2, 'positioner_silent')) == 1
-    assert served(outages, 6, 1) == [
-        LogMessage('cycle 6: user 1 served again after: positioner_silent, rhs_silent')]
-    assert served(outages, 7, 1) == []
-    assert len(outages.log_lost_cycle(8, 1, 'rhs_silent')) == 1
+def test_a_reason_is_logged_once_until_a_cycle_is_served(outages):
+    assert outages.lose(1, 'rhs_silent') == [
+        LogMessage('cycle 1 of user 1 given up: rhs_silent', warning=True)]
+    assert outages.lose(2, 'rhs_silent') == []
+    assert len(outages.lose(2, 'positioner_silent')) == 1
+    assert outages.serve(1) == [
+        LogMessage('cycle 1: user 1 served again after: positioner_silent, rhs_silent')]
+    assert outages.serve(1) == []
+    assert len(outages.lose(1, 'rhs_silent')) == 1
 
 
 @pytest.mark.parametrize('reason', ['user_gone', 'no_fix'])
-def test_the_reasons_of_a_user_are_logged_once_until_that_user_is_served(reason):
-    outages = OutageLog()
-    assert len(outages.log_lost_cycle(1, 1, reason)) == 1
-    assert len(outages.log_lost_cycle(2, 2, reason)) == 1
-    assert served(outages, 3, 3) == []
-    assert outages.log_lost_cycle(4, 1, reason) == []
-    assert served(outages, 5, 1) == [
-        LogMessage(f'cycle 5: user 1 served again after: {reason}')]
-    assert len(outages.log_lost_cycle(6, 1, reason)) == 1
-    assert outages.log_lost_cycle(7, 2, reason) == []
+def test_the_reasons_of_a_user_are_logged_once_until_that_user_is_served(outages, reason):
+    assert len(outages.lose(1, reason)) == 1
+    assert len(outages.lose(2, reason)) == 1
+    assert outages.serve(3) == []
+    assert outages.lose(1, reason) == []
+    assert outages.serve(1) == [LogMessage(f'cycle 1: user 1 served again after: {reason}')]
+    assert len(outages.lose(1, reason)) == 1
+    assert outages.lose(2, reason) == []
 
 
-def test_the_outages_of_many_users_do_not_fill_the_memory():
-    outages = OutageLog()
+def test_the_outages_of_many_users_do_not_fill_the_memory(outages):
     for user in range(1, 6000):
-        assert outages.log_lost_cycle(user, user, 'no_fix')
-    assert len(outages._open) == 4096
+        assert outages.lose(user, 'no_fix')
+    assert len(outages.station._outages) == 4096
 
 
 @pytest.mark.parametrize(('users', 'text'), [
     ([4], 'user 4 no longer answers'), ([4, 9], 'users 4, 9 no longer answer'),
     (range(1, 12), 'users 1, 2, 3, 4, 5, 6, 7, 8 and 3 others no longer answer')])
-def test_lost_users_are_logged_in_one_message(users, text):
-    assert OutageLog().log_lost_users(users) == [LogMessage(text, warning=True)]
+def test_lost_users_are_logged_in_one_message(outages, users, text):
+    station = outages.station
+    for user in (*users, 50):
+        station._users.register(user)
+    logged = []
+    for _ in range(3):
+        station._users.invite(1)
+        station._users.add_answer(50)
+        logged += outages.end(0, State.BEACONING, Timeout())
+    assert logged == [LogMessage(text, warning=True)]
 
 
-def test_no_message_is_logged_without_a_lost_user():
-    assert OutageLog().log_lost_users([]) == []
+def test_missing_roles_are_logged_once_until_a_cycle_begins(outages):
+    def report(*missing):
+        return outages.station.handle(PeersChanged(missing), 0.0)
 
-
-def test_missing_roles_are_logged_once_until_a_cycle_begins():
-    outages = OutageLog()
-    assert outages.log_waiting(['channel', 'codebook']) == [
-        LogMessage('waiting for channel, codebook', warning=True)]
-    assert outages.log_waiting(['channel', 'codebook']) == []
-    assert outages.log_waiting(['codebook']) == [
-        LogMessage('waiting for codebook', warning=True)]
-    outages.clear_waiting()
-    assert len(outages.log_waiting(['codebook'])) == 1
+    assert report('channel') == [LogMessage('waiting for channel, codebook', warning=True)]
+    assert report('channel') == []
+    assert report() == [LogMessage('waiting for codebook', warning=True)]
+    assert report() == []
 
 
 def test_a_network_without_a_positioner_logs_the_outage_once(network):

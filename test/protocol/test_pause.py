@@ -3,7 +3,7 @@
 import pytest
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import STEPS, State
+from rhs_isac_ros.protocol.base_station import STEPS, State
 from rhs_isac_ros.protocol.events import PauseRequested, Reply, ResumeRequested, StepRequested
 
 

@@ -9,7 +9,7 @@ from rhs_isac_ros.protocol.channel import Channel
 from rhs_isac_ros.protocol.events import (
     BuildEstimator,
     CodebookOffered,
-    EstimatorReady,
+    EstimatorBuilt,
     Send,
 )
 from rhs_isac_ros.protocol.positioner import Positioner
@@ -59,7 +59,7 @@ def test_no_sequence_of_messages_raises_an_error(
             requested = [action for action in role.handle(offered, float(n))
                          if isinstance(action, BuildEstimator)]
             for action in requested:
-                role.handle(EstimatorReady(action.codebook, Fixed(action.codebook), 0.0), float(n))
+                role.handle(EstimatorBuilt(action.codebook, Fixed(action.codebook), 0.0), float(n))
         for action in role.handle(example(kind, rng, **given), float(n)):
             assert isinstance(action, Send)
             m.check(action.message, scenario.sizes)

@@ -11,8 +11,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
     BuildEstimator,
     CodebookOffered,
-    EstimatorFailed,
-    EstimatorReady,
+    EstimatorBuilt,
     LogMessage,
     Send,
 )
@@ -54,7 +53,7 @@ def signals(codebooks, example):
 
 
 def ready(codebook, estimator=None):
-    return EstimatorReady(codebook, estimator or Fixed(codebook), 1.5)
+    return EstimatorBuilt(codebook, estimator or Fixed(codebook), 1.5)
 
 
 def requested(actions):
@@ -148,7 +147,7 @@ def test_no_estimator_is_built_for_a_codebook_replaced_meanwhile(positioner, cod
 def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(positioner, codebooks, signals):
     feed(positioner, [CodebookOffered(codebooks[0]), ready(codebooks[0]),
                       CodebookOffered(codebooks[1]), signals(4, 1)])
-    assert positioner.handle(EstimatorFailed(codebooks[1], 'no model'), 0.0) == [
+    assert positioner.handle(EstimatorBuilt(codebooks[1], None, failure='no model'), 0.0) == [
         LogMessage(f'no estimator for codebook {codebooks[1].id}: no model', warning=True)]
     assert [len(sent) for sent in feed(positioner, [signals(5), signals(6, 1)])] == [1, 0]
     assert positioner.counters == {'wrong_codebook': 2}
@@ -188,9 +187,9 @@ def test_an_error_while_an_estimator_is_built_is_an_event(codebooks, error):
     def make(codebook):
         raise error
     event = build_estimator(codebooks[0], make, lambda: 0.0)
-    assert isinstance(event, EstimatorFailed)
+    assert event.estimator is None
     assert event.codebook is codebooks[0]
-    assert event.reason == (str(error) or 'MemoryError')
+    assert event.failure == (str(error) or 'MemoryError')
 
 
 def test_a_built_estimator_is_returned_with_its_duration(codebooks):

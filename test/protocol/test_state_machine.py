@@ -6,7 +6,7 @@ import enum
 import pytest
 
 from rhs_isac_ros.protocol.events import LogMessage, Outcome
-from rhs_isac_ros.protocol.role import ANY, StateMachine, Transition, rows_for
+from rhs_isac_ros.protocol.role import ANY, StateMachine, Transition, on, rows_for
 
 
 class State(enum.Enum):
@@ -44,46 +44,48 @@ class LightSteps(StateMachine):
     """A traffic light that records its actions."""
 
     def __init__(self):
-        super().__init__(State.RED, {State.RED: 10.0, State.GREEN: 2.0})
+        super().__init__(State.RED)
+        self.timeouts_s = {State.RED: 10.0, State.GREEN: 2.0}
         self.seen = []
 
-    def fast(self, event, now_s):
+    def timeout_s(self, state):
+        return self.timeouts_s.get(state)
+
+    def fast(self, event):
         return event.fast
 
-    def past(self, event, now_s):
-        return now_s > 100.0
+    def past(self, event):
+        return self.now_s > 100.0
 
-    def log(self, event, now_s):
-        self.seen.append((event, now_s, self.state))
-        return [LogMessage(f'{type(event).__name__} {len(self.seen)}')]
+    def note(self, event):
+        self.seen.append((event, self.now_s, self.state))
+        self.log(f'{type(event).__name__} {len(self.seen)}')
 
-    def record(self, event, now_s):
+    def record(self, event):
         self.seen.append('recorded')
 
-    def shorten(self, event, now_s):
-        self._timeouts_s = {State.RED: 1.0}
+    def shorten(self, event):
+        self.timeouts_s = {State.RED: 1.0}
 
 
 class Light(LightSteps):
     STATES = State
-    EVENT_NAMES = {Go: 'go', Stop: 'stop', Blink: 'blink', Wait: 'wait', Fail: 'fail',
-                   Renew: 'renew'}
     TABLE = (
-        Transition(ANY, Go, guard=LightSteps.past, outcome=Outcome.STALE),
-        Transition((State.RED,), Go, guard=LightSteps.fast, target=State.GREEN,
-                   outcome=Outcome.OVERFLOW),
-        Transition((State.RED,), Go, target=State.GREEN,
-                   actions=(LightSteps.log, LightSteps.record, LightSteps.log)),
-        Transition((State.GREEN,), Go, target=State.GREEN),
-        Transition((State.GREEN,), Stop, target=State.RED),
-        Transition((State.GREEN,), Fail, actions=(LightSteps.shorten,),
-                   target=State.RED),
-        Transition((State.RED,), Wait),
-        Transition((State.RED, State.GREEN), Blink, restart_timeout=True),
-        Transition(ANY, Renew, enter_again=True),
-        Transition(ANY, Blink, actions=(LightSteps.log,), outcome=Outcome.DUPLICATE),
-        Transition(ANY, Fail, actions=(LightSteps.log,), target=State.DARK,
-                   outcome=Outcome.OVERFLOW),
+        *on(Go, 'go', {LightSteps.past: Outcome.STALE})(
+            Transition((State.RED,), target=State.GREEN, guard=LightSteps.fast,
+                       outcome=Outcome.OVERFLOW),
+            Transition((State.RED,), (LightSteps.note, LightSteps.record, LightSteps.note),
+                       State.GREEN),
+            Transition((State.GREEN,))),
+        *on(Stop, 'stop')(Transition((State.GREEN,), target=State.RED)),
+        *on(Fail, 'fail')(
+            Transition((State.GREEN,), (LightSteps.shorten,), State.RED),
+            Transition(ANY, (LightSteps.note,), State.DARK, outcome=Outcome.OVERFLOW)),
+        *on(Wait, 'wait')(Transition((State.RED,))),
+        *on(Blink, 'blink')(
+            Transition((State.RED, State.GREEN), restart_timeout=True),
+            Transition(ANY, (LightSteps.note,), outcome=Outcome.DUPLICATE)),
+        *on(Renew, 'renew')(Transition((State.RED,), target=State.RED)),
     )
 
 
@@ -200,19 +202,6 @@ def test_a_subclass_inherits_the_rows_of_its_table():
     lamp = Lamp()
     lamp.handle(Go(), 0.0)
     assert lamp.state is State.GREEN
-
-
-def test_a_machine_copies_its_timeouts():
-    timeouts_s = {State.RED: 1.0}
-
-    class Slow(Light):
-        def __init__(self):
-            StateMachine.__init__(self, State.GREEN, timeouts_s)
-
-    light = Slow()
-    timeouts_s[State.RED] = 99.0
-    light.handle(Stop(), 0.0)
-    assert light.next_deadline() == 1.0
 
 
 def test_a_row_cannot_be_changed():

@@ -12,7 +12,7 @@ from rhs_isac_ros.model import Scenario, mobility
 from rhs_isac_ros.protocol import base_station as bs
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import rhs_controller, user
-from rhs_isac_ros.protocol.base_station_memory import POLICIES, State
+from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import (
     CodebookOffered,
     Kind,
@@ -32,6 +32,7 @@ from rhs_isac_ros.protocol.events import (
 )
 from rhs_isac_ros.protocol.role import ANY, SAME, StateMachine, always, rows_for
 from rhs_isac_ros.protocol.settings import BaseStationSettings
+from rhs_isac_ros.protocol.user_registry import POLICIES
 
 # The first state, the states without a time-out, and the state that a role reaches if it receives
 # no messages.
@@ -65,14 +66,12 @@ def role(request):
 def machine(scenario):
     """Function that returns the machine of a role, with timeouts of 1 s."""
     def make(name):
-        role = ROLES[name]
         if name == 'bs':
             def receive(codebook, feeds, user, cycle_id, noise):
                 return np.zeros((2, 3, 2), complex)
             return bs.BaseStation(scenario, settings(), np.random.default_rng(0), receive)
         if name == 'user':
-            timeouts_s = {state: 1.0 for state in user.State if state not in role.endless}
-            return user.User({1: mobility.Static((10, 0, 0))}, timeouts_s)
+            return user.User({1: mobility.Static((10, 0, 0))}, step_s=1.0, beacon_s=1.0)
         return rhs_controller.RhsController()
     return make
 
@@ -121,11 +120,10 @@ def test_every_event_of_the_role_has_rows_and_a_name(role):
 def test_every_guard_and_action_belongs_to_a_row(role):
     used = {function.__name__ for row in role.machine.TABLE
             for function in (row.guard, *row.actions)}
-    own = role.machine.__mro__[:role.machine.__mro__.index(StateMachine)]
-    steps = {name for cls in own for name, function in vars(cls).items()
+    steps = {name for name, function in vars(role.machine).items()
              if inspect.isfunction(function)
-             and [*inspect.signature(function).parameters] == ['self', 'event', 'now_s']}
-    assert steps == used - {'always', 'abandon', 'reply'}
+             and [*inspect.signature(function).parameters] == ['self', 'event']}
+    assert steps == used - {'always', 'reply'}
 
 
 def test_no_row_is_hidden_by_an_earlier_one(role):
@@ -190,7 +188,7 @@ def test_outcomes_of_timeouts_differ(role):
 def test_the_base_station_gives_up_exactly_with_the_lost_outcomes():
     rows = bs.BaseStation.TABLE
     lost = [row for row in rows if row.outcome and row.outcome.kind is Kind.LOST]
-    assert lost == [row for row in rows if 'abandon' in {a.__name__ for a in row.actions}]
+    assert lost == [row for row in rows if '_abandon' in {a.__name__ for a in row.actions}]
     assert {row.target for row in lost} == {State.RESTING}
 
 
@@ -218,7 +216,7 @@ def test_rows_that_drop_messages_precede_rows_of_single_states(name):
             acting = [other for other in earlier if other.source is not ANY]
             # A grant to another user ends the wait of this one, before any refusal.
             assert {other.guard for other in acting} <= {
-                user.User.other_user_granted, user.User.other_instance_granted}
+                user.User._other_user_granted, user.User._other_instance_granted}
 
 
 # The machines
@@ -232,7 +230,8 @@ def snapshot(thing):
         case np.random.Generator():
             return str(thing.bit_generator.state)
         case dict():
-            return [(snapshot(key), snapshot(value)) for key, value in thing.items()]
+            return [(snapshot(key), snapshot(value)) for key, value in thing.items()] + [
+                getattr(thing, 'pinned', None)]
         case list() | tuple():
             return [snapshot(item) for item in thing]
         case set():
@@ -242,16 +241,16 @@ def snapshot(thing):
             return id(thing)
     if hasattr(thing, '__dict__'):
         return [(name, snapshot(value)) for name, value in vars(thing).items()
-                if name != 'counters']
+                if name not in ('counters', 'now_s', 'outcome', '_actions')]
     return thing
 
 
 def test_a_snapshot_shows_changes_at_every_depth(machine):
     subject = machine('bs')
-    for change in (lambda: subject._users._missed.update({3: 0}),
+    for change in (lambda: subject._users.register(3),
                    lambda: subject._users._rng.random(),
                    lambda: subject._cycle.began_s.__setitem__(0, 1.0),
-                   lambda: subject._outages._open.put(('user_gone', 1), None),
+                   lambda: subject._outages.put(('user_gone', 1), None),
                    lambda: subject._cycle.configured.add(9)):
         before = snapshot(subject)
         assert snapshot(subject) == before
@@ -314,7 +313,8 @@ def random_event(rng, subject, example, codebooks):
         return Resumed(int(rng.integers(1000)))
     if kind is SettingsOffered:
         return SettingsOffered(settings(policy=rng.choice(POLICIES)))
-    cycle_id = subject._cycle.id if isinstance(subject, bs.BaseStation) else subject._cycle_id
+    memory = subject._cycle if isinstance(subject, bs.BaseStation) else subject
+    cycle_id = getattr(memory, 'cycle_id', None) or getattr(memory, '_cycle_id', 0)
     given = {'cycle_id': max(cycle_id + int(rng.choice([0, 0, 0, 0, 1, -1])), 0)}
     fields = kind.__dataclass_fields__
     if 'codebook_id' in fields:
@@ -331,17 +331,18 @@ def test_machines_take_the_first_row_that_matches(
     role, subject = ROLES[name], machine(name)
     taken = []
     take = StateMachine._take
-    monkeypatch.setattr(StateMachine, '_take', lambda self, row, event, now_s: (
-        taken.append(row) or take(self, row, event, now_s)))
+    monkeypatch.setattr(StateMachine, '_take', lambda self, row, event: (
+        taken.append(row) or take(self, row, event)))
     rng = np.random.default_rng(seed)
     now_s, visited, sent, unexpected = 0.0, {subject.state}, set(), 0
     for _ in range(1500):
         event = random_event(rng, subject, example, codebooks)
         now_s += rng.exponential(0.05)
         state, memory, counters = subject.state, snapshot(subject), subject.counters.copy()
+        subject.now_s = now_s
         matching = [row for row in role.machine.TABLE
                     if type(event) is row.event and (row.source is ANY or state in row.source)
-                    and row.guard(subject, event, now_s)]
+                    and row.guard(subject, event)]
         # Guards change nothing.
         assert snapshot(subject) == memory
         assert subject.counters == counters
@@ -365,8 +366,9 @@ def test_machines_take_the_first_row_that_matches(
         assert (deadline_s is None) == (subject.state in role.endless)
         if subject.state is not state and deadline_s is not None:
             # There is no rest before a pause.
-            pauses = subject.state is State.RESTING and subject._pausing
-            assert deadline_s == now_s + (0.0 if pauses else 1.0)
+            pauses = subject.state is State.RESTING and subject._pause_requested
+            steps = 4.0 if subject.state is user.State.GRANTED else 1.0
+            assert deadline_s == now_s + (0.0 if pauses else steps)
     assert len(visited) >= 3
     assert sent
     # An idle RHS controller rejects all beams but one without a codebook.

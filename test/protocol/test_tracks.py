@@ -89,13 +89,13 @@ def test_a_gap_ends_a_track(locate):
     assert locate(40).n_phases == 2
     assert locate(1, now_s=4.1 + MAX_GAP_S).n_phases == 1
     locate(2, user=2, now_s=30.0 + MAX_GAP_S)
-    assert len(locate.tracks) == 1
+    assert len(locate.tracks._tracks) == 1
 
 
 def test_more_than_64_users_have_tracks(locate):
     for n in range(70):
         locate(n, user=1 + n, now_s=0.1 + n / 1000)
-    assert len(locate.tracks) == 70
+    assert len(locate.tracks._tracks) == 70
     assert locate(70, user=1, now_s=0.3).n_phases == 2
 
 
@@ -104,7 +104,7 @@ def test_the_number_of_tracks_is_bounded(monkeypatch, locate):
     counts = [locate(n, user=user, now_s=n / 10).n_phases
               for n, user in enumerate([1, 2, 1, 3, 1, 2])]
     assert counts == [1, 1, 2, 1, 3, 1]
-    assert len(locate.tracks) == 2
+    assert len(locate.tracks._tracks) == 2
 
 
 @pytest.fixture

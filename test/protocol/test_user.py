@@ -1,12 +1,14 @@
 """The user alone, in situations that are rare in a network."""
 
+import math
+
 import numpy as np
 import pytest
 
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Send, Timeout
-from rhs_isac_ros.protocol.user import State, User, timeouts
+from rhs_isac_ros.protocol.user import State, User
 
 DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
 OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
@@ -14,9 +16,9 @@ OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
 
 @pytest.fixture
 def user():
-    """User 4, connected, with timeouts of 2 s for a grant and 3 s after it."""
+    """User 4, connected, with timeouts of 2 s for a grant and 8 s after it."""
     way = mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)
-    made = User({4: way}, {State.ACKNOWLEDGED: 2.0, State.GRANTED: 3.0})
+    made = User({4: way}, step_s=2.0, beacon_s=math.inf)
     made.handle(PeersChanged(()), 0.0)
     return made
 
@@ -61,18 +63,12 @@ def test_every_further_beacon_is_answered_and_restarts_the_timeout(user, cycle_i
 
 
 def test_a_grant_is_answered_with_the_present_position(user):
-    user.ground_truth(4, 8.0)
+    assert [truth.cycle_id for truth in user.ground_truths(8.0).each()] == [0]
     (truth,) = grant(user)
     assert (type(truth), truth.cycle_id, truth.user) == (m.GroundTruth, 7, 4)
     np.testing.assert_allclose(truth.position, (7, 0, 0))
     np.testing.assert_allclose(truth.velocity, (0.5, 0, 0))
-    assert user.next_deadline() == 13.0
-
-
-def test_a_true_position_has_cycle_0_unless_given(user):
-    assert user.ground_truth(4, 0.0).cycle_id == 0
-    assert user.ground_truth(4, 0.0, 9).cycle_id == 9
-    assert user.ground_truth(4, 0.0).user == 4
+    assert user.next_deadline() == 18.0
 
 
 def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user):
@@ -81,7 +77,7 @@ def test_a_pilot_request_is_answered_in_each_frame_and_restarts_the_timeout(user
         cycle_id=7, user=4, band=1, last_band=1, n_frames=3), 12.5)
     assert (pilots.cycle_id, pilots.user, pilots.band) == (7, 4, 1)
     assert pilots.symbols.tolist() == [1 + 0j] * 3
-    assert user.next_deadline() == 15.5
+    assert user.next_deadline() == 20.5
 
 
 def test_the_downlink_is_answered_with_equal_uplink_and_ends_the_cycle(user):
@@ -91,7 +87,7 @@ def test_the_downlink_is_answered_with_equal_uplink_and_ends_the_cycle(user):
     assert (data.cycle_id, data.user, data.direction, data.stage) == (7, 4, UP, OFFERED)
     assert (data.duration_s, data.bits) == (0.25, 123.0)
     assert user.state is State.LISTENING
-    assert user.next_deadline() is None
+    assert user.next_deadline() == math.inf
 
 
 @pytest.mark.parametrize(('direction', 'stage'), [(DOWN, OFFERED), (UP, OFFERED), (UP, DELIVERED)])
@@ -109,7 +105,7 @@ def test_a_late_beacon_of_the_granted_cycle_is_only_counted(user):
     grant(user)
     assert user.handle(m.Beacon(cycle_id=7, attempt=1), 11.0) == []
     assert user.state is State.GRANTED
-    assert user.next_deadline() == 13.0
+    assert user.next_deadline() == 18.0
     assert user.counters == {'stale_beacon': 1}
 
 
@@ -150,20 +146,13 @@ def test_a_pilot_request_that_overtakes_the_grant_implies_it(user):
     assert (type(pilots), len(pilots.symbols)) == (m.Pilot, 2)
     assert user.state is State.GRANTED
     assert user.handle(m.Grant(cycle_id=7, user=4), 11.0) == []
-    assert user.next_deadline() == 13.5
+    assert user.next_deadline() == 18.5
     assert user.counters == {}
 
 
-def test_the_timeout_of_a_granted_user_covers_the_steps_without_messages_to_it():
-    """These are sounding of the last band, estimating and steering."""
-    waits = timeouts(0.5, 7.0)
-    assert waits[State.GRANTED] > 3 * 0.5
-    assert waits.keys() == {State.LISTENING, State.ACKNOWLEDGED, State.GRANTED}
-    assert waits[State.LISTENING] == 7.0
-
-
 @pytest.mark.parametrize(('granted', 'deadline_s', 'reason'), [
-    (False, 12.0, 'not_granted'), (True, 13.0, 'bs_silent')])
+    # A granted user waits through sounding of the last band, estimating and steering.
+    (False, 12.0, 'not_granted'), (True, 18.0, 'bs_silent')])
 def test_a_timeout_leads_back_to_listening(user, granted, deadline_s, reason):
     user.handle(m.Beacon(cycle_id=7, attempt=0), 10.0)
     if granted:
@@ -172,7 +161,7 @@ def test_a_timeout_leads_back_to_listening(user, granted, deadline_s, reason):
     assert user.handle(Timeout(), deadline_s) == []
     assert user.state is State.LISTENING
     assert user.counters == {reason: 1}
-    assert user.next_deadline() is None
+    assert user.next_deadline() == math.inf
 
 
 @pytest.mark.parametrize('state', State)
@@ -197,7 +186,7 @@ def test_a_connected_user_keeps_its_state(user, state):
 def users():
     """Users 4 to 6 of one node, connected."""
     made = User({user: mobility.Static((user, 0.0, 0.0)) for user in (4, 5, 6)},
-                timeouts(0.5, 1.5))
+                step_s=0.5, beacon_s=1.5)
     made.handle(PeersChanged(()), 0.0)
     return made
 

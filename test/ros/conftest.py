@@ -18,7 +18,8 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
 
 import rhs_isac_msgs.msg as ros
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 # Type supports load a parser that uses deprecated modules.
 with warnings.catch_warnings():
@@ -71,7 +72,7 @@ class Bench:
     def publisher(self, node, kind):
         """Return a publisher of a message once there is a subscriber."""
         publisher = node.create_publisher(
-            convert.ros_type(kind), topics.NAMES[kind], qos.EXCHANGE)
+            convert.ros_type(kind), topics.NAMES[kind], EXCHANGE)
         self.until(publisher.get_subscription_count, f'a subscriber of {kind.__name__}')
         return publisher
 
@@ -80,7 +81,7 @@ class Bench:
         received = []
         subscription = node.create_subscription(
             convert.ros_type(kind), topics.NAMES[kind],
-            lambda message: received.append(convert.from_ros(kind, message)), qos.EXCHANGE)
+            lambda message: received.append(convert.from_ros(kind, message)), EXCHANGE)
         self.until(subscription.get_publisher_count, f'a publisher of {kind.__name__}')
         return received
 

@@ -18,6 +18,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import MessageError, check
 from rhs_isac_ros.ros import cdr, convert, topics
+from rhs_isac_ros.ros.convert import CodebookMessage
 
 SIZES = Scenario().sizes
 STAMP = Time(sec=12, nanosec=345)
@@ -47,12 +48,13 @@ def random_scalar(field, rng):
 def random_array(meta, rng):
     """Return an array with a random number of frames, which only `check` restricts."""
     shape = [SIZES.get(d) or int(d if d.isdigit() else rng.integers(1, 6)) for d in meta['dims']]
-    if meta['kind'] is complex:
+    declared = meta['declared']
+    if declared.kind is complex:
         return rng.normal(size=(*shape, 2)) @ [1, 1j] * 10.0**rng.integers(-200, 200)
-    if meta['kind'] is int:
-        return rng.integers(meta['low'], meta['high'], shape)
-    if math.isfinite(meta['low']):
-        return rng.uniform(meta['low'], meta['high'], shape)
+    if declared.kind is int:
+        return rng.integers(declared.low, declared.high, shape)
+    if declared.range:
+        return rng.uniform(declared.low, declared.high, shape)
     return rng.normal(size=shape) * 10.0**rng.integers(-200, 200)
 
 
@@ -277,7 +279,7 @@ def test_bytes_convert_to_the_message_or_an_error_that_names_it(kind):
 
 
 def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):
-    sent = convert.codebook_to_ros(shipped, STAMP)
+    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
     received = deserialize_message(serialize_message(sent), ros.Codebook)
     assert received.codebook_id == shipped.id
     assert (received.header.stamp, received.header.frame_id) == (STAMP, 'rhs_link')
@@ -290,21 +292,22 @@ def test_a_round_trip_preserves_every_bit_of_a_codebook(shipped):
 
 def test_a_round_trip_preserves_a_codebook_without_a_bound(small):
     assert math.isnan(small.codebook.average_crlb_m2)
-    back = convert.codebook_from_ros(convert.codebook_to_ros(small.codebook, STAMP))
+    back = convert.codebook_from_ros(
+        convert.to_ros(CodebookMessage.of(small.codebook), STAMP))
     assert math.isnan(back.average_crlb_m2)
     assert back.id == small.codebook.id
 
 
 def test_a_malformed_codebook_is_rejected(shipped):
-    sent = convert.codebook_to_ros(shipped, STAMP)
+    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
     sent.analog.data = sent.analog.data[:-1]
-    with pytest.raises(MessageError, match='^Codebook: 799 values'):
+    with pytest.raises(MessageError, match='^CodebookMessage.analog: 799 values'):
         convert.codebook_from_ros(sent)
-    sent = convert.codebook_to_ros(shipped, STAMP)
+    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
     sent.digital.im = sent.digital.im[:-1]
-    with pytest.raises(MessageError, match='^Codebook: 191 values'):
+    with pytest.raises(MessageError, match='^CodebookMessage.digital: 191 values'):
         convert.codebook_from_ros(sent)
-    sent = convert.codebook_to_ros(shipped, STAMP)
+    sent = convert.to_ros(CodebookMessage.of(shipped), STAMP)
     sent.analog.data[0] = 1.5
     with pytest.raises(CodebookError, match='analog: .* expected 0 to 1'):
         convert.codebook_from_ros(sent)

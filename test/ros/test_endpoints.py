@@ -1,9 +1,11 @@
-"""A topic or service that the middleware refuses costs its node that topic or service alone."""
+"""Endpoints that the middleware refuses, topics of single users, and jobs in the background."""
 
 import importlib
+import threading
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Point, Vector3
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -11,6 +13,7 @@ from rclpy.parameter import Parameter
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import endpoints, locate, topics
+from rhs_isac_ros.ros.endpoints import BackgroundWorker, UserTopics
 from rhs_isac_ros.ros.roster import ROSTER
 
 ESTIMATE = m.PositionEstimate(
@@ -120,3 +123,97 @@ def test_a_refusal_is_logged_once(probe, refused, capfd):
         assert not probe.destroy_publisher(publisher)
     assert refused == ['ack', 'ack']
     assert capfd.readouterr().err.count('publisher of ack was refused: ack not found') == 1
+
+
+@pytest.fixture
+def user_topics(probe):
+    """Topics of the users up to number 7."""
+    return UserTopics(probe, {'users/user_{user}/a': Point, 'users/user_{user}/b': Vector3}, 7)
+
+
+def names(publishers):
+    return [publisher.topic_name for publisher in publishers]
+
+
+def test_each_user_has_its_publishers(user_topics):
+    first = user_topics.publishers(7)
+    assert names(first) == ['/users/user_7/a', '/users/user_7/b']
+    assert [publisher.msg_type for publisher in first] == [Point, Vector3]
+    assert user_topics.publishers(7) == first
+
+
+def test_users_with_higher_numbers_have_none_and_one_is_logged(user_topics, capfd):
+    for user in range(8, 1008):
+        assert user_topics.publishers(user) == ()
+    assert len(user_topics.publishers(1)) == 2
+    assert capfd.readouterr().err.count('no topics for user') == 1
+
+
+def test_the_topics_of_a_user_that_was_removed_are_created_again(user_topics, probe):
+    user_topics.publishers(1)
+    user_topics.remove(1)
+    user_topics.remove(9)
+    assert not probe.count_publishers('users/user_1/a')
+    assert names(user_topics.publishers(1)) == ['/users/user_1/a', '/users/user_1/b']
+
+
+@pytest.fixture
+def background(each_bench):
+    background = BackgroundWorker(each_bench.add(Node, 'busy'))
+    yield background
+    background.close()
+
+
+def test_a_job_runs_in_another_thread_and_its_result_is_delivered_here(each_bench, background):
+    seen = []
+    background.run(threading.current_thread, lambda worker: seen.append(
+        (worker, threading.current_thread())))
+    ((worker, receiver),) = each_bench.until(lambda: seen)
+    assert receiver is threading.current_thread()
+    assert worker is not receiver
+    assert worker.name.startswith('busy')
+
+
+def test_callbacks_continue_while_a_job_runs(each_bench, background):
+    node = each_bench.add(Node, 'other')
+    released, calls, results = threading.Event(), [], []
+    background.run(released.wait, results.append)
+    node.create_timer(0.001, lambda: calls.append(1))
+    each_bench.until(lambda: len(calls) >= 3)
+    assert not results
+    released.set()
+    each_bench.until(lambda: results == [True])
+
+
+def test_jobs_run_one_after_the_other(each_bench, background):
+    order = []
+    for n in range(5):
+        background.run(lambda n=n: order.append(('begin', n)) or n,
+                       lambda n: order.append(('end', n)))
+    each_bench.until(lambda: len(order) == 10)
+    assert [n for kind, n in order if kind == 'begin'] == list(range(5))
+    assert [n for kind, n in order if kind == 'end'] == list(range(5))
+
+
+def test_an_exception_of_a_job_is_raised_where_the_node_spins(each_bench, background):
+    def fail():
+        raise ZeroDivisionError('of the job')
+    background.run(fail, lambda result: None)
+    with pytest.raises(ZeroDivisionError, match='of the job'):
+        each_bench.until(lambda: False)
+
+
+def test_closing_waits_for_the_running_job_and_discards_the_others(each_bench, background):
+    begun, released, done, results = threading.Event(), threading.Event(), [], []
+
+    def first():
+        begun.set()
+        released.wait()
+        done.append(1)
+    background.run(first, results.append)
+    background.run(lambda: done.append(2), results.append)
+    assert begun.wait(10)
+    threading.Timer(0.01, released.set).start()
+    background.close()
+    assert done == [1]
+    assert not results

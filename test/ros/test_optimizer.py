@@ -16,7 +16,8 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, CodebookError, default_codebook_file
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
-from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.endpoints import LATCHED
 from rhs_isac_ros.ros.parameters import ParameterError
 
 TYPES = {
@@ -49,7 +50,7 @@ def other(random_beams):
 
 def latched(bench, node):
     received = []
-    node.create_subscription(ros.Codebook, 'codebook', received.append, qos.LATCHED)
+    node.create_subscription(ros.Codebook, 'codebook', received.append, LATCHED)
     bench.until(lambda: received, 'the latched codebook')
     return received
 

@@ -44,15 +44,18 @@ def set_together(node, **values):
 
 
 def wrong_values(p):
-    """Yield invalid values of a parameter: of another type, out of range, not a choice."""
-    yield {bool: 'yes', int: 2.5, float: 3, str: 17}[type(p.default)]
-    if p.low is not None:
-        yield type(p.default)(p.high + 1)
-        yield type(p.default)(p.low - 1)
-    if isinstance(p.default, float):
-        yield math.nan
+    """Yield invalid values of a parameter: of another type, out of range, not a choice.
+
+    Each comes with what the error says is expected.
+    """
+    yield {bool: 'yes', int: 2.5, float: 3, str: 17}[p.kind], p.expected
+    if p.kind in (int, float):
+        yield p.kind(p.high + 1), p.range
+        yield p.kind(p.low - 1), p.range
+    if p.kind is float:
+        yield math.nan, p.range
     if p.choices:
-        yield 'nonsense'
+        yield 'nonsense', p.expected
 
 
 @pytest.mark.parametrize(('executable', 'parameter'), DYNAMIC,
@@ -60,11 +63,10 @@ def wrong_values(p):
 def test_an_invalid_value_is_rejected_with_a_reason(make, executable, parameter):
     node = make(executable)
     before = node.get_parameter(parameter.name).value
-    for wrong in wrong_values(parameter):
+    for wrong, expected in wrong_values(parameter):
         result = set_together(node, **{parameter.name: wrong})
         assert not result.successful
-        assert result.reason.startswith(
-            f'{parameter.name}: {wrong!r}, expected {parameter.expected}')
+        assert result.reason.startswith(f'{parameter.name}: {wrong!r}, expected {expected}')
         # The node itself may also set parameters one by one.
         (result,) = node.set_parameters([Parameter(parameter.name, value=wrong)])
         assert not result.successful

@@ -21,7 +21,6 @@ from rhs_isac_ros.protocol.settings import (
     PositionerSettings,
     TransmissionSettings,
 )
-from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.ros.parameters import NODES, ParameterError, declare, settings_of
 from rhs_isac_ros.support import plugins
 
@@ -42,7 +41,7 @@ def only(choose):
         ids=[name for _, name in chosen])
 
 
-has_range = only(lambda p: p.low is not None)
+has_range = only(lambda p: p.kind in (int, float, list))
 has_choices = only(lambda p: p.choices)
 has_fractions = only(lambda p: type(p.default) in (float, list))
 
@@ -96,7 +95,8 @@ def test_descriptors_match_the_declarations(make, executable):
 
 @each_parameter
 def test_numbers_have_ranges_and_texts_are_sentences(executable, parameter):
-    assert (parameter.low is not None) == (type(parameter.default) in (int, float, list))
+    assert bool(parameter.range and not parameter.choices) == (
+        parameter.kind in (int, float, list))
     assert parameter.text.endswith('.')
     assert parameter.choices == () or parameter.default in parameter.choices
 
@@ -132,8 +132,7 @@ def test_a_range_includes_its_ends_and_nothing_beyond(make, executable, paramete
     text = refusal(make, executable, parameter.name, beyond)
     assert text.startswith(f'{parameter.name}: ')
     assert str(beyond) in text
-    assert f'expected {parameter.expected}' in text
-    assert format(parameter.high, 'd' if type(end) is int else 'g') in text
+    assert 'expected ' in text and parameter.range in text
 
 
 @has_fractions
@@ -142,7 +141,7 @@ def test_a_number_that_is_not_finite_is_rejected(make, executable, parameter, nu
     text = refusal(make, executable, parameter.name, value_of(parameter, number))
     assert text.startswith(f'{parameter.name}: ')
     assert str(number) in text
-    assert f'expected {parameter.expected}' in text
+    assert 'expected ' in text and parameter.range in text
 
 
 @has_choices
@@ -186,27 +185,6 @@ def test_the_dynamic_parameters_are_the_settings_of_the_role(executable, setting
 def test_other_nodes_have_no_dynamic_parameters():
     dynamic = {executable for executable, p in PAIRS if p.dynamic}
     assert dynamic == {'bs', 'channel', 'positioner', 'transmission'}
-
-
-def test_the_table_lists_every_parameter_once_with_its_declaration():
-    head, rule, *rows = parameters.table().splitlines()
-    columns = head.count('|')
-    assert rule == '|' + '---|' * (columns - 1)
-    owners = {}
-    for executable, p in PAIRS:
-        owners.setdefault(p.name, []).append(executable)
-    assert [row.split('|')[1] for row in rows] == [f' `{name}` ' for name in owners]
-    by_name = {p.name: p for _, p in PAIRS}
-    for row, (name, nodes) in zip(rows, owners.items(), strict=True):
-        p, cells = by_name[name], [cell.strip() for cell in row.split('|')]
-        assert row.count('|') == columns
-        default = {True: 'true', False: 'false'}[p.default] if isinstance(
-            p.default, bool) else str(p.default)
-        assert ('empty' if p.default in ('', []) else default) in cells
-        assert {p.text, ', '.join(nodes)} <= set(cells)
-        assert all(choice in row for choice in p.choices)
-        assert p.unit in row
-        assert ('yes' in cells) == p.dynamic
 
 
 def test_nodes_share_declarations_of_equal_names():

@@ -19,9 +19,10 @@ from rhs_isac_ros.nodes.rhs_controller import RhsControllerNode
 from rhs_isac_ros.nodes.transmission import TransmissionNode
 from rhs_isac_ros.nodes.user import UserNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.role import PlainRole
-from rhs_isac_ros.ros import convert, peers, qos, topics
+from rhs_isac_ros.protocol.role import Role
+from rhs_isac_ros.ros import convert, peers, topics
 from rhs_isac_ros.ros.codebook_client import CodebookClient
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES
 from rhs_isac_ros.ros.peers import Peers, new_instance
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.roster import ROSTER, identifying_endpoints
@@ -36,9 +37,9 @@ def create_endpoints(node, endpoints):
     """Create the endpoints of a role, without its behaviour."""
     publishers, subscriptions = endpoints
     for name in publishers:
-        node.create_publisher(TYPES[name], name, qos.EXCHANGE)
+        node.create_publisher(TYPES[name], name, EXCHANGE)
     for name in subscriptions:
-        node.create_subscription(TYPES[name], name, lambda message: None, qos.EXCHANGE)
+        node.create_subscription(TYPES[name], name, lambda message: None, EXCHANGE)
 
 
 @pytest.fixture
@@ -112,7 +113,7 @@ def test_a_role_is_present_from_the_second_poll_in_a_row_that_finds_it():
         node.count_publishers.return_value = node.count_subscribers.return_value = int(present)
         node.get_publishers_info_by_topic.return_value = (
             node.get_subscriptions_info_by_topic.return_value) = present * [mock.Mock(
-                node_name='other', node_namespace='/', qos_profile=qos.EXCHANGE)]
+                node_name='other', node_namespace='/', qos_profile=EXCHANGE)]
         poll()
         return {} in reports
 
@@ -144,7 +145,7 @@ def test_nodes_whose_names_arrive_late_are_found():
     node.get_fully_qualified_name.return_value = '/user'
     node.resolve_topic_name.side_effect = '/{}'.format
     node.count_publishers.return_value = node.count_subscribers.return_value = 1
-    info = mock.Mock(node_name='_NODE_NAME_UNKNOWN_', node_namespace='/', qos_profile=qos.EXCHANGE)
+    info = mock.Mock(node_name='_NODE_NAME_UNKNOWN_', node_namespace='/', qos_profile=EXCHANGE)
     node.get_publishers_info_by_topic.return_value = (
         node.get_subscriptions_info_by_topic.return_value) = [info]
     Peers(node, 'user', 1, Scenario(), reports.append, lambda stands_by: None)
@@ -224,7 +225,7 @@ def test_endpoints_with_incompatible_qos_are_named_once(bench, probe, publishes,
     observer = bench.add(Node, 'observer')
     if publishes:
         observer.create_subscription(
-            TYPES['feed_signals'], 'feed_signals', lambda message: None, qos.LATCHED)
+            TYPES['feed_signals'], 'feed_signals', lambda message: None, LATCHED)
         key = 'conflict.qos.feed_signals.observer'
     else:
         observer.create_publisher(TYPES['pilot'], 'pilot', qos_profile_sensor_data)
@@ -251,7 +252,7 @@ def test_compatible_observers_are_no_conflict(bench):
 
 # Several nodes of a role
 
-class Radio(PlainRole):
+class Radio(Role):
     """A role that collects its events."""
 
     SENDS, RECEIVES = (m.FeedSignals,), (m.Pilot,)
@@ -315,7 +316,7 @@ def test_the_older_node_stands_by_and_resumes(each_bench, capfd):
 
 def test_nothing_is_announced_repeatedly_without_a_conflict(bench, probe, add_channel):
     received = []
-    probe.create_subscription(ros.Presence, topics.PRESENCE, received.append, qos.PRESENCES)
+    probe.create_subscription(ros.Presence, topics.PRESENCE, received.append, PRESENCES)
     node = add_channel()
     bench.until(lambda: received, 'the announcement')
     assert received[0].sender == node.instance
@@ -334,7 +335,7 @@ def test_nothing_is_announced_repeatedly_without_a_conflict(bench, probe, add_ch
 @pytest.mark.parametrize('scenario', ['[', '3', 'a: b: c'])
 def test_invalid_announcements_are_ignored(bench, probe, add_channel, scenario):
     node = add_channel()
-    publisher = probe.create_publisher(ros.Presence, topics.PRESENCE, qos.LATCHED)
+    publisher = probe.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
     bench.until(publisher.get_subscription_count, 'the subscription')
     publisher.publish(ros.Presence(
         sender=new_instance(), role='channel', node='/rogue', scenario=scenario))
@@ -381,7 +382,7 @@ def test_the_serving_optimizer_announces_again_after_an_older_one_has_returned(
     def announce():
         """Start a node that announces itself as an older optimizer."""
         node = bench.add(Node, 'older')
-        publisher = node.create_publisher(ros.Presence, topics.PRESENCE, qos.LATCHED)
+        publisher = node.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
         publisher.publish(ros.Presence(
             sender=newer._instance - 1, scenario_id=small.scenario.id, role='optimizer',
             node='/older', scenario='{}'))
@@ -390,10 +391,10 @@ def test_the_serving_optimizer_announces_again_after_an_older_one_has_returned(
     bench.until(newer._peers.conflicts, 'the older one')
     bench.remove(older)
     bench.until(lambda: not newer._peers.conflicts(), 'its absence')
-    codebooks = probe.create_publisher(ros.Codebook, topics.CODEBOOK, qos.LATCHED)
+    codebooks = probe.create_publisher(ros.Codebook, topics.CODEBOOK, LATCHED)
     bench.until(codebooks.get_subscription_count, 'the subscription')
-    codebooks.publish(convert.codebook_to_ros(
-        second, probe.get_clock().now().to_msg(), newer._instance - 1, small.scenario.id))
+    codebooks.publish(convert.to_bytes(convert.CodebookMessage.of(
+        second, newer._instance - 1, small.scenario.id), 0))
     bench.until(lambda: got == [first.id, second.id], 'the codebook of the older one')
     announce()
     bench.until(lambda: got == [first.id, second.id, first.id], 'the codebook of the newer one')
@@ -404,7 +405,7 @@ def test_a_node_of_another_scenario_changes_nothing(bench, add_channel):
     other = Peers(bench.add(Node, 'other'), 'optimizer', new_instance(), node.scenario,
                   lambda missing: None, changes.append)
     stranger = bench.add(Node, 'stranger')
-    publisher = stranger.create_publisher(ros.Presence, topics.PRESENCE, qos.LATCHED)
+    publisher = stranger.create_publisher(ros.Presence, topics.PRESENCE, LATCHED)
     publisher.publish(ros.Presence(
         sender=1, scenario_id='sc2', role='optimizer', node='/stranger', scenario='{}'))
     bench.until(lambda: 'conflict.sc2' in other.conflicts(), 'the stranger')

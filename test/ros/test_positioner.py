@@ -17,7 +17,8 @@ from rhs_isac_ros.nodes.positioner import PositionerNode
 from rhs_isac_ros.positioning import Network, make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
-from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.support import plugins
 
@@ -81,7 +82,7 @@ def second_estimate(bench, node, send, codebooks):
     def of(kind, topic):
         receiver, messages = bench.add(Node, 'receiver'), []
         estimates = bench.collect(receiver, m.PositionEstimate)
-        subscription = receiver.create_subscription(kind, topic, messages.append, qos.EXCHANGE)
+        subscription = receiver.create_subscription(kind, topic, messages.append, EXCHANGE)
         node.dispatch(CodebookOffered(codebooks[0]))
         # The first estimate creates the topic.
         send(3)
@@ -110,7 +111,7 @@ def test_signals_are_answered_while_another_estimator_is_built(
             begun.set()
             released.wait()
         return make_estimator(name, scenario, codebook, **options)
-    monkeypatch.setattr(positioner, 'make_estimator', slowly)
+    monkeypatch.setattr(positioner.positioning, 'make_estimator', slowly)
     estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
     node.dispatch(CodebookOffered(codebooks[0]))
     send(1)
@@ -133,7 +134,7 @@ def test_a_node_can_be_destroyed_while_an_estimator_is_built(bench, node, codebo
         begun.set()
         made.append(make_estimator(name, scenario, codebook, **options))
         return made[0]
-    monkeypatch.setattr(positioner, 'make_estimator', slowly)
+    monkeypatch.setattr(positioner.positioning, 'make_estimator', slowly)
     node.dispatch(CodebookOffered(codebooks[0]))
     assert begun.wait(10)
     bench.remove(node)

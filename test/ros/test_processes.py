@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from ament_index_python.packages import get_package_prefix
+from system.trial_processes import TrialProcesses
 
 from rhs_isac_ros.executables import PARENT_ID
 from rhs_isac_ros.ros import processes
@@ -84,7 +85,7 @@ def test_cores_memory_and_discovery_limit_the_number_of_processes(
 
 
 def test_cpu_time_and_memory_are_those_of_the_running_processes(tmp_path):
-    with processes.Processes(tmp_path, {'ROS_LOG_DIR': str(tmp_path)}) as children:
+    with TrialProcesses(tmp_path, {'ROS_LOG_DIR': str(tmp_path)}) as children:
         children.start('rhs_controller')
         (child,) = children._running.values()
         while not (before_s := children.cpu_s()['rhs_controller']):

@@ -23,9 +23,10 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.transmission import TransmissionNode
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import ACKS, EXCHANGE
 from rhs_isac_ros.ros.recording import (
+    CycleObserver,
     Recorder,
     RecordingError,
     _offered_qos,
@@ -55,7 +56,7 @@ def recording(bench, probe, tmp_path):
             received(2)]
     publishers = {ros.ReceivedSignals: 'received_signals',
                   ros.PositionEstimate: 'position_estimate'}
-    publishers = {kind: probe.create_publisher(kind, name, qos.EXCHANGE)
+    publishers = {kind: probe.create_publisher(kind, name, EXCHANGE)
                   for kind, name in publishers.items()}
     for publisher in publishers.values():
         bench.until(publisher.get_subscription_count, 'the recorder')
@@ -122,8 +123,8 @@ def test_a_definition_contains_each_of_its_parts_once():
 def test_an_observer_logs_the_cycles_that_it_records(bench, probe, tmp_path):
     recorder = Recorder(tmp_path / 'run.mcap', Scenario())
     observer = bench.add(CycleObserver, recorder)
-    beacon = probe.create_publisher(ros.Beacon, 'beacon', qos.EXCHANGE)
-    state = probe.create_publisher(ros.ProtocolState, 'protocol_state', qos.EXCHANGE)
+    beacon = probe.create_publisher(ros.Beacon, 'beacon', EXCHANGE)
+    state = probe.create_publisher(ros.ProtocolState, 'protocol_state', EXCHANGE)
     for publisher in (beacon, state):
         bench.until(publisher.get_subscription_count, 'the recorder')
     beacon.publish(ros.Beacon(cycle_id=7))
@@ -289,7 +290,7 @@ def test_a_full_disk_ends_the_recording_with_one_error(bench, probe, tmp_path):
     (tmp_path / 'run.mcap.part').symlink_to('/dev/full')
     recorder, seen = Recorder(tmp_path / 'run.mcap', Scenario()), []
     recorder.record_topics(probe, lambda name, message: seen.append(name))
-    publisher = probe.create_publisher(ros.Ack, 'ack', qos.ACKS)
+    publisher = probe.create_publisher(ros.Ack, 'ack', ACKS)
     bench.until(publisher.get_subscription_count, 'the recorder')
 
     def failed():
@@ -313,7 +314,7 @@ def test_the_tool_ends_with_one_line_if_the_disk_is_full(bench, probe, tmp_path)
     process = subprocess.Popen(
         [sys.executable, '-m', 'rhs_isac_ros.tools.record', str(tmp_path / 'run.mcap')],
         stderr=subprocess.PIPE, text=True)
-    publisher = probe.create_publisher(ros.Ack, 'ack', qos.ACKS)
+    publisher = probe.create_publisher(ros.Ack, 'ack', ACKS)
     bench.until(publisher.get_subscription_count, 'the recorder')
 
     def ended():
@@ -330,7 +331,8 @@ def test_the_tool_ends_with_one_line_if_the_disk_is_full(bench, probe, tmp_path)
 def test_nodes_receive_a_recording_that_is_played_with_its_recorded_qos(bench, tmp_path):
     """As ``ros2 bag play`` does, which reads the quality of service from the file."""
     codebook = Codebook.load(default_codebook_file())
-    message = convert.codebook_to_ros(codebook, Time(), 1, Scenario().id)
+    message = convert.to_ros(
+        convert.CodebookMessage.of(codebook, 1, Scenario().id), Time())
     player = bench.add(Node, 'player')
     (recorded,) = yaml.safe_load(_offered_qos(recorded_topics()[topics.CODEBOOK][1]))
     assert recorded['liveliness_lease_duration'] == recorded['deadline']

@@ -3,7 +3,7 @@ import types
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Pose
+from geometry_msgs.msg import Pose, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node as Node_
@@ -11,6 +11,7 @@ from rclpy.node import Node as Node_
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import refusals
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix
+from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.robot import RobotMobility, follow_frame, follow_odometry
 
 # Turned by 90 degrees about z, and moved.
@@ -101,3 +102,47 @@ def test_transforms_that_were_refused_are_lacking(bench, monkeypatch):
     bench.spin_once()
     assert mobility.lack == 'transform from map to base_link'
     assert '/tf was refused: rt/tf' in ''.join(refusals(node).values())
+
+
+class Buffer:
+    """The part of tf2_ros.Buffer that a robot uses, which has no wheel; tf2_ros itself is tested
+    in test/nodes/test_robot_example.py."""
+
+    latest = None
+
+    def __init__(self, cache_time=None, node=None):
+        Buffer.last = self
+
+    def can_transform(self, target_frame, source_frame, time):
+        return self.latest is not None and (target_frame, source_frame) == ('map', 'base_link')
+
+    def lookup_transform(self, target_frame, source_frame, time):
+        assert self.can_transform(target_frame, source_frame, time)
+        return self.latest
+
+    def put(self, nanoseconds, x):
+        self.latest = TransformStamped()
+        self.latest.header.stamp.sec, self.latest.header.stamp.nanosec = divmod(
+            nanoseconds, 10**9)
+        self.latest.transform.translation.x = x
+
+
+def test_a_frame_is_followed_with_the_velocity_between_two_transforms(bench, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(
+        Buffer=Buffer, TransformListener=lambda buffer, node: object()))
+    node = bench.add(Node_, 'robot_user')
+    mobility = follow_frame(node, Frame(), 'base_link', 60.0)
+    assert mobility.lack == 'transform from map to base_link'
+    begin_ns = node.get_clock().now().nanoseconds
+    Buffer.last.put(begin_ns, 5.0)
+    bench.until(lambda: not mobility.lack, 'the position')
+    assert mobility.state(0.0)[1].tolist() == [0.0, 0.0, 0.0]
+    Buffer.last.put(begin_ns + 10**9 // 2, 6.0)
+    bench.until(lambda: mobility.state(0.0)[1].any(), 'the velocity')
+    np.testing.assert_allclose(mobility.state(0.0)[1], [2.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_frame_needs_tf2_ros(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
+    with pytest.raises(ParameterError, match="mobility: 'tf', .* tf2_ros is not installed"):
+        follow_frame(Node(), Frame(), 'base_link', 1.0)

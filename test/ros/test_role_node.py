@@ -9,13 +9,13 @@ from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
-from rhs_isac_ros.protocol.role import PlainRole
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import steady_timer
+from rhs_isac_ros.protocol.role import Role
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import LATCHED, steady_timer
 from rhs_isac_ros.ros.role_node import RoleNode
 
 
-class Scripted(PlainRole):
+class Scripted(Role):
     """A role that records its events and follows the script of the test."""
 
     def __init__(self, script=lambda role, event, now_s: [], sends=(), receives=()):
@@ -173,7 +173,7 @@ def test_a_node_withdraws_publishers_despite_an_observer_with_incompatible_qos(b
     node.start(Scripted(sends=kinds))
     for kind in kinds:
         probe.create_subscription(
-            convert.ros_type(kind), topics.NAMES[kind], lambda _: None, qos.LATCHED)
+            convert.ros_type(kind), topics.NAMES[kind], lambda _: None, LATCHED)
     changes, periods_s = [], itertools.cycle((1e-4, 3e-4, 1e-3, 2e-3, 5e-3))
 
     def change():
@@ -332,7 +332,7 @@ def test_a_late_joiner_receives_the_latest_statistics(bench, start):
         assert node.publish(m.CapacityStatistics(cycle_id=n, n_reports=n, **quartiles))
     late, received, kind = bench.add(Node, 'late'), [], m.CapacityStatistics
     late.create_subscription(
-        convert.ros_type(kind), topics.NAMES[kind], received.append, qos.LATCHED)
+        convert.ros_type(kind), topics.NAMES[kind], received.append, LATCHED)
     bench.until(lambda: received, 'the statistics')
     (message,) = received
     assert message.n_reports == 2

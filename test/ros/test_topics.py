@@ -9,8 +9,9 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.validate_topic_name import validate_topic_name
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.base_station_memory import MAX_USERS
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.protocol.user_registry import MAX_USERS
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, OBSERVATION, profile_for
 from rhs_isac_ros.ros.recording import recorded_topics, type_name
 from rhs_isac_ros.ros.roster import ROSTER
 
@@ -32,7 +33,7 @@ def test_a_burst_of_messages_is_received_completely(bench, probe):
     # Such as the acks of a hundred users, or the pilots of a band, before the node spins.
     received = []
     probe.create_subscription(
-        convert.ros_type(m.Ack), topics.NAMES[m.Ack], received.append, qos.EXCHANGE)
+        convert.ros_type(m.Ack), topics.NAMES[m.Ack], received.append, EXCHANGE)
     publisher = bench.publisher(probe, m.Ack)
     for user in range(100):
         publisher.publish(convert.ros_type(m.Ack)(cycle_id=1, user=user))
@@ -44,14 +45,14 @@ def test_a_late_joiner_receives_latched_messages_only(
         bench, probe):
     kind = convert.ros_type(m.Ack)
     publishers = {name: probe.create_publisher(kind, name, profile)
-               for name, profile in (('exchange', qos.EXCHANGE), ('latched', qos.LATCHED))}
+               for name, profile in (('exchange', EXCHANGE), ('latched', LATCHED))}
     for user in (1, 2):
         for publisher in publishers.values():
             publisher.publish(kind(user=user))
     late = bench.add(Node, 'late')
     received = {'exchange': [], 'latched': []}
-    late.create_subscription(kind, 'exchange', received['exchange'].append, qos.EXCHANGE)
-    late.create_subscription(kind, 'latched', received['latched'].append, qos.LATCHED)
+    late.create_subscription(kind, 'exchange', received['exchange'].append, EXCHANGE)
+    late.create_subscription(kind, 'latched', received['latched'].append, LATCHED)
     bench.until(lambda: received['latched'] and all(
         p.get_subscription_count() for p in publishers.values()), 'the latched message')
     for publisher in publishers.values():
@@ -63,15 +64,15 @@ def test_a_late_joiner_receives_latched_messages_only(
 
 
 def test_only_the_statistics_are_latched():
-    assert {kind for kind in topics.NAMES if qos.profile_for(kind) is qos.LATCHED} == {
+    assert {kind for kind in topics.NAMES if profile_for(kind) is LATCHED} == {
         m.CapacityStatistics}
-    assert {kind for kind in topics.NAMES if qos.profile_for(kind) is qos.EXCHANGE} == set(
+    assert {kind for kind in topics.NAMES if profile_for(kind) is EXCHANGE} == set(
         topics.NAMES) - {m.CapacityStatistics, m.Ack}
 
 
 def test_the_queue_of_acks_holds_those_of_all_users():
-    assert qos.profile_for(m.Ack).depth == MAX_USERS
-    assert qos.profile_for(m.Ack, qos.OBSERVATION) is qos.OBSERVATION
+    assert profile_for(m.Ack).depth == MAX_USERS
+    assert profile_for(m.Ack, OBSERVATION) is OBSERVATION
 
 
 def test_the_table_of_the_documentation_is_that_of_the_code():

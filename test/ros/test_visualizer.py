@@ -11,7 +11,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def shown(bench, probe, small_files, request):
                 del latest[marker.ns, marker.id]
             else:
                 latest[marker.ns, marker.id] = marker
-    probe.create_subscription(MarkerArray, topics.MARKERS, receive, qos.EXCHANGE)
+    probe.create_subscription(MarkerArray, topics.MARKERS, receive, EXCHANGE)
     return latest
 
 
@@ -123,7 +124,7 @@ def test_each_user_has_a_path(bench, probe, shown):
     for name in (topics.PATH, topics.TRUE_PATH):
         probe.create_subscription(
             Path, name.format(user=7), lambda path, name=name: paths.update({name: path}),
-            qos.EXCHANGE)
+            EXCHANGE)
     truths, estimates = (
         bench.publisher(probe, kind) for kind in (m.GroundTruth, m.PositionEstimate))
     stamp = probe.get_clock().now().to_msg()

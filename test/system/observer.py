@@ -16,9 +16,9 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import cycle_log
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, diagnostics, qos, topics
-from rhs_isac_ros.ros.endpoints import subscribe
-from rhs_isac_ros.ros.observer import CycleObserver
+from rhs_isac_ros.ros import convert, diagnostics, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, subscribe
+from rhs_isac_ros.ros.recording import CycleObserver
 from system import invariants
 
 
@@ -54,9 +54,9 @@ class NetworkObserver(CycleObserver):
         self.warnings: dict[str, list[str]] = {}
         self.n_codebooks = 0
         self.on_phase: Callable[[m.Phase], None] = lambda phase: None
-        self._subscribe(ros.Codebook, topics.CODEBOOK, qos.LATCHED, self._on_codebook)
+        self._subscribe(ros.Codebook, topics.CODEBOOK, LATCHED, self._on_codebook)
         self._subscribe(
-            DiagnosticArray, topics.DIAGNOSTICS, qos.EXCHANGE, self._on_diagnostics)
+            DiagnosticArray, topics.DIAGNOSTICS, EXCHANGE, self._on_diagnostics)
 
     def observe(self, message: m.Message, now_s: float) -> None:
         """Process a message that arrived at `now_s` [s]."""

@@ -23,8 +23,7 @@ from rhs_isac_ros.model import Scenario, draw_surface, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.settings import Impairments
-from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.recording import Recorder
+from rhs_isac_ros.ros.recording import CycleObserver, Recorder
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.tools.calibrate import main
 

@@ -6,8 +6,6 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
-from nav_msgs.msg import Odometry
-from rosgraph_msgs.msg import Clock
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
@@ -60,15 +58,25 @@ def test_a_user_may_not_publish_messages_of_another_role():
         assert not allowed[f'/user_{number}']['request']
 
 
-def test_a_robot_may_read_its_positions_and_no_other_user_may(capsys):
-    assert permissions.main(['--users', '3', '--robot', '2=/tf', '--robot', '3=robot/odom']) == 0
-    allowed, plain = rules(capsys.readouterr().out), rules(permissions.policy(users=3))
-    more = {path: rights['subscribe'] - plain[path]['subscribe']
-            for path, rights in allowed.items()}
-    transforms = {topics.TF, topics.TF_STATIC}
-    assert {path: names for path, names in more.items() if names} == {
-        '/user_2': transforms, '/user_3': {'/robot/odom'}, '/operator': {'/robot/odom'},
-        '/network': {*transforms, '/robot/odom'}}
+def test_a_robot_may_read_its_odometry_or_transforms(processes, make_watch):
+    watch = make_watch('/closed')
+    processes.start('user', name='user_1', namespace='/closed', use_sim_time=True,
+                    mobility='odometry', odometry_topic='/robot/odom')
+    allowed = rules(permissions.policy('/closed', 3, {1: '/robot/odom', 3: 'tf'}, True))
+    rights = allowed['/closed/user_1']['subscribe']
+
+    def subscribed():
+        if ('user_1', '/closed') not in watch.node.get_node_names_and_namespaces():
+            return set()
+        return {name for name, _ in
+                watch.node.get_subscriber_names_and_types_by_node('user_1', '/closed')}
+    watch.until(lambda: subscribed() >= rights, 'the subscriptions')
+    assert subscribed() == rights
+    plain, robot = allowed['/closed/user_2'], allowed['/closed/user_3']
+    assert '/clock' in plain['subscribe'] and '/robot/odom' not in plain['subscribe']
+    assert robot['subscribe'] - plain['subscribe'] == {topics.TF, topics.TF_STATIC}
+    assert '/closed/tf2_frames' in robot['reply']
+    assert allowed['/closed/network']['subscribe'] >= rights | robot['subscribe']
 
 
 def test_only_the_operator_may_set_parameters_of_other_nodes():
@@ -148,53 +156,33 @@ def test_publishers_are_those_of_the_documentation():
         assert allowed_to == expected
 
 
-@pytest.mark.parametrize('arguments', [
-    ['--namespace', 'lab'], ['--users', '-1'], ['--robot', '3=odom'], ['--robot', '0=odom'],
-    ['--robot', '1='], ['--robot', '1=a//b']])
+@pytest.mark.parametrize('arguments', [['--namespace', 'lab'], ['--users', '-1']])
 def test_invalid_arguments_are_rejected(arguments, capsys):
     with pytest.raises(SystemExit):
         permissions.main(arguments)
     assert 'error: argument' in capsys.readouterr().err
 
 
-def drive(node):
-    """Publish the odometry of a robot that stands still."""
-    publisher, message = node.create_publisher(Odometry, 'odom', 10), Odometry()
-    message.header.frame_id = topics.MAP_FRAME
-    message.pose.pose.position.x, message.pose.pose.orientation.w = 8.0, 1.0
-
-    def publish():
-        message.header.stamp = node.get_clock().now().to_msg()
-        publisher.publish(message)
-    node.create_timer(0.05, publish)
-
-
 def test_policy_and_graph_agree(processes, make_watch, small_files):
     """A running network uses all allowed rights and no others."""
     space, watch = '/closed', make_watch('/closed')
-    files = {'scenario_file': small_files / 'scenario.yaml', 'use_sim_time': True}
-    clock = watch.node.create_publisher(Clock, topics.CLOCK, 10)
-    watch.node.create_timer(
-        0.02, lambda: clock.publish(Clock(clock=watch.node.get_clock().now().to_msg())))
     network = processes.start(
         'network', namespace=space, users=2, rest_s=0.0, prior='track',
-        codebook_file=small_files / 'first.yaml', **files)
-    visualizer = processes.start('visualizer', namespace=space, **files)
+        scenario_file=small_files / 'scenario.yaml', codebook_file=small_files / 'first.yaml')
+    visualizer = processes.start(
+        'visualizer', namespace=space, scenario_file=small_files / 'scenario.yaml')
     users = processes.start(
-        'user', namespace=space, name='users', user_id=3, user_count=2, **files)
-    robot = processes.start(
-        'user', namespace=space, name='user_5', user_id=5, mobility='odometry',
-        ground_truth_period_s=0.05, **files)
-    drive(watch.node)
-    allowed = rules(permissions.policy(space, users=5, robots={5: 'odom'}))
+        'user', namespace=space, name='users', user_id=3, user_count=2,
+        scenario_file=small_files / 'scenario.yaml')
+    allowed = rules(permissions.policy(space, users=4))
     # Those of several nodes have tests of their own, and users 3 and 4 have one node.
     for name in ('operator', 'replay', 'network', 'user_3', 'user_4'):
         del allowed[f'{space}/{name}']
     if not importlib.util.find_spec('tf2_msgs'):
         allowed[f'{space}/visualizer']['publish'] -= {topics.TF, topics.TF_STATIC}
-    # This node has two of the five users.
+    # This node has two of the four users.
     allowed[f'{space}/users']['publish'] -= {
-        f'{space}/{topics.TRUE_ODOMETRY.format(user=user)}' for user in (1, 2, 5)}
+        f'{space}/{topics.TRUE_ODOMETRY.format(user=user)}' for user in (1, 2)}
 
     def used(path):
         node, name = watch.node, path.rpartition('/')[2]
@@ -209,8 +197,8 @@ def test_policy_and_graph_agree(processes, make_watch, small_files):
                 for right, pairs in found.items()}
 
     # After two cycles, all nodes have created all their publishers and subscriptions.
-    for user in range(1, 6):
-        watch.until_served(2, user, processes=[network, visualizer, users, robot])
+    for user in range(1, 5):
+        watch.until_served(2, user, processes=[network, visualizer, users])
     watch.until(lambda: {f'{place}/{name}' for name, place in
                          watch.node.get_node_names_and_namespaces()} >= allowed.keys(),
                 'every node in the graph', [network, visualizer])

@@ -17,9 +17,9 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos
-from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.recording import Recorder, read
+from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.endpoints import EXCHANGE
+from rhs_isac_ros.ros.recording import CycleObserver, Recorder, read
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.tools import replay
 from rhs_isac_ros.tools.replay import errors_m, load, main, tracked_errors_m
@@ -169,7 +169,7 @@ def test_a_running_positioner_reproduces_the_recorded_estimates(run, shared_sess
     received = {}
     subscription = shared_session.node.create_subscription(
         convert.ros_type(m.PositionEstimate), '/again/position_estimate',
-        lambda message: received.update({message.cycle_id: content(message)}), qos.EXCHANGE)
+        lambda message: received.update({message.cycle_id: content(message)}), EXCHANGE)
     assert shared_session.spin_until(lambda: subscription.get_publisher_count() > 0, 60)
     # A cycle that was repeated has its signals twice.
     signals = [message.cycle_id for _, message, _ in read(run.path, ['/received_signals'])]

@@ -22,7 +22,7 @@ from rhs_isac_ros.monitoring.shapes import (
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.tools.rerun_stream import RerunStream, blueprint
 
-rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/_view)')
+rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/setup view)')
 PLACES = np.array([[9.0, 1.0, 0.5], [8.0, 2.0, 0.0]])
 COLOURS = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]])
 QUATERNIONS = np.array([[0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 0.0, 1.0]])

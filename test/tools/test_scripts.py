@@ -33,6 +33,14 @@ def test_a_link_in_another_directory_finds_the_package(built_scripts, tmp_path):
     assert done.stdout.startswith('usage: scripts/param ')
 
 
+def test_setup_rejects_an_unknown_group():
+    done = subprocess.run([SCRIPTS / 'setup', 'recordin'], capture_output=True, text=True,
+                          check=False)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr == ("scripts/setup: 'recordin', expected recording, experiments, docs, "
+                           'test, view or peers\n')
+
+
 @pytest.mark.parametrize(('script', 'built', 'distribution', 'line'), [
     ('scripts/setup', 'system', '',
      'scripts/setup: this clone was built on ROS 2 Jazzy, which is not sourced'),

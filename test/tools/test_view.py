@@ -20,8 +20,14 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring import network_view
 from rhs_isac_ros.monitoring.shapes import user_colour
-from rhs_isac_ros.ros.observer import CycleObserver
-from rhs_isac_ros.ros.recording import Recorder, RecordingError, read, schema, type_name
+from rhs_isac_ros.ros.recording import (
+    CycleObserver,
+    Recorder,
+    RecordingError,
+    read,
+    schema,
+    type_name,
+)
 from rhs_isac_ros.tools.replay import load
 from rhs_isac_ros.tools.view import Posteriors, ViewNode, entries, main
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.bounds import PairwiseErrorCost
+from rhs_isac_ros.bounds.rows import Evaluation
 from rhs_isac_ros.codebook import Codebook, optimize, random_codebook
-from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, ambiguity
+from rhs_isac_ros.codebook.codebook import Provenance
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, ambiguity, draw_confusable, sobol
 from rhs_isac_ros.codebook.optimize import DEFAULT_POSITIONS
-from rhs_isac_ros.codebook.provenance import Provenance
-from rhs_isac_ros.codebook.sampling import draw_confusable, sobol
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 
@@ -31,7 +31,7 @@ N_STEPS = 8
 def all_pairs(objective: PairwiseErrorCost, codebook: Codebook) -> float:
     """Evaluate value and matrix products of the gradient as a plain loop over blocks."""
     rows, total = objective.rows, 0.0
-    evaluation = rows.begin(MeasurementModel(objective.scenario, codebook))
+    evaluation = Evaluation(rows, MeasurementModel(objective.scenario, codebook))
     for start in range(0, rows.n_items, 128):
         block = slice(start, min(start + 128, rows.n_items))
         whitened = [evaluation.whitened(block, band)

@@ -11,16 +11,15 @@ import numpy as np
 
 from rhs_isac_ros.bounds.fisher import inverse_information, quadratic_form
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.impairments import AppliedBeams
 from rhs_isac_ros.model.los import los_derivative, los_gain
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     measurement_correlation,
     multipath_covariance,
 )
-from rhs_isac_ros.positioning.expansion import Means
+from rhs_isac_ros.model.surface import AppliedBeams
 from rhs_isac_ros.positioning.grid import TemplateTable, tabulate
-from rhs_isac_ros.positioning.lattice import Resolution
+from rhs_isac_ros.positioning.lattice import Means, Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood, NuisancePrior, Signals
 from rhs_isac_ros.positioning.posterior import WeightedSamples, draw_samples
 from rhs_isac_ros.positioning.search import find_modes

@@ -13,8 +13,9 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.cdr import HEADER
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.ros.run import run
 
@@ -74,13 +75,13 @@ class BareNode(Node):
         self._steps = [(number, {*step.after}, HEADER + bytes([number]) + bytes(step.size))
                        for number, step in steps]
         self._senders = {number: self.create_publisher(
-            convert.ros_type(step.kind), _topic(step.kind), qos.EXCHANGE)
+            convert.ros_type(step.kind), _topic(step.kind), EXCHANGE)
             for number, step in steps}
         member = ROSTER.get(process.rstrip('_12'))
         for kind in member.role.RECEIVES if member else KINDS:
             self.create_subscription(
                 convert.ros_type(kind), _topic(kind), self._receive if member else _ignore,
-                qos.EXCHANGE, raw=True,
+                EXCHANGE, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
         if process == 'bs':
             self._began_s, self._is_resting = time.perf_counter(), True

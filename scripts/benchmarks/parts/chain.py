@@ -10,7 +10,8 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos, topics
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import OBSERVATION
 
 # The messages of the chain. Others are sent in parallel with them.
 KINDS = (m.Beacon, m.Ack, m.RhsCommand, m.RhsConfiguration, m.PilotRequest, m.Pilot, m.FeedSignals,
@@ -44,7 +45,7 @@ class ChainObserver(Node):
             collections.defaultdict(list))
         for kind in KINDS:
             self.create_subscription(
-                convert.ros_type(kind), topics.NAMES[kind], self._store(kind), qos.OBSERVATION,
+                convert.ros_type(kind), topics.NAMES[kind], self._store(kind), OBSERVATION,
                 raw=True, event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
 
     def _store(self, kind: type[m.Message]) -> Callable[[bytes], None]:

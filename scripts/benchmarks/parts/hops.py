@@ -12,7 +12,8 @@ from rclpy.node import Node
 from rhs_isac_msgs.msg import FeedSignals
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert, qos
+from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.run import run
 
 # Messages of a cycle in order. Those of all bands are sent in parallel and count once.
@@ -34,7 +35,7 @@ def ping_pong(scenario: Scenario, composed: bool = False) -> np.ndarray:
     message = convert.to_ros(m.FeedSignals(cycle_id=1, user=1, band=0, signals=feeds), None)
     times_s: list[float] = []
     node = Node('ping')
-    publisher = node.create_publisher(FeedSignals, 'benchmark/ping', qos.EXCHANGE)
+    publisher = node.create_publisher(FeedSignals, 'benchmark/ping', EXCHANGE)
 
     def on_pong(_: FeedSignals) -> None:
         times_s.append(time.perf_counter() - on_pong.sent_s)
@@ -42,7 +43,7 @@ def ping_pong(scenario: Scenario, composed: bool = False) -> np.ndarray:
         publisher.publish(message)
 
     node.create_subscription(
-        FeedSignals, 'benchmark/pong', on_pong, qos.EXCHANGE,
+        FeedSignals, 'benchmark/pong', on_pong, EXCHANGE,
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
     executor = EventsExecutor()
     nodes = [node, *make_pong()] if composed else [node]
@@ -71,9 +72,9 @@ def ping_pong(scenario: Scenario, composed: bool = False) -> np.ndarray:
 def make_pong() -> list[Node]:
     """Return a node that echoes each message."""
     node = Node('pong')
-    publisher = node.create_publisher(FeedSignals, 'benchmark/pong', qos.EXCHANGE)
+    publisher = node.create_publisher(FeedSignals, 'benchmark/pong', EXCHANGE)
     node.create_subscription(
-        FeedSignals, 'benchmark/ping', publisher.publish, qos.EXCHANGE,
+        FeedSignals, 'benchmark/ping', publisher.publish, EXCHANGE,
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
     return [node]
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import AverageCrlb
 from rhs_isac_ros.codebook import Progress, optimize, random_codebook
-from rhs_isac_ros.codebook.objective import ROW_TOLERANCE
-from rhs_isac_ros.codebook.sampling import monte_carlo
+from rhs_isac_ros.codebook.objective import ROW_TOLERANCE, monte_carlo
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support import streams
 

@@ -3,13 +3,13 @@
 from typing import Any
 
 import numpy as np
+from parts.exhaustive_posterior import exhaustive_posterior, posterior_with_truth
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.experiments.resampling import reduction
+from rhs_isac_ros.experiments.resampling import replicate
 from rhs_isac_ros.model import ElementErrors, Scenario
-from rhs_isac_ros.positioning import Estimate, exhaustive_posterior
+from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.positioning.failures import can_enumerate
-from rhs_isac_ros.positioning.reference import posterior_with_truth
 
 
 def reference_means(
@@ -36,6 +36,7 @@ def ratio_to_reference(
     fix = estimate.fix[:n]
     own = np.sum((estimate.mean[:n] - positions)[fix]**2, axis=1)
     best = np.sum(np.prod(reference - positions, axis=0)[fix], axis=1)
-    value, low, high = reduction(own, best, lambda samples: samples.mean(axis=-1))
+    found, exact = (replicate(errors[None], 0)[0] for errors in (own, best))
+    value, low, high = found.reduction_from(exact)
     return {'mse_to_reference': (1 - value / 100, 1 - high / 100, 1 - low / 100),
             'reference_positions': n}

@@ -6,7 +6,7 @@ import numpy as np
 
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.positioning import Estimate
-from rhs_isac_ros.positioning.innovation_test import WINDOW, InnovationTest
+from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest
 
 
 def warnings(estimate: Estimate, n_windows: int) -> dict[str, Any]:

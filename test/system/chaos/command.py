@@ -17,9 +17,9 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.command_line import check_domain
-from rhs_isac_ros.ros.early import use_discovery_profile
-from rhs_isac_ros.ros.processes import Processes, private_domain
+from rhs_isac_ros.ros.processes import private_domain
+from rhs_isac_ros.ros.run import check_domain
+from rhs_isac_ros.ros.startup import use_discovery_profile
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
@@ -33,6 +33,7 @@ from system.chaos import crashes, fuzzing, intruders, report, soaking
 from system.chaos.trial import ChaosError, Trial
 from system.invariants import CHECK_DELAY_S
 from system.observer import NetworkObserver
+from system.trial_processes import TrialProcesses
 
 # Pause between cycles [s]; a longer one during fuzzing leaves room for messages in the queues.
 _REST_S, _FUZZING_REST_S = 0.02, 0.2
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rclpy.init(args=[])
     observer = NetworkObserver(scenario)
     with tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs:
-        processes = Processes(Path(logs), {'ROS_LOG_DIR': logs})
+        processes = TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs})
         try:
             with processes:
                 start_network(
@@ -90,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-        observer: NetworkObserver, processes: Processes, scenario: Scenario,
+        observer: NetworkObserver, processes: TrialProcesses, scenario: Scenario,
         options: argparse.Namespace, folder: Path, codebook_file: Path) -> dict[str, Any]:
     if options.soak:
         return _soak(observer, processes, options)
@@ -111,7 +112,7 @@ def _run(
 
 
 def _soak(
-        observer: NetworkObserver, processes: Processes, options: argparse.Namespace
+        observer: NetworkObserver, processes: TrialProcesses, options: argparse.Namespace
 ) -> dict[str, Any]:
     result = soaking.soak(
         observer, processes, options.soak, lambda minutes, cycles: _show_progress(
@@ -124,7 +125,7 @@ def _soak(
 
 
 def _fuzz(
-        observer: NetworkObserver, processes: Processes, scenario: Scenario,
+        observer: NetworkObserver, processes: TrialProcesses, scenario: Scenario,
         options: argparse.Namespace) -> dict[str, Any]:
     result = fuzzing.fuzz(
         observer, processes, scenario, options.fuzz, np.random.default_rng(options.seed),
@@ -134,7 +135,7 @@ def _fuzz(
 
 
 def _crash(
-        observer: NetworkObserver, processes: Processes, options: argparse.Namespace
+        observer: NetworkObserver, processes: TrialProcesses, options: argparse.Namespace
 ) -> list[crashes.CrashTrial]:
     print(report.CRASH_HEAD)
     phases = [m.Phase[name.upper()] for name in options.phases or _PHASES]
@@ -144,7 +145,7 @@ def _crash(
 
 
 def _intrude(
-        observer: NetworkObserver, processes: Processes, scenario: Scenario,
+        observer: NetworkObserver, processes: TrialProcesses, scenario: Scenario,
         options: argparse.Namespace, folder: Path, codebook_file: Path
 ) -> list[intruders.IntrusionTrial]:
     print(report.INTRUSION_HEAD)

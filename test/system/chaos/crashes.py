@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.roster import ROSTER
 from system.chaos.trial import (
     TIMEOUT_S,
@@ -17,6 +16,7 @@ from system.chaos.trial import (
     warnings_since,
 )
 from system.observer import NetworkObserver
+from system.trial_processes import TrialProcesses
 
 # Messages that each node publishes.
 PUBLISHES = {name if member.is_unique else f'{name}_1': member.role.SENDS if member.role else ()
@@ -46,7 +46,7 @@ class CrashTrial(Trial):
 
 
 def crash_all(
-        observer: NetworkObserver, processes: Processes, nodes: Sequence[str],
+        observer: NetworkObserver, processes: TrialProcesses, nodes: Sequence[str],
         phases: Iterable[m.Phase], on_trial: Callable[[CrashTrial], None],
         repetitions: int = 1) -> list[CrashTrial]:
     """Kill every node in every phase.
@@ -76,7 +76,8 @@ def crash_all(
 
 
 def crash(
-        observer: NetworkObserver, processes: Processes, node: str, phase: m.Phase) -> CrashTrial:
+        observer: NetworkObserver, processes: TrialProcesses, node: str, phase: m.Phase
+) -> CrashTrial:
     """Kill a node in a phase, and restart it.
 
     Raises
@@ -107,7 +108,7 @@ def crash(
 
 
 def _kill_in(
-        observer: NetworkObserver, processes: Processes, node: str, phase: m.Phase) -> float:
+        observer: NetworkObserver, processes: TrialProcesses, node: str, phase: m.Phase) -> float:
     """Kill a node as soon as a cycle enters a phase; return how long that took [s]."""
     delays_s: list[float] = []
 

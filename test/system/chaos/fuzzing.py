@@ -16,8 +16,8 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.role import NewestDict
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import subscribe
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, profile_for, subscribe
 from rhs_isac_ros.ros.processes import Processes
 from system.chaos.mutations import mutate
 from system.chaos.trial import ChaosError, both_served
@@ -32,11 +32,11 @@ _MAX_PUBLISHED = 100 * _BATCH
 _PROTOCOL = {name: kind for kind, name in topics.NAMES.items()}
 # Topics with other messages.
 _OTHERS = {
-    topics.CODEBOOK: (ros.Codebook, qos.LATCHED),
-    topics.PRESENCE: (ros.Presence, qos.PRESENCES),
-    topics.POSITION: (PoseWithCovarianceStamped, qos.EXCHANGE),
-    topics.DIAGNOSTICS: (DiagnosticArray, qos.EXCHANGE),
-    topics.MARKERS: (MarkerArray, qos.EXCHANGE),
+    topics.CODEBOOK: (ros.Codebook, LATCHED),
+    topics.PRESENCE: (ros.Presence, PRESENCES),
+    topics.POSITION: (PoseWithCovarianceStamped, EXCHANGE),
+    topics.DIAGNOSTICS: (DiagnosticArray, EXCHANGE),
+    topics.MARKERS: (MarkerArray, EXCHANGE),
 }
 # Topics without messages in a correct network with one codebook, a node for each user and no
 # visualizer.
@@ -161,7 +161,7 @@ def fuzz(
     ChaosError
         If a node does not receive the messages of another one, or a mutation.
     """
-    mutators = [_Mutator(observer, name, convert.ros_type(kind), qos.profile_for(kind))
+    mutators = [_Mutator(observer, name, convert.ros_type(kind), profile_for(kind))
                 for name, kind in _PROTOCOL.items()]
     mutators += [_Mutator(observer, name, kind, profile)
                  for name, (kind, profile) in _OTHERS.items()]

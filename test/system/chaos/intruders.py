@@ -12,9 +12,8 @@ from rclpy.node import Node
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.ros import convert, qos, topics
-from rhs_isac_ros.ros.endpoints import subscribe
-from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.ros.endpoints import LATCHED, subscribe
 from rhs_isac_ros.ros.roster import UNIQUE
 from system.chaos.crashes import PUBLISHES
 from system.chaos.trial import (
@@ -25,6 +24,7 @@ from system.chaos.trial import (
     warnings_since,
 )
 from system.observer import NetworkObserver
+from system.trial_processes import TrialProcesses
 
 # A channel of another scenario, a node with the number of user 1, and a second base station beside
 # an observer that requests an incompatible quality of service.
@@ -58,7 +58,7 @@ class IntrusionTrial(Trial):
 
 
 def intrude_all(
-        observer: NetworkObserver, processes: Processes, intruders: Iterable[str],
+        observer: NetworkObserver, processes: TrialProcesses, intruders: Iterable[str],
         seconds: float, folder: Path, parameters: dict[str, Any], scenario: Scenario,
         codebook: Codebook, on_trial: Callable[[IntrusionTrial], None]) -> list[IntrusionTrial]:
     """Add each intruder to a network for a time.
@@ -99,7 +99,7 @@ def _incompatible_observer() -> Iterator[None]:
     """Run a node that requests the latest message of every topic, which most do not offer."""
     node = Node('incompatible')
     for kind, name in topics.NAMES.items():
-        subscribe(node, convert.ros_type(kind), name, lambda content: None, qos.LATCHED, raw=True)
+        subscribe(node, convert.ros_type(kind), name, lambda content: None, LATCHED, raw=True)
     try:
         yield
     finally:
@@ -129,7 +129,7 @@ def _commands(
 
 
 def _intrude(
-        observer: NetworkObserver, processes: Processes, intruder: str,
+        observer: NetworkObserver, processes: TrialProcesses, intruder: str,
         command: tuple[str, str, dict[str, Any]], seconds: float) -> IntrusionTrial:
     wait_for_service(observer)
     executable, node, parameters = command

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable, Mapping
 
 from rhs_isac_ros.protocol.settings import Impairments
-from rhs_isac_ros.ros.processes import Processes
 from system.chaos.trial import ChaosError
 from system.observer import NetworkObserver
+from system.trial_processes import TrialProcesses
 
 IMPAIRMENTS = Impairments(
     loss_probability=0.05, double_probability=0.05, delay_s=0.001, jitter_s=0.005)
@@ -72,7 +72,7 @@ class SoakResult:
 
 
 def soak(
-        observer: NetworkObserver, processes: Processes, minutes: float,
+        observer: NetworkObserver, processes: TrialProcesses, minutes: float,
         on_progress: Callable[[float, int], None]) -> SoakResult:
     """Observe a network for a time.
 

@@ -14,8 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.ros.early import discovery_profile_file
-from rhs_isac_ros.ros.processes import Processes
+from rhs_isac_ros.ros.startup import discovery_profile_file
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
@@ -36,6 +35,7 @@ from system.hosts.trial import NetworkBroken, Trial
 from system.hosts.verdict import Outage, figures, table
 from system.observer import NetworkObserver
 from system.recovery import RECOVERY_LIMIT_S
+from system.trial_processes import TrialProcesses
 
 # Exit code of a skipped test, as test drivers define it.
 SKIPPED = 77
@@ -83,7 +83,7 @@ def _run(
         profile: Path | None) -> int:
     _set_environment(profile, options.static_peers)
     with Hosts() as hosts, tempfile.TemporaryDirectory(prefix='rhs_isac_ros.') as logs, \
-            Processes(Path(logs), {'ROS_LOG_DIR': logs}, hosts.command_prefix) as processes:
+            TrialProcesses(Path(logs), {'ROS_LOG_DIR': logs}, hosts.command_prefix) as processes:
         start_network(processes, options.users, options.seed, options.config, codebook_file,
                       scenario)
         hosts.enter(plan.OBSERVER)

@@ -4,7 +4,7 @@ import ipaddress
 
 import pytest
 
-from rhs_isac_ros.ros.early import discovery_profile_file
+from rhs_isac_ros.ros.startup import discovery_profile_file
 from system.hosts import plan
 
 

@@ -1,0 +1,47 @@
+"""Operations on arrays that all parts of the model share."""
+
+import functools
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    """Make an array read-only and return it."""
+    array.flags.writeable = False
+    return array
+
+
+def adjoint(matrices: np.ndarray) -> np.ndarray:
+    """Return the conjugate transposes of matrices [..., n, m]."""
+    return np.conj(np.swapaxes(matrices, -2, -1))
+
+
+def blocks(n: int, size: int) -> list[slice]:
+    """Split n items into blocks of a size; the last one may be smaller."""
+    return [slice(start, start + size) for start in range(0, n, size)]
+
+
+@functools.cache
+def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights of a quadrature from -1 to 1; their computation takes long."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    return read_only(nodes), read_only(weights)
+
+
+def digest(*arrays: np.ndarray) -> str:
+    """Return 16 hexadecimal digits that identify the bytes of little-endian arrays."""
+    return hashlib.sha256(b''.join(array.tobytes() for array in arrays)).hexdigest()[:16]
+
+
+def check_arrays(owner: Any, shapes: Mapping[str, tuple[int, ...]],
+                 error: type[ValueError] = ValueError) -> None:
+    """Raise an error unless attributes have these shapes and are finite."""
+    for name, shape in shapes.items():
+        array = getattr(owner, name)
+        if np.shape(array) != shape:
+            raise error(f'{name}: shape {np.shape(array)}, expected {shape}')
+        if not np.isfinite(array).all():
+            raise error(f'{name}: not finite, expected finite numbers')

@@ -1,0 +1,336 @@
+"""Coefficients of the elements of a surface: drawn, declared as unknown, or estimated.
+
+The coefficient of element m in frame q is (1 + e_m) x_{q,m}, with the relative error e_m, complex
+normal of variance s^2, and the amplitude x: the configuration c, or with the probability p of a
+failure a level that is uniform in [0, 1]. Over surfaces, its mean is (1 - p) c + p / 2, and its
+covariance between two frames is
+
+    s^2 E[x_q] E[x_q'] + (1 + s^2) (p / 12 + p (1 - p) (1/2 - c_q) (1/2 - c_q')),
+
+a sum of at most three products of a factor for each frame. Elements are independent. Signals are
+treated as circular: failures also contribute a pseudo-covariance, a sum over elements whose terms
+differ in phase.
+
+An estimated coefficient is linear in two numbers, ``gain c + offset``: an element that works has
+the offset 0, and one that has failed the gain 0. A band multiplies all its signals by a gain of
+the receiving chain. Mean signals are therefore linear in the elements and in each band's gain, and
+their errors have a covariance in closed form.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from rhs_isac_ros.model.arrays import adjoint, blocks, digest, gauss_legendre, read_only
+from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.multipath import (
+    complex_normal,
+    measurement_correlation,
+    multipath_covariance,
+    spatial_covariance,
+)
+from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.model.surface import AppliedBeams, Beamforming, feed_weights
+
+# Nodes along each side of the region of interest. Products of the gains of two sub-bands have no
+# carrier and are smooth.
+_ROI_NODES = 8
+# Quasi-random positions over which other covariances are averaged.
+_LOG2_NODES = 7
+# Positions evaluated at a time.
+_BLOCK = 32
+
+# Callable that takes a band and positions, float64 [N, 3] [m], and returns errors of the direct
+# path's signals per unit of R white numbers, complex128 [N, N_SB F, R].
+DirectErrors = Callable[[int, np.ndarray], np.ndarray]
+
+
+class SurfaceModel:
+    """Knowledge of the elements of a surface: expected coefficients and their errors.
+
+    A subclass defines `applied_beams`, and if there are errors `is_exact` and `errors`.
+    """
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether there are no errors."""
+        return True
+
+    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
+        """Return the expected beamforming in effect."""
+        raise NotImplementedError
+
+    def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
+        """Return the covariance from the multipath [N_B, N_SB F, N_SB F] and the direct errors."""
+        raise NotImplementedError
+
+    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
+        """Compute the covariance due to errors, complex128 [N_B, N_SB F, N_SB F] [W].
+
+        It is the average over the region of interest, and includes the errors of the direct path
+        and of the multipath.
+        """
+        from scipy.stats import qmc
+
+        low, high = scenario.roi_bounds_m
+        nodes = low + qmc.Sobol(3, seed=0).random(2**_LOG2_NODES) * (high - low)
+        return np.mean([
+            self.error_covariance_at(scenario, beams, block).mean(axis=0)
+            for block in np.split(nodes, len(nodes) // _BLOCK)], axis=0)
+
+    def error_covariance_at(
+            self, scenario: Scenario, beams: Beamforming, positions: np.ndarray) -> np.ndarray:
+        """Compute `error_covariance` at positions [N, 3] [m] instead, [N, N_B, N_SB F, N_SB F]."""
+        scattered, direct = self.errors(scenario, beams)
+        covariance = np.repeat(scattered[None], len(positions), axis=0)
+        for band in range(scenario.n_bands):
+            for block in blocks(len(positions), _BLOCK):
+                errors = direct(band, positions[block])
+                covariance[block, band] += np.matmul(errors, adjoint(errors))
+        return covariance
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ElementErrors(SurfaceModel):
+    """Errors of the elements of one surface, the same in all bands and frames.
+
+    Attributes
+    ----------
+    gains
+        Factor of the coefficient of each element, complex128 [N_E]; 1 without an error.
+    stuck
+        Amplitude of each failed element, float64 [N_E]; NaN where an element works.
+    """
+
+    gains: np.ndarray
+    stuck: np.ndarray
+
+    @property
+    def id(self) -> str:
+        """Hash of the errors, 16 hexadecimal digits."""
+        return digest(np.asarray(self.gains, '<c16'), np.asarray(self.stuck, '<f8'))
+
+    def applied(self, analog: np.ndarray) -> np.ndarray:
+        """Return the coefficients in effect, complex128, for configurations [..., N_E].
+
+        Raises ValueError if the surface has another number of elements.
+        """
+        if analog.shape[-1:] != self.gains.shape:
+            raise ValueError(f'surface: {len(self.gains)} elements, expected N_E = '
+                             f'{analog.shape[-1]} as in the configurations')
+        return np.where(np.isnan(self.stuck), analog, self.stuck) * self.gains
+
+    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
+        """Return the beamforming in effect."""
+        return AppliedBeams(self.applied(beams.analog), beams.digital)
+
+
+class DeclaredElements(SurfaceModel):
+    """The distribution of the elements that a scenario declares."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._is_exact = not has_errors(scenario)
+        self._failed_share = scenario.failed_element_share
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the scenario declares no errors."""
+        return self._is_exact
+
+    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
+        """Return the beamforming in effect, averaged over surfaces."""
+        share = self._failed_share
+        analog = (1 - share) * beams.analog + share / 2 if share else beams.analog
+        return AppliedBeams(analog, beams.digital)
+
+    def error_covariance(self, scenario: Scenario, beams: Beamforming) -> np.ndarray:
+        """Compute the covariance, as `SurfaceModel` describes, from cached correlations."""
+        covariance = []
+        for band, radiation in enumerate(np.swapaxes(error_radiation(scenario, beams), 0, 1)):
+            products = np.einsum('trm,tsm->rsm', radiation, np.conj(radiation))
+            covariance.append(np.sum(products * element_correlation(scenario, band), axis=2))
+        return np.stack(covariance)
+
+    def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
+        """Return the errors, as `SurfaceModel` describes."""
+        # [N_B, N_SB F, T, N_E]
+        radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
+        n_bands, n_rows, n_terms, n_elements = radiation.shape
+        amplitude = np.sqrt(spatial_covariance(scenario).power)
+        flat = (radiation * amplitude[:, None, None]).reshape(n_bands, n_rows, -1)
+
+        def direct(band: int, positions: np.ndarray) -> np.ndarray:
+            gains = np.repeat(los_gain(scenario, positions, band), scenario.n_frames, axis=1)
+            errors = radiation[band] * gains[:, :, None]
+            return errors.reshape(len(gains), n_rows, n_terms * n_elements)
+
+        return measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)), direct
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SurfaceEstimate(SurfaceModel):
+    """Mean and covariance of the coefficients of a surface.
+
+    Attributes
+    ----------
+    gains, offsets
+        Expected coefficient of each element, ``gain c + offset``, complex128 [N_E].
+    band_gains
+        Expected gain of each band, complex128 [N_B].
+    factor
+        F with F F^H the covariance of gains, offsets and relative errors of the band gains,
+        complex128 [2 N_E + N_B, R].
+    failed_probability
+        Probability that each element has failed, float64 [N_E].
+    """
+
+    gains: np.ndarray
+    offsets: np.ndarray
+    band_gains: np.ndarray
+    factor: np.ndarray
+    failed_probability: np.ndarray
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the estimate has no errors."""
+        return not self.factor.shape[1]
+
+    @property
+    def id(self) -> str:
+        """Hash of the estimate, 16 hexadecimal digits."""
+        return digest(*(np.asarray(array, '<c16') for array in (
+            self.gains, self.offsets, self.band_gains, self.factor)))
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Which elements have probably failed, bool [N_E]."""
+        return self.failed_probability > 0.5
+
+    def std(self) -> np.ndarray:
+        """Return the standard deviations of the rows of `factor`, float64 [2 N_E + N_B]."""
+        return np.sqrt(np.sum(np.abs(self.factor)**2, axis=1))
+
+    def without_errors(self) -> 'SurfaceEstimate':
+        """Return an estimate that takes the means as exact."""
+        return dataclasses.replace(self, factor=self.factor[:, :0])
+
+    def applied(self, analog: np.ndarray) -> np.ndarray:
+        """Return the expected coefficients, complex128, for configurations [..., N_E]."""
+        return self.gains * analog + self.offsets
+
+    def applied_beams(self, beams: Beamforming) -> AppliedBeams:
+        """Return the expected beamforming in effect, with the gains of the bands."""
+        return AppliedBeams(
+            self.applied(beams.analog), self.band_gains[:, None, None, None] * beams.digital)
+
+    def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
+        """Return the errors, as `SurfaceModel` describes."""
+        radiation = element_radiation(scenario, beams)
+        of_elements, of_bands = np.split(self.factor, [2 * scenario.n_elements])
+        scattered = scattered_errors(scenario, radiation, of_elements @ np.conj(of_elements.T))
+
+        def direct(band: int, positions: np.ndarray) -> np.ndarray:
+            design = direct_design(scenario, radiation, band, positions)
+            mean = design @ np.concatenate([self.gains, self.offsets])
+            return self.band_gains[band] * (
+                design @ of_elements + mean[..., None] * of_bands[band])
+
+        return scattered * np.abs(self.band_gains[:, None, None])**2, direct
+
+
+def has_errors(scenario: Scenario) -> bool:
+    """Return whether a scenario declares errors or failures of elements."""
+    return scenario.element_error_rms > 0 or scenario.failed_element_share > 0
+
+
+def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
+    """Draw the errors of a surface.
+
+    Generators in the same state give the same errors up to their declared size, and a higher
+    share of failed elements adds failures.
+    """
+    n_elements = scenario.n_elements
+    fate, levels = rng.uniform(size=(2, n_elements))
+    gains = 1 + scenario.element_error_rms * complex_normal((n_elements,), rng)
+    return ElementErrors(
+        gains, np.where(fate < scenario.failed_element_share, levels, np.nan))
+
+
+def error_terms(scenario: Scenario) -> list[tuple[float, float]]:
+    """Return the factors of the coefficients' covariance: constants, and slopes over C.
+
+    The covariance of an element's coefficient between two frames is a sum over T terms: one for
+    errors, and two more if elements can fail. Each is the product of the factors of both frames.
+    """
+    rms, share = scenario.element_error_rms, scenario.failed_element_share
+    spread = np.sqrt((1 + rms**2) * share)
+    centred = spread * np.sqrt(1 - share)
+    terms = [(rms * share / 2, rms * (1 - share)), (spread / np.sqrt(12), 0.0),
+             (centred / 2, -centred)]
+    return [term for term in terms if any(term)]
+
+
+def error_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
+    """Compute the factors of `error_terms` times S B, complex128 [T, N_B, N_SB F, N_E]."""
+    factors = np.array([constant + slope * beams.analog
+                        for constant, slope in error_terms(scenario)])
+    return (factors.reshape(-1, *beams.analog.shape)[:, :, None]
+            * feed_weights(scenario, beams)).reshape(
+                len(factors), scenario.n_bands, -1, scenario.n_elements)
+
+
+@functools.lru_cache(maxsize=16)
+def element_correlation(scenario: Scenario, band: int) -> np.ndarray:
+    """Compute the correlation of an element's gain over the measurements of a band.
+
+    It includes the direct path, averaged over the region of interest, and the multipath. Returns
+    complex128 [N_SB F, N_SB F, N_E], read-only.
+    """
+    nodes, weights = gauss_legendre(_ROI_NODES)
+    low, high = scenario.roi_bounds_m
+    axes = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
+    positions = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
+    shares = np.einsum('a,b,c->abc', *[weights / 2] * 3).ravel()
+    direct = np.zeros((scenario.n_subbands, scenario.n_subbands, scenario.n_elements), complex)
+    for block in blocks(len(positions), _BLOCK):
+        gains = los_gain(scenario, positions[block], band)
+        direct += np.einsum('n,njm,nlm->jlm', shares[block], gains, np.conj(gains))
+    correlation = np.repeat(np.repeat(direct, scenario.n_frames, 0), scenario.n_frames, 1)
+    power = spatial_covariance(scenario).power[band]
+    correlation += measurement_correlation(scenario)[band][..., None] * power
+    return read_only(correlation)
+
+
+def element_radiation(scenario: Scenario, beams: Beamforming) -> np.ndarray:
+    """Compute the weights of gains and offsets of the elements in every measurement.
+
+    Returns complex128 [N_B, N_SB F, 2 N_E], for unit gains of the bands.
+    """
+    weights = feed_weights(scenario, beams)
+    both = np.concatenate([beams.analog[:, None] * weights, weights], axis=-1)
+    return both.reshape(scenario.n_bands, -1, 2 * scenario.n_elements)
+
+
+def direct_design(scenario: Scenario, radiation: np.ndarray, band: int,
+                  positions: np.ndarray) -> np.ndarray:
+    """Compute the derivative of a band's mean signals with respect to gains and offsets.
+
+    Returns complex128 [N, N_SB F, 2 N_E] for the weights of `element_radiation`.
+    """
+    los = los_gain(scenario, positions, band)
+    by_measurement = np.repeat(np.concatenate([los, los], axis=-1), scenario.n_frames, axis=1)
+    return by_measurement * radiation[band]
+
+
+def scattered_errors(
+        scenario: Scenario, radiation: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Compute the covariance of the signals from the multipath at erroneous elements [W].
+
+    Takes the weights of `element_radiation` and the covariance of gains and offsets, complex128
+    [2 N_E, 2 N_E]. Returns complex128 [N_B, N_SB F, N_SB F].
+    """
+    spatial = np.tile(multipath_covariance(scenario), (1, 2, 2))
+    products = np.matmul(radiation @ (spatial * errors), adjoint(radiation))
+    return measurement_correlation(scenario) * products

@@ -1,0 +1,319 @@
+"""Data of one hall that take the place of declared multipath: a covariance, or paths.
+
+A survey measures the covariance. Gains g of the elements in all measurements of a band are
+Gaussian with the covariance C_0 that three fields of the scenario declare. A survey with the
+radiation matrix T replaces the covariance L_0 of its signals T g + noise by a measured one, L, and
+leaves the distribution of g given these signals as it is. Of all covariances whose signals have
+the covariance L, the following one of g is then the closest to C_0 in the sense of Kullback and
+Leibler, apart from the noise:
+
+    C = C_0 + C_0 T^H M T C_0    with    M = L_0^-1 (L - L_0) L_0^-1.
+
+It yields the covariance for any other beams, and for single elements.
+
+Paths come from a ray tracer, for example. A path is a spherical wave from a virtual source, such
+as the mirror image of the user in a wall: a line of sight to that source, times a complex
+reflection coefficient, which is the amplitude of the path at the surface's centre relative to free
+space over the same distance. Gain patterns of elements and users apply to a path as they do to a
+line of sight to its source.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rhs_isac_ros.model.arrays import check_arrays, read_only
+from rhs_isac_ros.support.files import (
+    ArchiveError,
+    ArrayFile,
+    read_archive,
+    read_arrays,
+    write_archive,
+    write_whole,
+)
+
+SPEED_OF_LIGHT_MPS = 299_792_458.0
+_FORMAT = 1
+# Fields of the scenario that a measured covariance replaces.
+FIELDS = ('multipath_to_los_db', 'delay_spread_s', 'angular_spread_deg')
+# Fields on which it depends; they are written to the file.
+CONDITIONS = (
+    'center_frequencies_hz', 'n_subbands', 'subband_width_hz', 'n_frames', 'elements_per_side',
+    'element_interval_wavelengths', 'multipath_direction_deg', 'roi_center_m', 'roi_size_m')
+# Largest ratio of a centre frequency to the frequency of the paths, or the inverse.
+_MAX_FREQUENCY_RATIO = 1.5
+# Largest amplitude relative to free space, and distance of a direct path's source from its user.
+_MAX_COEFFICIENT, _MAX_OFFSET_M = 2.0, 0.01
+# Smallest share of the users that are in the region of interest.
+_MIN_SHARE = 0.5
+# Types of the arrays of paths in memory; in a file, some have less precision.
+_TYPES = {'users': float, 'a': complex, 'src': float, 'n': int, 'f0': float, 'gains': complex}
+_FILE_TYPES = {'a': np.complex64, 'gains': np.complex64, 'src': np.float32, 'n': np.int8}
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class MultipathEstimate(ArrayFile):
+    """A measured covariance of the multipath, as a value of the field `Scenario.multipath`.
+
+    Attributes
+    ----------
+    multipath_to_los_db, delay_spread_s, angular_spread_deg
+        The fields of C_0.
+    radiation
+        T_i of the survey, complex128 [N_B, N_SB F, N_E].
+    excess
+        M_i, complex128 [N_B, N_SB F, N_SB F] [1/W].
+    conditions
+        Fields of the scenario of the survey on which it depends.
+    about
+        How it was made: ``positions``, their number; ``prior_weight`` nu, ``inflation`` t and
+        ``level_std_db``, the standard deviation of the power among users [dB];
+        ``coverage``, the expected share of positions in the 95 % region, with its interval;
+        ``warnings``; ``codebook``, its id; ``version``.
+    path
+        File from which it was read.
+
+    Raises
+    ------
+    ArchiveError
+        If sizes disagree or a number is not finite.
+    """
+
+    multipath_to_los_db: float
+    delay_spread_s: float
+    angular_spread_deg: float
+    radiation: np.ndarray
+    excess: np.ndarray
+    conditions: dict[str, Any]
+    about: dict[str, Any] = dataclasses.field(default_factory=dict)
+    path: str = ''
+
+    def __post_init__(self) -> None:
+        """Check sizes and numbers, and make the arrays read-only."""
+        n_bands, n_rows, n_elements = (*np.shape(self.radiation), 0, 0, 0)[:3]
+        check_arrays(self, {
+            **dict.fromkeys(FIELDS, ()), 'radiation': (n_bands or 1, n_rows, n_elements),
+            'excess': (n_bands, n_rows, n_rows)}, ArchiveError)
+        for array in self.content():
+            read_only(array)
+
+    @property
+    def level_db(self) -> tuple[float, float]:
+        """Median and standard deviation of the level of a user's multipath [dB].
+
+        The median is below 0 dB, because the covariance is larger than the multipath by the
+        inflation of the survey.
+        """
+        return (-10 * math.log10(self.about.get('inflation', 1.0)),
+                self.about.get('level_std_db', 0.0))
+
+    def content(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays that the digest covers."""
+        fields = np.array([getattr(self, name) for name in FIELDS])
+        return fields, self.radiation, self.excess
+
+    def misfit(self, scenario: Any) -> str:
+        """Return why the covariance does not fit a scenario; empty if it does."""
+        fields = scenario.fields()
+        for name in CONDITIONS:
+            if (own := self.conditions.get(name)) != fields[name]:
+                return f'a survey with {name} {own}, expected {fields[name]} as in the scenario'
+        return ''
+
+    def save(self, path: str | Path) -> None:
+        """Write the estimate to a file of NumPy's format ``.npz``, without pickled objects.
+
+        An existing file is replaced at the end, or kept if there is an `OSError`.
+        """
+        write_archive(path, {'radiation': self.radiation, 'excess': self.excess}, {
+            'format': _FORMAT, 'about': self.about, 'conditions': self.conditions,
+            **{name: getattr(self, name) for name in FIELDS}})
+
+    @classmethod
+    def load(cls, path: str | Path) -> 'MultipathEstimate':
+        """Read an estimate from a file; raise ArchiveError if the file is invalid."""
+        arrays, about = read_archive(path, 'multipath', _FORMAT, {'radiation', 'excess'})
+        try:
+            content: dict[str, Any] = {name: float(about[name]) for name in FIELDS}
+            content |= {name: array.astype(complex) for name, array in arrays.items()}
+            content |= {name: dict(about[name]) for name in ('conditions', 'about')}
+            return cls(**content, path=str(path))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ArchiveError(f'{path}: {error}') from None
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class PathChannel(ArrayFile):
+    """Propagation paths between users and the surface, as a value of `Scenario.channel`.
+
+    Users have at most P paths; the amplitude of missing ones is 0.
+
+    Attributes
+    ----------
+    users
+        Positions, float64 [N, 3] [m], in the frame of the scenario.
+    a
+        Amplitudes at the surface's centre and the frequency `f0` for antennas without gain,
+        without the phase of the distance, complex128 [N, P]; c / (4 pi f0 d) in free space.
+    src
+        Virtual sources, float64 [N, P, 3] [m]; the user itself for the direct path.
+    n
+        Number of reflections, int [N, P]; 0 for the direct path, and -1 for a missing path.
+    f0
+        Frequency of the amplitudes [Hz], which are inversely proportional to the frequency.
+    gains
+        Factors of the paths at each element, complex128 [N, P, N_E], for objects that only a part
+        of the surface sees; None if all are 1.
+    path
+        File from which the paths were read.
+
+    Raises
+    ------
+    ArchiveError
+        If sizes disagree, or a number is not finite or not possible.
+    """
+
+    users: np.ndarray
+    a: np.ndarray
+    src: np.ndarray
+    n: np.ndarray
+    f0: float
+    gains: np.ndarray | None = None
+    path: str = ''
+
+    def __post_init__(self) -> None:
+        """Check sizes and numbers, and make the arrays read-only."""
+        shape = np.shape(self.a) if np.ndim(self.a) == 2 and np.size(self.a) else (1, 1)
+        expected: dict[str, tuple[int, ...]] = {
+            'a': shape, 'users': (shape[0], 3), 'src': (*shape, 3), 'n': shape, 'f0': ()}
+        if self.gains is not None:
+            expected['gains'] = (*shape, self.gains.shape[-1])
+        check_arrays(self, expected, ArchiveError)
+        for array in self.content():
+            read_only(array)
+        if self.f0 <= 0:
+            raise ArchiveError(f'f0: {self.f0:g} Hz, expected a positive frequency')
+        if (self.users[:, 0] <= 0).any():
+            raise ArchiveError(f'users: x = {self.users[:, 0].min():g} m, expected users in front '
+                               'of the surface, which lies in the plane x = 0')
+        largest = float(np.abs(self.coefficients).max())
+        if largest > _MAX_COEFFICIENT:
+            raise ArchiveError(f'a: {largest:.3g} times that of free space, expected at most '
+                               f'{_MAX_COEFFICIENT:g}')
+        direct = (self.n == 0) & (self.a != 0)
+        offset = np.linalg.norm(self.src - self.users[:, None], axis=2)[direct]
+        if offset.size and offset.max() > _MAX_OFFSET_M:
+            raise ArchiveError(f'src: {offset.max():.3g} m from the user for a direct path, '
+                               f'expected at most {_MAX_OFFSET_M:g} m')
+
+    @classmethod
+    def from_sionna(cls, paths: Any, f0: float) -> 'PathChannel':
+        """Convert paths of Sionna RT, as its `PathSolver` returns them.
+
+        Users are the transmitters, and the only receiver is at the surface's centre, with axes
+        like the scenario's. Both have one isotropic antenna. All reflections are specular, and
+        the frequency of the scene is `f0` [Hz]. Paths from behind the surface are removed. Raises
+        ArchiveError if there are several receivers or antennas, or the result is not possible.
+        """
+        a = np.array(paths.a[0]) + 1j * np.array(paths.a[1])
+        if a.ndim != 5 or (*a.shape[:2], a.shape[3]) != (1, 1, 1):
+            raise ArchiveError(f'a: shape {a.shape}, expected [1, 1, N, 1, P] of one receiver and '
+                               'N transmitters with one antenna each')
+        centre = np.array(paths.targets, float).T
+        users = np.array(paths.sources, float).T - centre
+        elevation, azimuth, delay = (
+            np.array(angles, float)[0] for angles in (paths.theta_r, paths.phi_r, paths.tau))
+        direction = np.stack([np.sin(elevation) * np.cos(azimuth),
+                              np.sin(elevation) * np.sin(azimuth), np.cos(elevation)], axis=-1)
+        sources = SPEED_OF_LIGHT_MPS * delay[..., None] * direction
+        present = np.array(paths.valid)[0] & (sources[..., 0] > 0)
+        n = np.sum(np.array(paths.interactions)[:, 0] > 0, axis=0).astype(int)
+        return cls(users, np.where(present, a[0, 0, :, 0], 0),
+                   np.where(present[..., None], sources, 0.0), np.where(present, n, -1), f0)
+
+    @classmethod
+    def joined(cls, parts: Sequence['PathChannel']) -> 'PathChannel':
+        """Join the users of several channels of one frequency and without factors `gains`."""
+        n_paths = max(part.a.shape[1] for part in parts)
+
+        def padded(name: str, value: float) -> np.ndarray:
+            arrays = [getattr(part, name) for part in parts]
+            return np.concatenate([np.pad(
+                array, [(0, 0), (0, n_paths - array.shape[1]), *[(0, 0)] * (array.ndim - 2)],
+                constant_values=value) for array in arrays])
+
+        if len({part.f0 for part in parts}) > 1 or any(part.gains is not None for part in parts):
+            raise ArchiveError('f0: channels of several frequencies or with gains, expected one '
+                               'frequency and no gains')
+        return cls(np.concatenate([part.users for part in parts]), padded('a', 0),
+                   padded('src', 0), padded('n', -1), parts[0].f0)
+
+    @functools.cached_property
+    def sources(self) -> np.ndarray:
+        """Sources in full precision, float64 [N, P, 3] [m]; the user for a direct path."""
+        missing, direct = (self.a == 0)[..., None], (self.n == 0)[..., None]
+        return np.where(missing | direct, self.users[:, None], self.src)
+
+    @functools.cached_property
+    def coefficients(self) -> np.ndarray:
+        """Amplitudes relative to free space over the same distance, complex128 [N, P]."""
+        distance = np.linalg.norm(self.sources, axis=2)
+        return self.a * 4 * np.pi * self.f0 * distance / SPEED_OF_LIGHT_MPS
+
+    def nearest(self, positions: np.ndarray) -> np.ndarray:
+        """Return the index of the user nearest to each position [N, 3] [m], int64 [N]."""
+        squares = np.sum((positions[:, None] - self.users)**2, axis=2)
+        return np.argmin(squares, axis=1)
+
+    def content(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays that the digest covers."""
+        gains = () if self.gains is None else (self.gains,)
+        return self.users, self.a, self.src, self.n, np.array([self.f0]), *gains
+
+    def misfit(self, scenario: Any) -> str:
+        """Return why the paths do not fit a scenario; empty if they do."""
+        for frequency in scenario.center_frequencies_hz:
+            ratio = max(frequency, self.f0) / min(frequency, self.f0)
+            if ratio > _MAX_FREQUENCY_RATIO:
+                return (f'f0: {self.f0:g} Hz, expected at most {_MAX_FREQUENCY_RATIO:g} times '
+                        f'more or less than the centre frequency {frequency:g} Hz')
+        if self.gains is not None and self.gains.shape[-1] != scenario.n_elements:
+            return f'gains: {self.gains.shape[-1]} elements, expected {scenario.n_elements}'
+        low, high = scenario.roi_bounds_m
+        share = float(np.mean(((low <= self.users) & (self.users <= high)).all(axis=1)))
+        if share < _MIN_SHARE:
+            return (f'users: {100 * share:.0f} % in the region of interest, expected at least '
+                    f'{100 * _MIN_SHARE:.0f} %, in metres and in the frame of the surface')
+        return ''
+
+    def save(self, path: str | Path) -> None:
+        """Write the paths to a compressed file of NumPy's format ``.npz``.
+
+        Amplitudes and virtual sources are rounded to single precision.
+        """
+        arrays: dict[str, Any] = {
+            name: np.asarray(array, _FILE_TYPES.get(name)) for name in _TYPES
+            if (array := getattr(self, name)) is not None}
+        write_whole(path, lambda stream: np.savez_compressed(stream, **arrays))
+
+    @classmethod
+    def load(cls, path: str | Path) -> 'PathChannel':
+        """Read paths from a file; arrays with other names are ignored.
+
+        Raises ArchiveError, with the name of the array, if the content is invalid.
+        """
+        arrays = read_arrays(path)
+        try:
+            for name in _TYPES:
+                if name not in arrays and name != 'gains':
+                    raise ArchiveError(f'{name}: missing, expected an array of this name')
+            content: dict[str, Any] = {
+                name: arrays[name].astype(kind) for name, kind in _TYPES.items() if name in arrays}
+            return cls(**content | {'f0': float(arrays['f0'])}, path=str(path))
+        except (TypeError, ValueError) as error:
+            raise ArchiveError(f'{path}: {error}') from None

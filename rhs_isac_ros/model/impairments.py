@@ -1,0 +1,263 @@
+"""Impairments of the signals: unknown gains, phases, and offsets of timing and carrier.
+
+Given the position, the signals of a cycle are Gaussian if a few Gaussian numbers and the elements
+of the surface (see `elements`) are known. Each of the numbers, a nuisance parameter x, has an
+exponent P of the signals: they are multiplied by ``exp(x P)``. A real exponent is a gain in
+nepers, an imaginary one a phase. The factor applies to the direct path and to the multipath, but
+not to the thermal noise. The exponential wraps phases, so that a phase whose standard deviation is
+a turn is uniform.
+
+Simulation, estimators, bounds and calibration use the results of an `Impairment` only, so that
+another one requires no change elsewhere: a `Factor` in `BUILT_IN`, or a plug-in of the group
+``rhs_isac_ros.impairments``.
+"""
+
+import dataclasses
+import enum
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.elements import ElementErrors, draw_surface, has_errors
+from rhs_isac_ros.model.geometry import subband_frequencies_hz
+from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.support import plugins
+
+# Standard deviation from which a wrapped phase is treated as uniform [rad].
+UNIFORM_STD_RAD = 2.0
+# Nepers per decibel of an amplitude gain.
+_NEPERS_PER_DB = np.log(10) / 20
+
+
+class Scope(enum.Enum):
+    """How long the value of an impairment lasts."""
+
+    USER = 'user'
+    CYCLE = 'cycle'
+
+
+class Linear(NamedTuple):
+    """The exponents of an impairment and the prior of its values.
+
+    Attributes
+    ----------
+    patterns
+        Exponent of the signals per unit of each value, complex128 [q, N_B, N_SB F].
+    root
+        Factor L of the covariance L L^T of the values, float64 [q, q], regular.
+    needs_search
+        Whether the likelihood of a value has several maxima within its prior, so that estimators
+        compare values on a grid before they refine one.
+    """
+
+    patterns: np.ndarray
+    root: np.ndarray
+    needs_search: bool = False
+
+
+class Impairment:
+    """An impairment of the signals.
+
+    A subclass defines `size` and `linear`. Its values are Gaussian unless it overrides `values`;
+    estimators and bounds always assume the Gaussian prior of `linear`. They are drawn anew as
+    often as `scope` states.
+    """
+
+    scope: Scope = Scope.CYCLE
+
+    def size(self, scenario: Scenario) -> int:
+        """Return the number q of values."""
+        raise NotImplementedError
+
+    def linear(self, scenario: Scenario) -> Linear:
+        """Return exponents and prior."""
+        raise NotImplementedError
+
+    def values(self, scenario: Scenario, white: np.ndarray) -> np.ndarray:
+        """Map standard normal numbers [n, q] to values of n independent draws, [n, q]."""
+        return white @ self.linear(scenario).root.T
+
+
+class Nuisance:
+    """The nuisance parameters of all impairments of a scenario.
+
+    The parameters are x = L z with standard normal z. Bounds and estimators use z, which needs no
+    units.
+
+    Attributes
+    ----------
+    patterns, scaled_patterns
+        Exponent of the signals per unit of x and of z, complex128 [Q, N_B, N_SB F].
+    needs_search
+        As in `Linear`, bool [Q].
+    moves_multipath
+        Which of z change measurements of one band relative to each other, bool [Q]. These move the
+        multipath out of the nulls of its covariance.
+    phases
+        Phase of each band per unit of those z that only turn whole bands, and 0 for all others,
+        float64 [N_B, Q].
+    """
+
+    def __init__(self, scenario: Scenario, parts: Sequence[Linear]) -> None:
+        self.patterns = read_only(np.concatenate([
+            np.zeros((0, *_shape(scenario)), complex), *(part.patterns for part in parts)]))
+        sizes = [len(part.patterns) for part in parts]
+        starts = np.cumsum([0, *sizes])
+        root = np.zeros((starts[-1], starts[-1]))
+        for start, part in zip(starts, parts, strict=False):
+            block = slice(start, start + len(part.root))
+            root[block, block] = part.root
+        self.scaled_patterns = read_only(np.tensordot(root.T, self.patterns, axes=1))
+        self.needs_search = np.repeat([part.needs_search for part in parts], sizes).astype(bool)
+        self.moves_multipath = np.ptp(self.scaled_patterns, axis=2).any(axis=1)
+        turns = ~self.moves_multipath & ~self.scaled_patterns.real.any(axis=(1, 2))
+        self.phases = read_only(np.where(turns, self.scaled_patterns[:, :, 0].imag.T, 0.0))
+
+    def __len__(self) -> int:
+        """Return the number Q of parameters."""
+        return len(self.patterns)
+
+    @property
+    def scaled_phases(self) -> np.ndarray:
+        """The columns of `phases` that are not zero, float64 [N_B, q]."""
+        return self.phases[:, self.phases.any(axis=0)]
+
+    def factors(self, values: np.ndarray) -> np.ndarray:
+        """Compute the factors exp(x P) for values x [..., Q], complex128 [..., N_B, N_SB F]."""
+        return np.exp(np.tensordot(values, self.patterns, axes=1))
+
+
+def _gain(scenario: Scenario) -> np.ndarray:
+    return np.ones((1, *_shape(scenario)), complex)
+
+
+def _phase(scenario: Scenario) -> np.ndarray:
+    return np.full((1, *_shape(scenario)), 1j)
+
+
+def _phase_of_each_band(scenario: Scenario) -> np.ndarray:
+    return 1j * np.eye(scenario.n_bands)[:, :, None] * np.ones(_shape(scenario))
+
+
+def _carrier_offset(scenario: Scenario) -> np.ndarray:
+    frames = np.arange(scenario.n_frames) * scenario.frame_duration_s
+    return 2j * np.pi * np.broadcast_to(
+        np.tile(frames, scenario.n_subbands), (1, *_shape(scenario)))
+
+
+def _timing_offset(scenario: Scenario) -> np.ndarray:
+    centers = np.array(scenario.center_frequencies_hz)[:, None]
+    offsets = subband_frequencies_hz(scenario) - centers
+    return -2j * np.pi * np.repeat(offsets, scenario.n_frames, axis=1)[None]
+
+
+def _shape(scenario: Scenario) -> tuple[int, int]:
+    return scenario.n_bands, scenario.n_subbands * scenario.n_frames
+
+
+@dataclasses.dataclass(frozen=True)
+class Factor(Impairment):
+    """Independent values whose standard deviation is a field of the scenario."""
+
+    field: str
+    # Function that returns the exponents per unit of the values.
+    patterns: Callable[[Scenario], np.ndarray]
+    # Unit of the field, in the unit of the values.
+    unit: float = 1.0
+    needs_search: bool = False
+    scope: Scope = Scope.CYCLE
+
+    def std(self, scenario: Scenario) -> float:
+        """Return the standard deviation that the scenario declares, in the unit of the values."""
+        return float(getattr(scenario, self.field)) * self.unit
+
+    def size(self, scenario: Scenario) -> int:
+        """Return the number of values: one, or one for each band."""
+        return len(self.patterns(scenario))
+
+    def linear(self, scenario: Scenario) -> Linear:
+        """Return exponents and prior."""
+        patterns = self.patterns(scenario)
+        return Linear(patterns, self.std(scenario) * np.eye(len(patterns)), self.needs_search)
+
+
+BUILT_IN: tuple[Factor, ...] = (
+    Factor('user_gain_std_db', _gain, unit=_NEPERS_PER_DB, scope=Scope.USER),
+    Factor('carrier_offset_std_hz', _carrier_offset, needs_search=True, scope=Scope.USER),
+    Factor('phase_std_rad', _phase),
+    Factor('timing_std_s', _timing_offset, needs_search=True),
+    Factor('band_phase_std_rad', _phase_of_each_band),
+)
+
+
+@functools.lru_cache(maxsize=16)
+def impairments_of(scenario: Scenario) -> tuple[Impairment, ...]:
+    """Return the impairments of the signals that a scenario declares; none for Table I.
+
+    Raises PluginError if a plug-in cannot be loaded or returns no `Impairment`.
+    """
+    return (*(one for one in BUILT_IN if one.std(scenario) > 0), *_installed(scenario))
+
+
+@functools.lru_cache(maxsize=16)
+def nuisance_of(scenario: Scenario) -> Nuisance:
+    """Return the nuisance parameters of all impairments that a scenario declares."""
+    return Nuisance(scenario, [one.linear(scenario) for one in impairments_of(scenario)])
+
+
+def draw_factors(
+        scenario: Scenario, n: int, user: np.random.Generator, cycle: np.random.Generator
+) -> np.ndarray | None:
+    """Draw the factors of the signals of n users and cycles, complex128 [n, N_B, N_SB F].
+
+    Impairments of users and of cycles have a generator each. The values of a built-in impairment
+    do not depend on others. The result is None if the scenario declares no impairment.
+    """
+    declared = impairments_of(scenario)
+    if not declared:
+        return None
+    generators = {Scope.USER: user, Scope.CYCLE: cycle}
+    # A plug-in may be unhashable.
+    values: dict[int, np.ndarray] = {}
+    for group in (BUILT_IN, _installed(scenario)):
+        for scope, rng in generators.items():
+            members = [one for one in group if one.scope is scope]
+            sizes = [one.size(scenario) for one in members]
+            white = np.split(rng.standard_normal((n, sum(sizes))), np.cumsum(sizes), axis=1)
+            values |= {id(one): one.values(scenario, part)
+                       for one, part in zip(members, white, strict=False) if one in declared}
+    return nuisance_of(scenario).factors(
+        np.concatenate([values[id(one)] for one in declared], axis=1))
+
+
+def draw_impairments(
+        scenario: Scenario, n: int, rng: np.random.Generator
+) -> tuple[ElementErrors | None, np.ndarray | None]:
+    """Draw a surface, and the factors of the signals of n phases, complex128 [n, N_B, N_SB F].
+
+    Each phase has another user. Either result is None if the scenario does not declare it. The
+    numbers come from children of the generator, whose own numbers, of multipath and noise, do not
+    depend on what is declared.
+    """
+    if not has_errors(scenario) and not impairments_of(scenario):
+        return None, None
+    of_surface, of_users = rng.spawn(2)
+    surface = draw_surface(scenario, of_surface) if has_errors(scenario) else None
+    return surface, draw_factors(scenario, n, of_users, of_users)
+
+
+def _installed(scenario: Scenario) -> tuple[Impairment, ...]:
+    return tuple(_load(name, strength) for name, strength in scenario.impairments)
+
+
+@functools.lru_cache(maxsize=16)
+def _load(name: str, strength: float) -> Impairment:
+    made = plugins.make(plugins.IMPAIRMENTS, name, strength)
+    if not isinstance(made, Impairment):
+        raise plugins.PluginError(
+            f'{plugins.describe(plugins.IMPAIRMENTS, name)}: returned {made!r}, expected an '
+            'Impairment')
+    return made

@@ -1,0 +1,260 @@
+"""The users that a base station knows: their turns, and the nodes that own their numbers."""
+
+import bisect
+import dataclasses
+import operator
+import re
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from rhs_isac_ros.protocol import messages as m
+
+POLICIES = ('round_robin', 'first', 'random')
+# Highest number of a user, which bounds the memory whatever numbers the acks contain.
+MAX_USERS = 4096
+LAST_NUMBER = 2**32 - 1
+# Number of registered users that the first beacon of a cycle invites, and the factor by which
+# each further beacon of the cycle extends it. All acks of a cycle take time, but one user is
+# served.
+INVITED, _EXTENSION = 8, 8
+# Number of consecutive beacons without an answer after which a user is removed.
+_MAX_MISSED = 3
+# The node that owns a number is silent when it has not answered for this time [s], while others
+# with its number have answered as many beacons: a beacon invites all of them or none.
+SILENT_S = 1.0
+# Time without a rejected ack after which a conflict has ended [s].
+_CONFLICT_S = 5.0
+
+
+@dataclasses.dataclass
+class _User:
+    """A registered user, and the node that owns its number: the first that answered."""
+
+    # (turn, 1, number) if it was served in that turn, (turn, 0, number) if it was registered after
+    # it and not served yet.
+    turn: tuple[int, int, int]
+    missed: int = 0  # consecutive beacons without an answer
+    instance: int = 0  # of the owner; 0 if unknown
+    answered_s: float = 0.0  # time of its last ack [s]
+    rejected: int = 0  # acks of other instances since then
+
+
+class UserRegistry:
+    """Registers the users that answer beacons and selects the next one to serve.
+
+    Each number belongs to one node: the first to answer, until it is silent.
+
+    Parameters
+    ----------
+    policy
+        ``round_robin``: the user served longest ago; ``first``: the first to answer; ``random``.
+    rng
+        Source of randomness, for ``random``.
+
+    Attributes
+    ----------
+    all_invited
+        Whether the latest beacon invited all users.
+    answered
+        Users that answered in this cycle, in order; the values have no meaning.
+    """
+
+    def __init__(self, policy: str, rng: np.random.Generator) -> None:
+        self.policy, self._rng = policy, rng
+        self._users: dict[int, _User] = {}
+        # By number: when an owner last answered after another instance [s], and a description.
+        self._conflicts: dict[int, tuple[float, str]] = {}
+        # The registered users in ascending order.
+        self._numbers: list[int] = []
+        # The registered users that were invited and have not answered yet.
+        self._awaited: set[int] = set()
+        # Users that are served before others once, in the order of the requests.
+        self._requested: dict[int, None] = {}
+        self._turn = 0
+        self.all_invited = True
+        self.answered: dict[int, None] = {}
+
+    def __len__(self) -> int:
+        """Return the number of registered users."""
+        return len(self._users)
+
+    def invite(self, attempt: int) -> tuple[int, int]:
+        """Choose the users to wait for, and return their first and last number.
+
+        The range contains the user whose turn it is. The ranges of all turns cover every number,
+        so that new users are invited within a round. `attempt` is the number of beacons of the
+        cycle that nobody answered; each extends the range.
+        """
+        self.answered = {}
+        numbers, size = self._numbers, INVITED * _EXTENSION**min(attempt, 8)
+        self.all_invited = size >= len(numbers)
+        if self.all_invited:
+            self._awaited = set(numbers)
+            return 1, LAST_NUMBER
+        begin = bisect.bisect_left(numbers, self._next()) // size * size
+        invited = numbers[begin:begin + size]
+        self._awaited = set(invited)
+        return (numbers[begin - 1] + 1 if begin else 1,
+                invited[-1] if begin + size < len(numbers) else LAST_NUMBER)
+
+    def request(self, user: int) -> None:
+        """Serve a user before others once, as soon as it answers."""
+        self._requested[user] = None
+
+    def _next(self) -> int:
+        """Return the registered user whose turn it is."""
+        if requested := next((user for user in self._requested if user in self._users), 0):
+            return requested
+        match self.policy:
+            case 'first':
+                return self._numbers[self._turn * INVITED % len(self._numbers)]
+            case 'random':
+                return int(self._rng.choice(self._numbers))
+        return min(map(operator.attrgetter('turn'), self._users.values()))[-1]
+
+    def is_taken(self, number: int, instance: int, now_s: float) -> bool:
+        """Return whether another instance owns a number and is not silent."""
+        user = self._users.get(number)
+        return user is not None and instance != user.instance and (
+            user.rejected < _MAX_MISSED or now_s < user.answered_s + SILENT_S)
+
+    def reject(self, number: int) -> None:
+        """Count an ack of an instance that does not own the number."""
+        self._users[number].rejected += 1
+
+    def register(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
+        """Wait for a user, without counting it among those that answered.
+
+        A user that was invited to this cycle and has not answered in time loses its turn.
+        Otherwise, the range of a user that is always late would be invited in every cycle, and
+        the users of the other ranges never.
+
+        Returns
+        -------
+        str
+            A warning at the first ack of the owner after one of another instance was rejected,
+            otherwise empty.
+        """
+        user = self._users.get(number)
+        # A new user comes after all that wait and before the one served last, so that users that
+        # leave and return do not gain turns.
+        if user is None:
+            user = self._users[number] = _User((self._turn, 0, number), instance=instance)
+            bisect.insort(self._numbers, number)
+        elif self.policy == 'round_robin' and number in self._awaited:
+            user.turn = self._turn, 0, number
+        warning = ''
+        if user.rejected and instance == user.instance:
+            text = m.describe_conflict(number, instance)
+            warning = '' if text in self.conflicts(now_s).values() else text
+            self._conflicts[number] = now_s, text
+        user.missed, user.rejected, user.instance, user.answered_s = 0, 0, instance, now_s
+        return warning
+
+    def add_answer(self, number: int, instance: int = 0, now_s: float = 0.0) -> str:
+        """Register a user as answering in this cycle; return a warning as `register` does."""
+        self._awaited.discard(number)
+        self.answered[number] = None
+        return self.register(number, instance, now_s)
+
+    def remove(self, number: int) -> None:
+        """Stop waiting for a user until it answers again, and release its number."""
+        if self._users.pop(number, None) is not None:
+            del self._numbers[bisect.bisect_left(self._numbers, number)]
+            self._awaited.discard(number)
+
+    def owner(self, number: int) -> int:
+        """Return the instance that owns a number; 0 if none does or if it is unknown."""
+        user = self._users.get(number)
+        return user.instance if user else 0
+
+    def conflicts(self, now_s: float) -> dict[str, str]:
+        """Return a description of each conflict, by key of the diagnostics."""
+        return {f'conflict.user_{number}': text
+                for number, (latest_s, text) in self._conflicts.items()
+                if now_s < latest_s + _CONFLICT_S}
+
+    def remove_all_except(self, is_allowed: Callable[[int], bool]) -> list[int]:
+        """Remove and return the users that are not allowed."""
+        removed = [user for user in self._numbers if not is_allowed(user)]
+        for user in removed:
+            self.remove(user)
+        return removed
+
+    def is_complete_with(self, user: int) -> bool:
+        """Return whether no further answers are needed once `user` has answered."""
+        if user in self._requested:
+            return True
+        if self.policy == 'first' and not self._awaited & self._requested.keys():
+            return True
+        return self._awaited <= {user}
+
+    def remove_absent(self) -> list[int]:
+        """Count missed beacons; remove and return the users that missed too many in a row.
+
+        Beacons that do not invite a user do not count.
+        """
+        lost = []
+        for number in sorted(self._awaited):
+            self._users[number].missed += 1
+            if self._users[number].missed >= _MAX_MISSED:
+                self.remove(number)
+                lost.append(number)
+        return lost
+
+    def select(self) -> int:
+        """Return the user to serve, one of those that answered."""
+        if requested := [user for user in self._requested if user in self.answered]:
+            chosen = requested[0]
+            del self._requested[chosen]
+        elif self.policy == 'first':
+            chosen = next(iter(self.answered))
+        elif self.policy == 'random':
+            chosen = int(self._rng.choice(list(self.answered)))
+        else:
+            chosen = min(self.answered, key=lambda user: self._users[user].turn)
+        self._turn += 1
+        self._users[chosen].turn = self._turn, 1, chosen
+        return chosen
+
+
+_RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
+
+
+def parse_users(text: str) -> tuple[range, ...]:
+    """Parse a list of user numbers from 1 and ranges, such as ``1, 4, 10-20``; may be empty.
+
+    Raises
+    ------
+    ValueError
+        If a part is neither a number nor an ascending range.
+    """
+    return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
+
+
+def _parse_range(part: str) -> range:
+    match = _RANGE.fullmatch(part)
+    first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, 0)
+    if not 1 <= first <= last <= LAST_NUMBER:
+        raise ValueError(f'{part.strip()!r}, expected numbers from 1 to {LAST_NUMBER} and ranges '
+                         'such as 10-20')
+    return range(first, last + 1)
+
+
+# Maximum number of users that one text names.
+MAX_NAMED = 8
+
+
+def join_users(users: Iterable[int]) -> str:
+    """Return the numbers of users as a list, which ends with a count of those beyond `MAX_NAMED`.
+
+    Examples
+    --------
+    >>> join_users(range(1, 12))
+    '1, 2, 3, 4, 5, 6, 7, 8 and 3 others'
+    """
+    names = [str(user) for user in users]
+    n_others = len(names) - MAX_NAMED
+    others = f' and {n_others} other{"s" * (n_others > 1)}' if n_others > 0 else ''
+    return f'{", ".join(names[:MAX_NAMED])}{others}'

@@ -1,0 +1,170 @@
+"""How a process joins the network: discovery, and an enclave of SROS 2.
+
+Fast DDS takes a tenth of a second for discovery, and a second longer for each message that it
+misses. A node therefore joins while it imports its modules; this one imports little.
+"""
+
+import contextlib
+import os
+import re
+import sys
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from ament_index_python.packages import get_package_share_directory
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+
+from rhs_isac_ros.executables import EXECUTABLES
+
+# Environment variable with the profile file of Fast DDS.
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+# Options of nodes that need no services, so that access control need not permit any.
+WITHOUT_SERVICES: Mapping[str, Any] = {
+    'start_parameter_services': False,
+    'parameter_overrides': [Parameter('start_type_description_service', value=False)]}
+# Keeps the participant of this process until its nodes do.
+_holders: list[Node] = []
+
+
+def discovery_profile_file() -> Path:
+    """Return the path of the Fast DDS discovery profile, which depends on DDS security."""
+    name = 'discovery_security.xml' if is_enabled() else 'discovery.xml'
+    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / name
+
+
+def use_discovery_profile() -> None:
+    """Shorten the discovery times of Fast DDS in this process.
+
+    Fast DDS reads the profile when the first node is created. A file that the environment already
+    names takes precedence; an empty name selects the defaults of Fast DDS.
+    """
+    file = os.environ.setdefault(_PROFILES, str(discovery_profile_file()))
+    if not file:
+        # Fast DDS reports an error for an empty name.
+        del os.environ[_PROFILES]
+
+
+def join(args: list[str]) -> None:
+    """Join the network with a hidden node, for a command line that begins with the program."""
+    use_discovery_profile()
+    rclpy.init(args=prepare(args), signal_handler_options=SignalHandlerOptions.NO)
+    with one_line():
+        _holders.append(Node(
+            f'_starting_{os.getpid()}', use_global_arguments=False, enable_rosout=False,
+            **WITHOUT_SERVICES))
+
+
+def leave() -> None:
+    """Destroy the hidden node, if there is one; nodes of the process keep its participant."""
+    while _holders:
+        _holders.pop().destroy_node()
+
+
+_ENABLE, _STRATEGY, _KEYSTORE, OVERRIDE = (
+    'ROS_SECURITY_ENABLE', 'ROS_SECURITY_STRATEGY', 'ROS_SECURITY_KEYSTORE',
+    'ROS_SECURITY_ENCLAVE_OVERRIDE')
+# Files of an enclave.
+_FILES = ('identity_ca.cert.pem', 'cert.pem', 'key.pem', 'permissions_ca.cert.pem',
+          'governance.p7s', 'permissions.p7s')
+# The remapping rules of the name and the namespace of a node.
+_RULE = re.compile(r'(?:[^:]+:)?__(node|ns):=(.*)')
+
+
+class SecurityError(RuntimeError):
+    """DDS security is requested and cannot be used."""
+
+
+def is_enabled() -> bool:
+    """Return whether the environment switches DDS security on."""
+    return os.environ.get(_ENABLE) == 'true'
+
+
+def prepare(args: Sequence[str]) -> list[str]:
+    """Return a command line that names an enclave, if DDS security is enabled.
+
+    The command line begins with the name of the program. By default, the enclave of a node has its
+    full name, that of a tool is ``operator``. ROS reports an error of the environment with a
+    traceback or not at all, so that it is checked here.
+
+    Raises
+    ------
+    SecurityError
+        If a variable has an unknown value, or a file is missing, or the permissions are for
+        another domain.
+    """
+    for name, values in ((_ENABLE, ('', 'true', 'false')), (_STRATEGY, (
+            '', 'Enforce', 'Permissive'))):
+        # ROS ignores other values, and runs without security.
+        if os.environ.get(name, '') not in values:
+            raise SecurityError(
+                f'{name}: {os.environ[name]!r}, expected {" or ".join(values[1:])}')
+    if not is_enabled():
+        return list(args)
+    enclave = os.environ.get(OVERRIDE) or _enclave(args)
+    try:
+        _check_enclave(enclave)
+    except SecurityError as error:
+        if os.environ.get(_STRATEGY) == 'Enforce':
+            raise
+        print(f'WITHOUT security, because {_STRATEGY} is not Enforce: {error}', file=sys.stderr)
+    return list(args) if '--enclave' in args else [*args, '--ros-args', '--enclave', enclave]
+
+
+def _enclave(args: Sequence[str]) -> str:
+    """Return the enclave that a command line names, or that of its node or tool."""
+    if '--enclave' in args[:-1]:
+        return args[args.index('--enclave') + 1]
+    rules = {match[1]: match[2] for match in map(_RULE.fullmatch, args) if match}
+    program = os.path.basename(args[0])
+    own = 'operator' if EXECUTABLES.get(program, 'tools') == 'tools' else program
+    name = program if program == 'replay' else own
+    return f'{rules.get("ns", "").rstrip("/")}/{rules.get("node", name)}'
+
+
+def _check_enclave(enclave: str) -> None:
+    keystore = os.environ.get(_KEYSTORE, '')
+    if not (Path(keystore) / 'enclaves').is_dir():
+        raise SecurityError(f'{_KEYSTORE}: {keystore!r}, expected a keystore: '
+                            'ros2 security generate_artifacts')
+    folder = Path(keystore) / 'enclaves' / enclave.lstrip('/')
+    # A file *.p11 names a key in a device.
+    missing = [name for name in _FILES if not (
+        (folder / name).is_file() or (folder / name).with_suffix('.p11').is_file())]
+    if missing:
+        raise SecurityError(f'enclave {enclave}: no {missing[0]} in {folder}; generate its keys, '
+                            f'or choose another with --ros-args --enclave or {OVERRIDE}')
+    # The permissions are signed, but not encrypted.
+    signed = (folder / 'permissions.p7s').read_text(encoding='utf-8', errors='replace')
+    domains = re.findall(r'<id>\s*(\d+)\s*</id>', signed)
+    domain = os.environ.get('ROS_DOMAIN_ID') or '0'
+    if domains and domain not in domains:
+        raise SecurityError(f'ROS_DOMAIN_ID: {domain}, expected {" or ".join({*domains})}, for '
+                            f'which the permissions of {enclave} are signed')
+
+
+@contextlib.contextmanager
+def one_line() -> Iterator[None]:
+    """Convert the error of a node or an endpoint that DDS security refuses to `SecurityError`."""
+    try:
+        with warnings.catch_warnings():
+            # ROS destroys the incomplete node.
+            warnings.simplefilter('ignore', RuntimeWarning)
+            yield
+    except rclpy_implementation.RCLError as error:
+        if not is_enabled():
+            raise
+        # The end of the text is a position in the sources of ROS.
+        text = str(error).partition(', at ')[0].splitlines()[0]
+        if 'failed to create participant' in text:
+            text = ('Fast DDS rejects the files of the enclave, which may be damaged, expired or '
+                    'signed by another authority')
+        if 'security libraries' in text:
+            text = ('Fast DDS was built without security, as in the wheels; install the packages '
+                    f'of ROS 2 Jazzy, or unset {_ENABLE}')
+        raise SecurityError(f'DDS security: {text}') from None

@@ -1,0 +1,96 @@
+"""The declaration of a value, with one wording of what is expected.
+
+Fields of scenarios and messages, settings of roles, ROS parameters and arguments of commands are
+declared in this way.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from rhs_isac_ros.support import plugins
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """Declaration of a value.
+
+    Attributes
+    ----------
+    kind
+        ``bool``, ``int``, ``float`` or ``str``, or ``list`` for numbers.
+    text
+        Description.
+    low, high
+        Range of numbers, inclusive.
+    is_open
+        Whether `low` itself is invalid.
+    choices
+        Valid strings; empty: any.
+    plugins
+        Entry point group whose names are valid too; empty: none.
+    """
+
+    kind: type
+    text: str = ''
+    unit: str = ''
+    low: float = -math.inf
+    high: float = math.inf
+    is_open: bool = False
+    choices: tuple[str, ...] = ()
+    plugins: str = ''
+
+    WORDS: ClassVar[Mapping[type, str]] = {
+        bool: 'true or false', int: 'an integer', float: 'a number', str: 'a string',
+        list: 'a list of numbers'}
+
+    @property
+    def range(self) -> str:
+        """Valid values as text; empty if every value of the type is valid."""
+        if self.choices:
+            return ', '.join(self.choices) + (' or a plug-in' if self.plugins else '')
+        # Large integers need all digits.
+        low, high = (str(limit) if isinstance(limit, int) else f'{limit:g}'
+                     for limit in (self.low, self.high))
+        if self.high < math.inf:
+            words = f'{low} to {high}'
+        elif self.low > -math.inf:
+            words = f'above {low}' if self.is_open else f'at least {low}'
+        else:
+            return ''
+        return f'{words} {self.unit}'.rstrip()
+
+    @property
+    def expected(self) -> str:
+        """Valid values as text, including the type."""
+        if self.choices:
+            return f'one of {self.range}' + (f' of {self.plugins}' if self.plugins else '')
+        words = self.WORDS[self.kind]
+        return f'{words}, {self.range}' if self.range else words
+
+    def problem(self, value: Any) -> str:
+        """Return an invalid value and what is expected instead; empty for a valid value."""
+        if not self._has_type(value):
+            return f'{value!r}, expected {self.expected}'
+        if self.choices:
+            return self._choice_problem(value)
+        numbers = value if self.kind is list else [value] if self.kind in (int, float) else []
+        if all(self.low <= number <= self.high and abs(number) < math.inf
+               and not (self.is_open and number == self.low) for number in numbers):
+            return ''
+        return f'{value!r}, expected {self.range or "finite numbers"}'
+
+    def _has_type(self, value: Any) -> bool:
+        if self.kind is not list:
+            return type(value) is self.kind
+        return (isinstance(value, Sequence) and not isinstance(value, str)
+                and all(isinstance(number, float) for number in value))
+
+    def _choice_problem(self, value: str) -> str:
+        # Listing the installed plug-ins takes time; the built-in choices do not need it.
+        installed = plugins.names(self.plugins) if value not in self.choices else ()
+        if value in (*self.choices, *installed):
+            return ''
+        listed = f'; installed: {", ".join(installed) or "none"}' if self.plugins else ''
+        return f'{value!r}, expected {self.expected}{listed}'

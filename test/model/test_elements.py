@@ -1,0 +1,175 @@
+"""Errors and failures of the elements: draws, and their effect on mean and covariance."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from rhs_isac_ros.model import (
+    MeasurementModel,
+    Scenario,
+    draw_surface,
+    elements,
+    simulate_received,
+)
+from rhs_isac_ros.model.elements import (
+    DeclaredElements,
+    element_correlation,
+    error_terms,
+)
+
+N_SURFACES = 1500
+ERRORS = [{'element_error_rms': 0.2}, {'failed_element_share': 0.1},
+          {'element_error_rms': 0.3, 'failed_element_share': 0.3}]
+
+
+@pytest.fixture(scope='module')
+def damaged(small) -> Scenario:
+    return dataclasses.replace(
+        small.scenario, element_error_rms=0.3, failed_element_share=0.2)
+
+
+def test_a_surface_has_the_declared_errors():
+    scenario = Scenario(
+        elements_per_side=100, element_error_rms=0.05, failed_element_share=0.03)
+    surface = draw_surface(scenario, np.random.default_rng(1))
+    errors, levels = surface.gains - 1, surface.stuck[~np.isnan(surface.stuck)]
+    assert np.sqrt(np.mean(np.abs(errors)**2)) == pytest.approx(0.05, rel=0.05)
+    assert abs(np.mean(errors**2)) < 5e-2 * 0.05**2
+    assert len(levels) == pytest.approx(300, abs=4 * np.sqrt(300))
+    assert levels.min() >= 0
+    assert levels.max() <= 1
+    assert levels.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * 300))
+
+
+def test_a_failed_element_is_stuck_in_all_configurations():
+    scenario = Scenario(elements_per_side=4, element_error_rms=0.1, failed_element_share=0.4)
+    surface = draw_surface(scenario, np.random.default_rng(2))
+    analog = np.random.default_rng(3).uniform(size=(2, 3, 16))
+    applied = surface.applied(analog)
+    failed = ~np.isnan(surface.stuck)
+    assert 0 < failed.sum() < 16
+    np.testing.assert_array_equal(
+        applied[..., failed], np.broadcast_to((surface.stuck * surface.gains)[failed],
+                                              applied[..., failed].shape))
+    np.testing.assert_array_equal(
+        applied[..., ~failed], (analog * surface.gains)[..., ~failed])
+
+
+def test_a_higher_share_adds_failures():
+    few, many = (draw_surface(Scenario(failed_element_share=share), np.random.default_rng(4))
+                 for share in (0.1, 0.3))
+    failed = ~np.isnan(few.stuck)
+    assert 0 < failed.sum() < (~np.isnan(many.stuck)).sum()
+    np.testing.assert_array_equal(many.stuck[failed], few.stuck[failed])
+
+
+def test_factors_are_the_covariance_of_the_coefficients():
+    scenario = Scenario(elements_per_side=128, element_error_rms=0.4, failed_element_share=0.3)
+    configurations = np.array([0.0, 0.3, 1.0])
+    analog = np.broadcast_to(configurations[:, None], (3, scenario.n_elements))
+    applied = draw_surface(scenario, np.random.default_rng(0)).applied(analog)
+    mean = 0.7 * configurations + 0.15
+    np.testing.assert_allclose(applied.mean(axis=1), mean, atol=0.02)
+    deviation = applied - mean[:, None]
+    factors = np.array([constant + slope * configurations
+                        for constant, slope in error_terms(scenario)])
+    np.testing.assert_allclose(
+        deviation @ deviation.conj().T / scenario.n_elements,
+        np.einsum('tq,tp->qp', factors, factors), atol=0.01)
+
+
+@pytest.mark.parametrize('errors', ERRORS, ids=str)
+def test_mean_and_covariance_are_those_over_surfaces(small, errors):
+    scenario = dataclasses.replace(small.scenario, **errors)
+    position = small.vectors['positions'][1:2]
+    model = MeasurementModel(scenario, small.codebook)
+    rng = np.random.default_rng(1)
+    surfaces = [MeasurementModel(scenario, small.codebook, draw_surface(scenario, rng))
+                for _ in range(N_SURFACES)]
+    covariance = model.covariance_at(position)[0, 0]
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    deviations = np.array([s.mean(position)[0, 0] for s in surfaces]) - model.mean(position)[0, 0]
+    deviations = deviations @ root.T
+    assert np.abs(deviations.mean(axis=0)).max() < 5 / np.sqrt(N_SURFACES)
+    # The covariance over surfaces and multipath is the mean covariance given the surface, plus
+    # the covariance of the mean given the surface.
+    given = np.mean([s.covariance()[0] for s in surfaces], axis=0)
+    found = root @ given @ root.conj().T + deviations.T @ deviations.conj() / N_SURFACES
+    np.testing.assert_allclose(found, np.eye(len(root)), atol=7 / np.sqrt(N_SURFACES))
+
+
+def test_the_average_is_that_over_the_region(table1):
+    scenario = dataclasses.replace(
+        table1.scenario, element_error_rms=0.03, failed_element_share=0.01)
+    model = MeasurementModel(scenario, table1.codebook)
+    low, high = scenario.roi_bounds_m
+    positions = low + qmc.Sobol(3, seed=0).random(128) * (high - low)
+    average = model.covariance_at(positions).mean(axis=0)
+    scale = np.sqrt(np.einsum('brr->br', average).real)
+    difference = (model.covariance() - average) / (scale[:, :, None] * scale[:, None, :])
+    assert np.abs(difference).max() < 0.01
+
+
+def test_the_quadrature_over_the_region_has_converged(monkeypatch):
+    """A near, wide region and wide sub-bands need more nodes than Table I."""
+    scenario = Scenario(elements_per_side=4, n_subbands=4, subband_width_hz=5e6,
+                        roi_center_m=(3, 0, 0), roi_size_m=(4, 8, 4))
+    found = element_correlation(scenario, 0)
+    monkeypatch.setattr(elements, '_ROI_NODES', 24)
+    expected = element_correlation.__wrapped__(scenario, 0)
+    assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
+
+
+def test_without_errors_the_covariance_is_the_same_everywhere(case):
+    model = MeasurementModel(case.scenario, case.codebook)
+    found = model.covariance_at(case.vectors['positions'])
+    np.testing.assert_array_equal(found, np.broadcast_to(model.covariance(), found.shape))
+
+
+def test_a_known_surface_has_no_error(small):
+    scenario = dataclasses.replace(small.scenario, element_error_rms=0.5)
+    surface = draw_surface(scenario, np.random.default_rng(3))
+    known = MeasurementModel(scenario, small.codebook, surface)
+    exact = MeasurementModel(small.scenario, small.codebook, surface)
+    np.testing.assert_array_equal(known.covariance(), exact.covariance())
+
+
+def test_elements_are_exact_if_their_errors_are_known_or_absent(small, damaged):
+    assert draw_surface(damaged, np.random.default_rng(3)).is_exact
+    assert DeclaredElements(small.scenario).is_exact
+    for name in ('element_error_rms', 'failed_element_share'):
+        assert not DeclaredElements(Scenario(**{name: 1e-6})).is_exact
+
+
+def test_a_given_surface_is_used(small, damaged):
+    surface = draw_surface(damaged, np.random.default_rng(9))
+    silent = dataclasses.replace(small.scenario, noise_psd_dbm_hz=-400, multipath_to_los_db=-200)
+    positions = small.scenario.sample_positions(2, np.random.default_rng(10))
+    received = simulate_received(
+        silent, small.codebook, positions, np.random.default_rng(0), surface)
+    model = MeasurementModel(silent, small.codebook, surface)
+    np.testing.assert_allclose(received, model.mean(positions), rtol=1e-6)
+
+
+def test_samples_are_of_the_known_surface(small, damaged):
+    surface = draw_surface(damaged, np.random.default_rng(9))
+    quiet = dataclasses.replace(
+        small.scenario, element_error_rms=0.3, failed_element_share=0.2, noise_psd_dbm_hz=-200,
+        multipath_to_los_db=-100)
+    positions = quiet.sample_positions(2, np.random.default_rng(10))
+    model = MeasurementModel(quiet, small.codebook, surface)
+    mean = model.mean(positions)
+    received = model.sample(positions, np.random.default_rng(0))
+    assert np.abs(received - mean).max() < 1e-3 * np.abs(mean).max()
+
+
+def test_a_surface_of_another_size_is_an_error(small):
+    other = draw_surface(Scenario(), np.random.default_rng(9))
+    positions = small.scenario.sample_positions(2, np.random.default_rng(10))
+    with pytest.raises(ValueError, match='^surface: 100 elements, expected N_E = 16 as in '):
+        MeasurementModel(small.scenario, small.codebook, other)
+    with pytest.raises(ValueError, match='^surface: 100 elements, expected N_E = 16 as in '):
+        simulate_received(
+            small.scenario, small.codebook, positions, np.random.default_rng(0), other)
