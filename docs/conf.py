@@ -43,5 +43,5 @@ nitpick_ignore_regex = [
     ('py:.*', r'(?!rhs_isac_ros\.).*'),
     ('py:.*', r'rhs_isac_ros\.(.*\.)?_.*'),
     # Type variables.
-    ('py:.*', r'rhs_isac_ros\.protocol\.(role\.(Item|Key|Value|\w+T)|settings\.SettingsT)'),
+    ('py:.*', r'rhs_isac_ros\.protocol\.(role\.(Key|Value|\w+T)|(messages|settings)\.\w+T)'),
 ]
