@@ -9,7 +9,7 @@ from nav_msgs.msg import Odometry
 from rhs_isac_ros.model import mobility
 from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.endpoints import UserTopics, steady_timer
+from rhs_isac_ros.ros.endpoints import UserTopics, create_timer, steady_timer
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS, ParameterError
 from rhs_isac_ros.ros.robot import RobotMobility, follow_frame, follow_odometry
@@ -38,7 +38,7 @@ class UserNode(RoleNode[User]):
         self._true_odometry = UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
         # On the clock of ROS, as the mobilities.
-        self.create_timer(values.ground_truth_period_s, self._publish_ground_truth)
+        create_timer(self, values.ground_truth_period_s, self._publish_ground_truth)
         if robot := self._robot:
             self._watch_robot(robot)
             steady_timer(self, _WATCH_S, functools.partial(self._watch_robot, robot))

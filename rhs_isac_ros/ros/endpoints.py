@@ -60,12 +60,6 @@ def profile_for(kind: type[m.Message], exchange: QoSProfile = EXCHANGE) -> QoSPr
         return ACKS
     return LATCHED if kind in _LATCHED_MESSAGES else exchange
 
-
-def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
-    """Create a running timer on the steady clock, which the deadlines of the roles refer to."""
-    return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-
 _CreatedT = TypeVar('_CreatedT')
 # By node: descriptions of what was refused, by kind and name.
 _refusals: weakref.WeakKeyDictionary[Node, dict[str, str]] = weakref.WeakKeyDictionary()
@@ -80,13 +74,44 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
     """Return what `create` returns; None, with one log line, if the middleware refuses it."""
     try:
         return create()
-    except rclpy_implementation.RCLError as error:
-        text = f'{what} was refused: {str(error).splitlines()[0]}'
+    # Of an action, rclpy raises a ValueError.
+    except (rclpy_implementation.RCLError, ValueError) as error:
+        # The end of the text is a position in the sources of ROS.
+        text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
         known = _refusals.setdefault(node, {})
         if what not in known:
             node.get_logger().error(text)
         known[what] = text
         return None
+
+
+class _NoTimer(Timer):
+    """Takes the place of a timer that was refused, and never expires."""
+
+    timer_period_ns = 0
+
+    def __init__(self) -> None:
+        return
+
+    def cancel(self) -> None:
+        return
+
+    def reset(self) -> None:
+        return
+
+
+def create_timer(
+        node: Node, period_s: float, callback: Callable[[], None], clock: Clock | None = None
+) -> Timer:
+    """Create a running timer, by default on the clock of ROS; if refused, it never expires."""
+    timer = create_or_refuse(node, f'timer of {period_s:g} s', lambda: node.create_timer(
+        period_s, callback, clock=clock))
+    return timer or _NoTimer()
+
+
+def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
+    """Create a running timer on the steady clock, which the deadlines of the roles refer to."""
+    return create_timer(node, period_s, callback, Clock(clock_type=ClockType.STEADY_TIME))
 
 
 class _NoPublisher(Publisher):

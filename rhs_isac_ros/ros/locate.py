@@ -17,6 +17,8 @@ from rhs_isac_ros.ros.topics import LOCATE
 
 _DEFAULT_TIMEOUT_S = 10.0
 _MAX_TIMEOUT_S = 3600.0
+# Maximum number of goals in progress: each takes memory and a timer.
+_MAX_GOALS = 100
 
 
 @dataclasses.dataclass(eq=False)
@@ -82,11 +84,14 @@ class LocateServer:
 
     def _accept(self, request: Locate.Goal) -> GoalResponse:
         valid = 1 <= request.user <= self._max_users and 0 <= request.timeout_s <= _MAX_TIMEOUT_S
-        if not valid:
-            self._node.get_logger().warning(
-                f'{LOCATE}: user {request.user}, timeout_s {request.timeout_s:g}, expected a user '
-                f'from 1 to {self._max_users} and a timeout from 0 to {_MAX_TIMEOUT_S:g} s')
-        return GoalResponse.ACCEPT if valid else GoalResponse.REJECT
+        if valid and len(self._goals) < _MAX_GOALS:
+            return GoalResponse.ACCEPT
+        self._node.get_logger().warning(
+            f'{LOCATE}: {_MAX_GOALS} goals are in progress' if valid else
+            f'{LOCATE}: user {request.user}, timeout_s {request.timeout_s:g}, expected a user '
+            f'from 1 to {self._max_users} and a timeout from 0 to {_MAX_TIMEOUT_S:g} s',
+            throttle_duration_sec=1.0)
+        return GoalResponse.REJECT
 
     def _cancel(self, handle: Any) -> CancelResponse:
         for goal in self._goals:
@@ -109,7 +114,7 @@ class LocateServer:
 
     def _later(self, delay_s: float, callback: Callable[[], None]) -> Any:
         def once() -> None:
-            timer.cancel()
+            self._node.destroy_timer(timer)
             callback()
         timer = steady_timer(self._node, max(delay_s, 1e-3), once)
         return timer

@@ -6,6 +6,7 @@ settings of a role are declared there.
 
 import dataclasses
 import difflib
+import functools
 import types
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -27,6 +28,7 @@ from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import Field
@@ -340,7 +342,14 @@ class ParameterizedNode(Node):
             self._check_each(parameter_list)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        return super().set_parameters_atomically(parameter_list)
+        # With use_sim_time, rclpy subscribes to the time of the simulation.
+        what = f'subscription to {topics.CLOCK}'
+        result = create_or_refuse(self, what, functools.partial(
+            super().set_parameters_atomically, parameter_list))
+        if result:
+            return result
+        self._time_source.ros_time_is_active = False
+        return SetParametersResult(successful=False, reason=refusals(self)[what])
 
     def _is_kept(self, parameter: RosParameter) -> bool:
         name = parameter.name

@@ -8,7 +8,8 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.time import Time
 
-from rhs_isac_ros.ros.endpoints import SENSOR, steady_timer, subscribe
+from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import SENSOR, create_or_refuse, steady_timer, subscribe
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix, vector
 from rhs_isac_ros.ros.parameters import ParameterError
 
@@ -111,7 +112,8 @@ def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> Robo
             'installed; it comes with a ROS 2 installation, but not as a wheel') from None
     mobility = RobotMobility(node, frame, f'transform from {frame.name} to {child}', timeout_s)
     buffer = tf2_ros.Buffer(node=node)
-    listener = tf2_ros.TransformListener(buffer, node)
+    listener = create_or_refuse(
+        node, f'subscription to {topics.TF}', lambda: tf2_ros.TransformListener(buffer, node))
     steady_timer(node, _LOOKUP_S, _lookup(mobility, buffer, listener, frame.name, child))
     return mobility
 
@@ -123,8 +125,7 @@ def _lookup(
 
     def look() -> None:
         # The listener lives as long as this function.
-        assert listener
-        if not buffer.can_transform(parent, child, Time()):  # type: ignore[attr-defined]
+        if not listener or not buffer.can_transform(parent, child, Time()):  # type: ignore[attr-defined]
             return
         found = buffer.lookup_transform(parent, child, Time())  # type: ignore[attr-defined]
         stamp_ns = Time.from_msg(found.header.stamp).nanoseconds

@@ -33,8 +33,9 @@ _holders: list[Node] = []
 
 
 def discovery_profile_file() -> Path:
-    """Return the path of the Fast DDS discovery profile, ``config/discovery.xml``."""
-    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / 'discovery.xml'
+    """Return the path of the Fast DDS discovery profile, which depends on DDS security."""
+    name = 'discovery_security.xml' if is_enabled() else 'discovery.xml'
+    return Path(get_package_share_directory('rhs_isac_ros')) / 'config' / name
 
 
 def use_discovery_profile() -> None:
@@ -158,7 +159,11 @@ def one_line() -> Iterator[None]:
     except rclpy_implementation.RCLError as error:
         if not is_enabled():
             raise
-        text = str(error).splitlines()[0]
+        # The end of the text is a position in the sources of ROS.
+        text = str(error).partition(', at ')[0].splitlines()[0]
+        if 'failed to create participant' in text:
+            text = ('Fast DDS rejects the files of the enclave, which may be damaged, expired or '
+                    'signed by another authority')
         if 'security libraries' in text:
             text = ('Fast DDS was built without security, as in the wheels; install the packages '
                     f'of ROS 2 Jazzy, or unset {_ENABLE}')

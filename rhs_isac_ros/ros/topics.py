@@ -43,6 +43,8 @@ TRUE_PATH = 'users/user_{user}/true_path'
 # Transforms. The names are absolute, as those of tf2.
 TF = '/tf'
 TF_STATIC = '/tf_static'
+# Time of a simulation; absolute, as rclpy expects it.
+CLOCK = '/clock'
 
 # Action of the base station, and its services.
 LOCATE = 'locate'

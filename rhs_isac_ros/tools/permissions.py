@@ -33,7 +33,6 @@ _LOCATE_SERVICES = tuple(
     f'{topics.LOCATE}/_action/{name}' for name in ('cancel_goal', 'get_result', 'send_goal'))
 # A buffer of tf2 offers its frames.
 _TF_SERVICE = 'tf2_frames'
-_CLOCK = '/clock'
 _GET_CODEBOOK = f'{topics.OPTIMIZER_NODE}/get_parameters'
 _VERSION = '0.2.0'
 
@@ -100,7 +99,7 @@ def permissions(
         request=tuple(f'{optimizer}/{service}' for service in _PARAMETER_SERVICES))})
     nodes |= {'operator': _operator(nodes, numbers), 'replay': replay}
     if is_simulated:
-        return {name: allowed._replace(subscribe=(*allowed.subscribe, _CLOCK))
+        return {name: allowed._replace(subscribe=(*allowed.subscribe, topics.CLOCK))
                 for name, allowed in nodes.items()}
     return nodes
 

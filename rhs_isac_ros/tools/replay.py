@@ -41,7 +41,7 @@ from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import create_publisher, steady_timer
 from rhs_isac_ros.ros.recording import RecordingError, read, recorded_topics
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.ros.startup import WITHOUT_SERVICES
+from rhs_isac_ros.ros.startup import WITHOUT_SERVICES, is_enabled
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.tools import command
@@ -49,9 +49,11 @@ from rhs_isac_ros.tools.command import ToolError
 
 _SIGNALS = topics.NAMES[m.ReceivedSignals]
 _ESTIMATES = topics.NAMES[m.PositionEstimate]
-# Period of looking for subscribers; maximum time to discover an optimizer [s].
+# Period of looking for subscribers; maximum time to discover an optimizer, also while DDS security
+# exchanges keys [s].
 _POLL_PERIOD_S = 0.05
 _DISCOVERY_TIMEOUT_S = 2.0
+_SECURE_DISCOVERY_TIMEOUT_S = 8.0
 # Time without a new endpoint after which the publishers and subscribers of a network are taken as
 # complete [s]. Another publisher may be discovered after the first subscriber.
 _SETTLING_TIME_S = 1.0
@@ -248,7 +250,7 @@ def _optimizer(scenario: Scenario, codebook: Codebook) -> OptimizerNode:
 
 def _optimizer_present(node: Node) -> bool:
     return AsyncParameterClient(node, topics.OPTIMIZER_NODE).wait_for_services(
-        _DISCOVERY_TIMEOUT_S)
+        _SECURE_DISCOVERY_TIMEOUT_S if is_enabled() else _DISCOVERY_TIMEOUT_S)
 
 
 def _parameters(codebook: Codebook) -> list[Parameter]:

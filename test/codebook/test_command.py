@@ -155,7 +155,7 @@ def fails_with(call, capsys, words, *arguments, **options):
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [
-    (['--positions', '0'], ['--positions: 0', 'at least 1']),
+    (['--positions', '0'], ['--positions: 0', 'expected 1 to']),
     (['--steps', '-1'], ['--steps: -1']),
     (['--start', '/no/file.yaml'], ['/no/file.yaml']),
     (['--resume', '--seed', '7'], ['seed: 7', 'as in the codebook to resume from'])])

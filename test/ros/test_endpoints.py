@@ -8,10 +8,11 @@ import pytest
 from geometry_msgs.msg import Point, Vector3
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import endpoints, topics
+from rhs_isac_ros.ros import endpoints, locate, topics
 from rhs_isac_ros.ros.endpoints import BackgroundWorker, UserTopics
 from rhs_isac_ros.ros.roster import ROSTER
 
@@ -37,7 +38,19 @@ def refused(monkeypatch):
         monkeypatch.setattr(Node, method, attempt)
     for method in ('create_publisher', 'create_subscription', 'create_client', 'create_service'):
         refuse(method)
+
+    def refuse_action(node, kind, name, *_, **__):
+        names.append(name)
+        raise ValueError(f'{name} not found in allow rule, at a.cpp:1')
+    monkeypatch.setattr(locate, 'ActionServer', refuse_action)
     return names
+
+
+@pytest.fixture
+def no_timers(monkeypatch):
+    def refuse(*_, **__):
+        raise rclpy_implementation.RCLError('no memory\n, at a.cpp:1')
+    monkeypatch.setattr(Node, 'create_timer', refuse)
 
 
 @pytest.fixture
@@ -70,6 +83,28 @@ def test_a_role_runs_without_what_was_refused(bench, make, refused, capfd, role)
     assert report.fault
     assert {*texts.values()} <= {*report.values.values()}
     assert capfd.readouterr().err.count('was refused') == len(texts)
+
+
+@pytest.mark.parametrize('role', [*sorted(ROSTER), 'visualizer'])
+def test_a_role_runs_without_timers(bench, make, no_timers, role):
+    node = make(role)
+    if role in ROSTER and ROSTER[role].has_codebook:
+        node._on_codebook(Codebook.load(default_codebook_file()))
+    if role == 'user':
+        node.dispatch(m.Beacon(cycle_id=1, attempt=1, sender=1))
+    bench.spin_once()
+    texts = {*endpoints.refusals(node).values()}
+    assert texts
+    assert all(text.endswith(' s was refused: no memory') for text in texts)
+
+
+def test_a_simulation_whose_time_was_refused_is_not_used(bench, make, refused):
+    node = make('bs')
+    result = node.set_parameters_atomically([Parameter('use_sim_time', value=True)])
+    assert (result.successful, result.reason) == (
+        False, 'subscription to /clock was refused: /clock not found in allow rule')
+    assert not node.get_clock().ros_time_is_active
+    assert not node.get_parameter('use_sim_time').value
 
 
 def test_the_visualizer_runs_without_what_was_refused(make, refused):

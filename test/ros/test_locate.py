@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from rhs_isac_msgs.action import Locate
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros import convert, locate
 from rhs_isac_ros.ros.frames import Frame
 from rhs_isac_ros.ros.locate import LocateServer
 from rhs_isac_ros.ros.topics import LOCATE
@@ -125,6 +125,18 @@ def test_signals_without_a_position_abort_the_goal(bench, action):
 def test_a_goal_ends_after_its_timeout(bench, action):
     assert finish(bench, action.send(1, 0.05), GoalStatus.STATUS_ABORTED).reason == (
         'no position within 0.05 s')
+
+
+def test_the_number_of_goals_and_of_timers_is_limited(bench, action, monkeypatch):
+    monkeypatch.setattr(locate, '_MAX_GOALS', 3)
+    node = action.server._node
+    for _ in range(2):
+        goals = [action.send(1) for _ in range(3)]
+        assert not action.send(1).handle.accepted
+        for goal in goals:
+            bench.result(goal.handle.cancel_goal_async())
+            finish(bench, goal, GoalStatus.STATUS_CANCELED)
+        bench.until(lambda: not [*node.timers], 'no timers')
 
 
 def test_a_goal_ends_with_the_action(bench, action):

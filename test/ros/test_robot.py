@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import Pose, TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node as Node_
 
 from rhs_isac_ros.ros import topics
+from rhs_isac_ros.ros.endpoints import refusals
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix
 from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.robot import RobotMobility, follow_frame, follow_odometry
@@ -87,6 +89,19 @@ def test_odometry_is_read_in_the_frame_of_the_robot(bench):
         return not mobility.lack
     bench.until(arrived, 'the odometry')
     np.testing.assert_allclose(mobility.state(0.0)[1], [0.0, 2.0, 0.0], atol=1e-12)
+
+
+def test_transforms_that_were_refused_are_lacking(bench, monkeypatch):
+    def refuse(*_):
+        raise rclpy_implementation.RCLError('rt/tf topic not found in allow rule')
+    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(
+        Buffer=lambda node: None, TransformListener=refuse))
+    node = bench.add(Node_, 'robot_user')
+    mobility = follow_frame(node, Frame(), 'base_link', 1.0)
+    bench.until(lambda: [*node.timers], 'the timer')
+    bench.spin_once()
+    assert mobility.lack == 'transform from map to base_link'
+    assert '/tf was refused: rt/tf' in ''.join(refusals(node).values())
 
 
 class Buffer:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ from ament_index_python.packages import get_package_prefix
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from rhs_isac_ros.ros import startup
-from rhs_isac_ros.ros.startup import SecurityError, prepare
+from rhs_isac_ros.ros.startup import SecurityError, discovery_profile_file, prepare
 from rhs_isac_ros.tools import param, topic
 
 EVERY = ('bs', 'lab/user_1', 'operator', 'lab/operator', 'replay', 'other')
@@ -53,6 +54,18 @@ def test_a_given_enclave_takes_precedence(monkeypatch):
     assert prepare(['unknown'])[0] == 'unknown'
 
 
+def test_security_has_the_lease_of_fast_dds(monkeypatch):
+    leases, rests = [], []
+    for value in ('true', 'false'):
+        monkeypatch.setenv('ROS_SECURITY_ENABLE', value)
+        text = discovery_profile_file().read_text(encoding='utf-8')
+        lease = re.search(r'<leaseDuration>.*?</leaseDuration>', text, re.S)[0]
+        leases.append(tuple(map(int, re.findall(r'\d+', lease))))
+        rests.append(re.sub('<!--.*?-->', '', text.replace(lease, ''), flags=re.S))
+    assert leases == [(20, 0), (1, 600_000_000)]
+    assert rests[0] == rests[1]
+
+
 @pytest.mark.parametrize('value', [None, '', 'false'])
 def test_nothing_changes_without_security(monkeypatch, value):
     monkeypatch.delenv('ROS_SECURITY_ENABLE')
@@ -82,6 +95,18 @@ def test_an_error_has_one_line_that_names_the_variable(monkeypatch, capsys, name
         prepare(['bs'])
         assert capsys.readouterr().err == (
             f'WITHOUT security, because ROS_SECURITY_STRATEGY is not Enforce: {error.value}\n')
+
+
+@pytest.mark.parametrize(('error', 'text'), [
+    ('__create_participant failed to create participant, at a.cpp:107, at b.c:2',
+     'DDS security: Fast DDS rejects the files of the enclave, which'),
+    ('could not create data writer, at a.cpp:275, at b.c:1',
+     'DDS security: could not create data writer')])
+def test_an_error_omits_the_sources_of_ros(error, text):
+    with pytest.raises(SecurityError) as found, startup.one_line():
+        raise rclpy_implementation.RCLError(error)
+    assert str(found.value).startswith(text)
+    assert ', at ' not in str(found.value)
 
 
 @pytest.mark.parametrize('executable', ['bs', 'optimizer'])

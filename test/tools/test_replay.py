@@ -22,6 +22,7 @@ from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.endpoints import EXCHANGE
 from rhs_isac_ros.ros.recording import CycleObserver, Recorder, read
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.tools import replay
 from rhs_isac_ros.tools.replay import errors_m, load, main
 
 pytest.importorskip('mcap', reason='mcap is not installed')
@@ -206,6 +207,14 @@ def test_topics_of_a_running_network_are_not_published(built_scripts, run, share
 def test_unusable_recordings_are_named(run, capsys, arguments, error):
     assert main([str(run.path), '--publish', *map(str, arguments)]) == 2
     assert error in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('enabled', 'least_s'), [('true', 6.0), ('false', 2.0)])
+def test_an_optimizer_is_awaited_as_long_as_discovery_takes(monkeypatch, enabled, least_s):
+    monkeypatch.setenv('ROS_SECURITY_ENABLE', enabled)
+    monkeypatch.setattr(replay, 'AsyncParameterClient', lambda *_: types.SimpleNamespace(
+        wait_for_services=lambda timeout_s: timeout_s >= least_s))
+    assert replay._optimizer_present(None)
 
 
 @pytest.mark.parametrize('arguments', [['--estimator', 'ml'], ['--rate', '0'],
