@@ -23,10 +23,11 @@ from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, BackgroundWorker, UserTopics, create_publisher
 from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface
+from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.fields import ParameterError
 
 
 class PositionerNode(RoleNode[Positioner]):

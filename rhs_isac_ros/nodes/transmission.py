@@ -6,9 +6,10 @@ from typing import Any
 from rhs_isac_ros.link import prepare_steering
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.transmission import Transmission
-from rhs_isac_ros.ros.parameters import ParameterError, calibrated_surface
+from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
+from rhs_isac_ros.support.fields import ParameterError
 
 
 class TransmissionNode(RoleNode[Transmission]):

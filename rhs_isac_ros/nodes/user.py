@@ -11,11 +11,12 @@ from rhs_isac_ros.protocol.user import User
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import UserTopics, create_timer, steady_timer
 from rhs_isac_ros.ros.frames import Frame
-from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS, ParameterError
+from rhs_isac_ros.ros.parameters import ODOMETRY, ROBOTS
 from rhs_isac_ros.ros.robot import RobotMobility, follow_frame, follow_odometry
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import plugins, streams
+from rhs_isac_ros.support.fields import ParameterError
 
 # Period at which the positions of a robot are watched [s].
 _WATCH_S = 0.1

@@ -13,8 +13,8 @@ import numpy as np
 from geometry_msgs.msg import Point, Pose, Quaternion
 from rclpy.node import Node
 
-from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.topics import MAP_FRAME, RHS_FRAME, USER_FRAME
+from rhs_isac_ros.support.fields import ParameterError
 
 
 def surface_frame(namespace: str) -> str:

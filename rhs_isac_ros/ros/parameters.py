@@ -31,11 +31,7 @@ from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
 from rhs_isac_ros.ros.roster import ROSTER
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.fields import Field
-
-
-class ParameterError(ValueError):
-    """A parameter has a value that its node cannot use."""
+from rhs_isac_ros.support.fields import Field, ParameterError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from rclpy.time import Time
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import SENSOR, create_or_refuse, steady_timer, subscribe
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix, vector
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.support.fields import ParameterError
 
 # Period at which a frame is looked up [s].
 _LOOKUP_S = 0.02

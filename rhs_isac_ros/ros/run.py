@@ -21,9 +21,10 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.executables import print_error
 from rhs_isac_ros.model import ScenarioError
 from rhs_isac_ros.ros import parameters
-from rhs_isac_ros.ros.parameters import CODEBOOK, NODES, Parameter, ParameterError
+from rhs_isac_ros.ros.parameters import CODEBOOK, NODES, Parameter
 from rhs_isac_ros.ros.startup import SecurityError, leave, one_line, prepare, use_discovery_profile
 from rhs_isac_ros.support.arguments import ArgumentParser
+from rhs_isac_ros.support.fields import ParameterError
 
 # The highest domain whose ports exist.
 _MAX_DOMAIN = 232

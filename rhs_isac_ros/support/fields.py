@@ -12,6 +12,10 @@ from typing import Any, ClassVar
 from rhs_isac_ros.support import plugins
 
 
+class ParameterError(ValueError):
+    """A ROS parameter has a value that its node cannot use."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Field:
     """Declaration of a value.

@@ -18,7 +18,7 @@ from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.nodes.optimizer import OptimizerNode
 from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.endpoints import LATCHED
-from rhs_isac_ros.ros.parameters import ParameterError
+from rhs_isac_ros.support.fields import ParameterError
 
 TYPES = {
     'codebook.id': Parameter.Type.STRING,

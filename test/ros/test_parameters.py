@@ -21,8 +21,9 @@ from rhs_isac_ros.protocol.settings import (
     PositionerSettings,
     TransmissionSettings,
 )
-from rhs_isac_ros.ros.parameters import NODES, ParameterError, declare, settings_of
+from rhs_isac_ros.ros.parameters import NODES, declare, settings_of
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.fields import ParameterError
 
 PAIRS = [(executable, p) for executable, group in NODES.items() for p in group]
 NAMES = [f'{executable}-{p.name}' for executable, p in PAIRS]

@@ -19,8 +19,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import CodebookOffered
 from rhs_isac_ros.ros import convert
 from rhs_isac_ros.ros.endpoints import EXCHANGE
-from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.fields import ParameterError
 
 PLACE = np.array([10.0, 0.5, 0.2])
 

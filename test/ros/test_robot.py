@@ -11,8 +11,8 @@ from rclpy.node import Node as Node_
 from rhs_isac_ros.ros import topics
 from rhs_isac_ros.ros.endpoints import refusals
 from rhs_isac_ros.ros.frames import Frame, rotation_matrix
-from rhs_isac_ros.ros.parameters import ParameterError
 from rhs_isac_ros.ros.robot import RobotMobility, follow_frame, follow_odometry
+from rhs_isac_ros.support.fields import ParameterError
 
 # Turned by 90 degrees about z, and moved.
 TURNED = Frame('odom', origin=np.array([1.0, 2.0, 3.0]),
