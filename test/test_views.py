@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
@@ -58,31 +57,6 @@ def test_both_layouts_are_fixed_to_the_frame_of_the_positions(rviz):
     assert rviz['Global Options']['Fixed Frame'] == topics.MAP_FRAME
     layout = json.loads((ROOT / FOXGLOVE).read_text(encoding='utf-8'))
     assert layout['configById']['3D!scene']['followTf'] == topics.MAP_FRAME
-
-
-def test_rviz_lists_the_namespaces_of_all_markers(rviz, small):
-    """So that each can be switched off."""
-    pytest.importorskip('rclpy')
-    from builtin_interfaces.msg import Time
-
-    from rhs_isac_ros.link import beam_pattern, steer
-    from rhs_isac_ros.protocol import messages as m
-    from rhs_isac_ros.ros import scene
-    scenario, position, stamp = small.scenario, np.array([9.0, 1.0, 0.0]), Time()
-    shown = [
-        scene.board(scenario, None, stamp), scene.region(scenario, stamp),
-        scene.truth(m.GroundTruth(cycle_id=0, user=1, position=position, velocity=np.zeros(3)),
-            stamp),
-        scene.estimate(m.PositionEstimate(
-            cycle_id=1, user=1, codebook_id='cb', position=position, covariance_m2=np.eye(3),
-            crlb_m2=0.1, estimator='bayes', latency_s=0.01), stamp),
-        scene.beam(beam_pattern(scenario, steer(scenario, position), 10.0), 1, stamp)]
-    (display,) = [one for one in rviz['Displays'] if one['Class'].endswith('/MarkerArray')]
-    assert set(display['Namespaces']) == {marker.ns for marker in shown}
-    # The list of the scene is complete: no other function of the module makes a marker.
-    makers = {name for name, function in vars(scene).items() if not name.startswith('_')
-              and getattr(function, '__annotations__', {}).get('return') is scene.Marker}
-    assert makers == {'board', 'region', 'truth', 'estimate', 'beam', 'deletion', 'place'}
 
 
 def names_in(layout):

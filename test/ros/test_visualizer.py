@@ -1,9 +1,11 @@
 """The node that publishes the scene for RViz and Foxglove."""
 
 import math
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
+import yaml
 from nav_msgs.msg import Path
 from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
@@ -13,6 +15,8 @@ from rhs_isac_ros.nodes.visualizer import VisualizerNode
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE
+
+ROOT = FilePath(__file__).parents[2]
 
 
 @pytest.fixture
@@ -60,6 +64,24 @@ def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
     assert shown['estimate', 2].type == Marker.SPHERE
     truths.publish(convert.to_ros(ground_truth(1, 9.5), stamp))
     bench.until(lambda: shown['truth', 1].pose.position.x == 9.5, 'the new position')
+
+
+def test_rviz_lists_the_namespaces_of_all_markers(bench, probe, shown, small):
+    """So that each can be switched off."""
+    layout = yaml.safe_load((ROOT / 'config/rviz/network.rviz').read_text(encoding='utf-8'))
+    (display,) = [one for one in layout['Visualization Manager']['Displays']
+                  if one['Class'].endswith('/MarkerArray')]
+    sizes, stamp = small.scenario.sizes, probe.get_clock().now().to_msg()
+    for message in (
+            ground_truth(1, 9.0),
+            m.PositionEstimate(
+                cycle_id=1, user=1, codebook_id='cb', position=np.array([8.0, 2.5, 0.1]),
+                covariance_m2=np.eye(3), crlb_m2=0.1, estimator='bayes', latency_s=0.01),
+            m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(sizes['N_E']),
+                   digital=np.ones((sizes['N_SB'], sizes['K']), complex), expected_bps=1.0)):
+        bench.publisher(probe, type(message)).publish(convert.to_ros(message, stamp))
+    bench.until(lambda: set(display['Namespaces']) == {namespace for namespace, _ in shown},
+                'every namespace')
 
 
 def test_the_board_has_the_colours_of_its_configuration(bench, probe, shown, small):
