@@ -76,7 +76,7 @@ CALLS = [
     ('tools.topic', ['hz'], 'required: topic_name'),
     ('tools.topic', ['list', '--spin-time', 'nan'], 'nan, expected at least 0'),
     ('tools.param', ['get', 'bs'], 'required: parameter_name'),
-    ('tools.param', ['list', '--timeout', 'x'], 'expected at least 0'),
+    ('tools.param', ['list', '--timeout', 'x'], 'expected a number, at least 0'),
     ('tools.permissions', ['--users', '-1'], 'expected 0 to 1000'),
     ('tools.permissions', ['--robot', '2'], "'2', expected USER=TOPIC or USER=tf"),
     ('tools.permissions', ['--robot', '3=odom'], 'user 3, expected one of 2 users'),

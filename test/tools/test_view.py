@@ -47,7 +47,7 @@ def test_without_rerun_one_line_names_the_command_that_installs_it(monkeypatch, 
     assert main([]) == 1
     assert capsys.readouterr() == ('', (
         'view: error: view needs rerun, which is not installed '
-        "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/_view)\n"))
+        "(pip install 'rhs_isac_ros[view]'; in a clone: scripts/setup view)\n"))
 
 
 @pytest.mark.parametrize(('arguments', 'reason'), [
@@ -67,7 +67,7 @@ def test_an_invalid_argument_is_named(arguments, reason, capsys, monkeypatch, tm
 
 @pytest.fixture(scope='module')
 def rerun():
-    return pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/_view)')
+    return pytest.importorskip('rerun', reason='rerun-sdk is not installed (scripts/setup view)')
 
 
 @pytest.fixture(scope='module')
@@ -211,7 +211,7 @@ def test_a_malformed_codebook_of_a_recording_is_named(tmp_path):
             type_name(ros.Codebook), 'ros2msg', schema(ros.Codebook).encode()))
     recorder._writer_of(channel, 'codebook', None)(serialize_message(ros.Codebook()))
     recorder.close()
-    with pytest.raises(RecordingError, match='run.mcap: /codebook: Codebook: 0 values, expected'):
+    with pytest.raises(RecordingError, match='run.mcap: /codebook: CodebookMessage.analog: 0 values'):
         list(entries(path, '/', Scenario(), Posteriors(Scenario())))
 
 
