@@ -211,7 +211,7 @@ def test_a_malformed_codebook_of_a_recording_is_named(tmp_path):
             type_name(ros.Codebook), 'ros2msg', schema(ros.Codebook).encode()))
     recorder._writer_of(channel, 'codebook', None)(serialize_message(ros.Codebook()))
     recorder.close()
-    with pytest.raises(RecordingError, match='run.mcap: /codebook: CodebookMessage.analog: 0 values'):
+    with pytest.raises(RecordingError, match='/codebook: CodebookMessage.analog: 0 values'):
         list(entries(path, '/', Scenario(), Posteriors(Scenario())))
 
 
