@@ -12,6 +12,8 @@ from rhs_isac_ros.experiments import Job, JobError, run_jobs
 from rhs_isac_ros.experiments import jobs as jobs_module
 from rhs_isac_ros.support.optional import MissingLibraryError
 
+pytestmark = pytest.mark.slow
+
 JOBS = [Job(f'square-{number}', {'number': number, 'of': (1, 2)}) for number in range(4)]
 SQUARES = [{'square': number**2} for number in range(4)]
 # A worker sends SIGINT to the process group, as a terminal does on Ctrl-C, then waits.

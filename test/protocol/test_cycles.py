@@ -13,6 +13,8 @@ from rhs_isac_ros.positioning import Estimate
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 
+pytestmark = pytest.mark.slow
+
 PACKAGE = Path(rhs_isac_ros.__file__).parent
 # Messages of one cycle with two bands of two frames.
 OF_A_CYCLE = [m.Beacon, m.Ack, m.Grant, m.RhsCommand, m.RhsCommand, m.RhsConfiguration,

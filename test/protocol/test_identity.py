@@ -10,6 +10,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 from rhs_isac_ros.protocol.events import PauseRequested, PeersChanged, Resumed, StoodBy
 
+pytestmark = pytest.mark.slow
+
 
 def violations(net):
     checker = InvariantChecker(net.scenario)

@@ -11,6 +11,8 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import user as user_role
 from rhs_isac_ros.protocol.base_station import State
 
+pytestmark = pytest.mark.slow
+
 POSITIONING, TRANSMISSION = m.Mode.POSITIONING, m.Mode.TRANSMISSION
 DOWN = {'direction': m.Direction.DOWNLINK}
 UP = {'direction': m.Direction.UPLINK}

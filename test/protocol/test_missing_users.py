@@ -5,6 +5,8 @@ import pytest
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import State
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_late_user_is_waited_for_in_the_next_cycle(network):
     """The first ack ends the beaconing of the first cycle; later acks register their users."""
