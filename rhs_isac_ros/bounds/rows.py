@@ -177,9 +177,10 @@ class Evaluation:
 def rows_within(
         scenario: Scenario, source: RowSource, n_items: int, n_rows: int, tolerance: float,
         patterns: Sequence[Pattern] = PLAIN, tick: Tick = no_tick) -> MeasurementRows:
-    """Return rows with a relative error, see `CompressedRows`; exact ones for an error of 0.
+    """Return rows within a relative error, compressed as in `CompressedRows`.
 
-    Few rows that would need a large basis are exact up to single precision.
+    For an error of 0, the rows are exact. If there are few rows but they need a large basis, they
+    are stored in single precision instead.
     """
     of = scenario, source, n_items, n_rows
     if tolerance == 0:

@@ -48,8 +48,9 @@ def screen(
         max_exhaustive: int = MAX_EXHAUSTIVE) -> tuple[np.ndarray, np.ndarray]:
     """Return plans with low errors, ascending float64 [P, N_B] [Hz], and the errors [P].
 
-    Up to `max_exhaustive` plans, these are all. Of more, they are the ends of a coordinate search
-    from several starts, which moves one frequency at a time to its best place on the raster.
+    If there are at most `max_exhaustive` plans, the function returns all of them. Otherwise, it
+    returns the results of coordinate searches from several starts. Such a search moves one
+    frequency at a time to its best place on the raster.
     """
     if math.comb(len(frequencies_hz), n_bands) > max_exhaustive:
         return _coordinate_search(frequencies_hz, n_bands, gap_hz, errors, rng)

@@ -104,9 +104,9 @@ class Table1:
 class Extensions:
     """Effects beyond the paper's model; by default there are none.
 
-    A standard deviation is that of a zero-mean Gaussian. Phases are angles, so their Gaussian is
-    wrapped to the circle: from a standard deviation of 2 pi on, a phase is uniform in effect,
-    because its mean resultant length, exp(-std^2 / 2), is below 3e-9.
+    Standard deviations belong to Gaussians with zero mean. A phase is wrapped to the circle. With
+    a standard deviation of 2 pi or more, it is practically uniform: its mean resultant length,
+    exp(-std^2 / 2), is below 3e-9.
 
     A user's gain and carrier offset are drawn once per user. Phases and the timing offset are
     drawn once per cycle, and element errors and failures once per surface.

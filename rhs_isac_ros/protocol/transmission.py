@@ -57,8 +57,8 @@ class _Waiting(NamedTuple):
 class Transmission(Role):
     """The role that steers the beam.
 
-    The true position affects only the reported capacities, never the beam. As a report takes as
-    long as a beam, the role computes it when no message of a cycle has arrived for a while.
+    The true position affects only the reported capacities, never the beam. A report takes as
+    long as a beam, so the role computes it when no message of a cycle has arrived for a while.
 
     Parameters
     ----------

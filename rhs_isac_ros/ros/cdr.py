@@ -19,9 +19,9 @@ from rhs_isac_ros.protocol.messages import MessageError
 
 
 class Type(NamedTuple):
-    """How a type of ROS is encoded: as items on the wire, each of a type of `struct`.
+    """The encoding of a ROS type as a series of items.
 
-    ``s`` is a string, ``*I`` and ``*d`` are sequences.
+    An item has a type code of `struct`, or is a string, ``s``, or a sequence, ``*I`` or ``*d``.
     """
 
     wire: tuple[str, ...]

@@ -62,9 +62,10 @@ class SnapshotNode(Node):
         self.mismatch = str(error)
 
     def is_ready(self, wait_s: float) -> bool:
-        """Return whether to draw the scene, after every user had time to report.
+        """Return whether to draw the scene.
 
-        It is complete, or it has been drawable for a time [s] although users lack an estimate.
+        Every user has had time to report, and the scene is complete or has been incomplete for
+        longer than the given time [s].
         """
         now_s, scene = time.monotonic(), self.scene
         return now_s > self._began_s + _REPORT_PERIOD_S and (
