@@ -15,6 +15,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
@@ -207,7 +208,8 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         gc.collect()
         gc.freeze()
         while ok() and not signals and not done():
-            executor.spin_once(timeout_sec=_POLL_S)
+            # Returns after this time, and not after each message, as `spin_once` does.
+            executor.spin_until_future_complete(Future(), timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass
     except (ParameterError, ParameterException, ScenarioError, CodebookError,
