@@ -139,7 +139,7 @@ class Channel(Role):
         cycle after they are offered.
     """
 
-    SENDS = (m.FeedSignals, m.Data)
+    SENDS = (m.FeedSignals, m.DeliveredData)
     RECEIVES = (m.GroundTruth, m.RhsConfiguration, m.Pilot, m.Beam, m.Data)
 
     def __init__(self, scenario: Scenario, seed: int,
@@ -188,7 +188,7 @@ class Channel(Role):
                     (event.cycle_id, event.mode, event.band), event.analog))
             case m.Beam():
                 self._keep_beam(event)
-            case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
+            case m.Pilot() | m.Data():
                 self.count(Outcome.OVERFLOW, self._pending.put(
                     (event.cycle_id, next(self._serial)), event))
         if self._cycle and isinstance(event, m.Message):
@@ -273,7 +273,8 @@ class Channel(Role):
             return None
         # What exceeds the capacity of the true channel is lost.
         bits = min(event.bits, cycle.rate_bps * event.duration_s // 1)
-        return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
+        return m.derive(m.DeliveredData, event, stamp_ns=event.stamp_ns, bits=bits,
+                        direction=event.direction, duration_s=event.duration_s)
 
     def _applied(self, cycle: _Cycle, mode: m.Mode, band: int) -> np.ndarray | None:
         """Return the coefficients that the surface applies in each frame, if they are known."""

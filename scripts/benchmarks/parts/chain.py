@@ -15,7 +15,8 @@ from rhs_isac_ros.ros.endpoints import OBSERVATION
 
 # The messages of the chain. Others are sent in parallel with them.
 KINDS = (m.Beacon, m.Ack, m.RhsCommand, m.RhsConfiguration, m.PilotRequest, m.Pilot, m.FeedSignals,
-         m.ReceivedSignals, m.PositionEstimate, m.Beam, m.Data, m.ProtocolState)
+         m.ReceivedSignals, m.PositionEstimate, m.Beam, m.Data, m.DeliveredData,
+         m.ProtocolState)
 
 
 class Link(NamedTuple):
@@ -117,7 +118,7 @@ _SENDERS = {
 
 def _sender_of(message: m.Message) -> str:
     match message:
-        case m.Data(stage=m.Stage.DELIVERED):
+        case m.DeliveredData():
             return 'channel'
         case m.Data():
             return 'bs' if message.direction is m.Direction.DOWNLINK else 'user'
@@ -135,6 +136,6 @@ def _step(message: m.Message) -> str | None:
         case m.RhsCommand() | m.RhsConfiguration() if message.band > 0:
             # Sent in parallel with those of the first band.
             return None
-        case m.Data():
-            return f'{name} {message.direction.name.lower()} {message.stage.name.lower()}'
+        case m.Data() | m.DeliveredData():
+            return f'{name} {message.direction.name.lower()}'
     return name
