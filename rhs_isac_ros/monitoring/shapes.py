@@ -1,6 +1,6 @@
 """The shapes of a network: in space, in planes and in charts.
 
-Rerun, RViz and Matplotlib show the same shapes; `tools.rerun_stream`, `ros.scene` and
+Rerun, RViz and Matplotlib show the same shapes; `tools.rerun_stream`, `nodes.visualizer` and
 `tools.pictures` translate them. Lengths are in metres, positions float64 [N, 3], or [N, 2] in a
 plane; colours are red, green and blue from 0 to 1, float64 [N, 3] for N shapes.
 """
