@@ -121,28 +121,6 @@ class TransmissionSettings:
     calibration_file: str = _calibration_file()
 
 
-def changes(old: Any, new: Any) -> dict[str, Any]:
-    """Return the values of `new`, by name, that differ from those of `old`."""
-    names = [field.name for field in dataclasses.fields(old)]
-    return {name: getattr(new, name) for name in names
-            if getattr(new, name) != getattr(old, name)}
-
-
-def describe_settings(in_use: Any, latest: Any) -> dict[str, str]:
-    """Return settings as text for the diagnostics.
-
-    Returns
-    -------
-    dict
-        ``parameter.<name>`` for each value in use and ``pending.<name>`` for each newer value
-        that is not in use yet.
-    """
-    described = {f'parameter.{name}': shown(value)
-                 for name, value in dataclasses.asdict(in_use).items()}
-    return described | {f'pending.{name}': shown(value)
-                        for name, value in changes(in_use, latest).items()}
-
-
 def shown(value: Any) -> str:
     """Return a parameter value as ROS prints it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
@@ -193,7 +171,7 @@ class Impairments:
             name: value for name, value in values.items() if name in known and value >= 0})
 
 
-SettingsT = TypeVar('SettingsT')
+SettingsT = TypeVar('SettingsT', bound=Any)
 
 
 class PendingSettings(Generic[SettingsT]):
@@ -212,12 +190,21 @@ class PendingSettings(Generic[SettingsT]):
         self.latest = settings
 
     def apply(self) -> list[LogMessage]:
-        """Put the latest settings into use; return a message that lists changes, if any."""
-        changed = changes(self.in_use, self.latest)
+        """Put the latest settings into use; return a message that lists the changes, if any."""
+        described = ', '.join(f'{name} {text!r}' for name, text in self._pending().items())
         self.in_use = self.latest
-        described = ', '.join(f'{name} {shown(value)!r}' for name, value in changed.items())
         return [LogMessage(f'settings applied: {described}')] if described else []
 
     def describe(self) -> dict[str, str]:
-        """Return the values in use and the pending ones, as `settings.describe_settings` does."""
-        return describe_settings(self.in_use, self.latest)
+        """Return ``parameter.<name>`` for each value in use, ``pending.<name>`` for newer ones."""
+        in_use = {f'parameter.{name}': shown(value)
+                  for name, value in dataclasses.asdict(self.in_use).items()}
+        return in_use | {f'pending.{name}': text for name, text in self._pending().items()}
+
+    def _pending(self) -> dict[str, str]:
+        """Return the values that are not in use yet, by name."""
+        if self.latest == self.in_use:
+            return {}
+        latest = dataclasses.asdict(self.latest)
+        return {name: shown(latest[name]) for name, value in dataclasses.asdict(
+            self.in_use).items() if latest[name] != value}
