@@ -259,7 +259,7 @@ def path(user: int, positions: Iterable[np.ndarray]) -> Lines:
 def track(
         user: int, positions: Iterable[np.ndarray], velocity: np.ndarray,
         covariance_m2: np.ndarray) -> tuple[Lines, Ellipsoids]:
-    """Return a track, the distance of the next second, and its 95 % ellipsoid.
+    """Return a track, the distance covered in the next second, and its 95 % ellipsoid.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ _MAX_AGE_S = 5.0
 
 
 class RobotMobility:
-    """Mobility of a robot: the latest position, continued with its velocity.
+    """Mobility of a robot: the latest position, extrapolated with its velocity.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class RobotMobility:
 
     @property
     def lack(self) -> str:
-        """Why there is no position at present; empty if there is one."""
+        """Reason why there is no position at present; empty if there is one."""
         if self._error:
             return f'{self._source}: {self._error}'
         if time.monotonic() > self._arrived_s + self._timeout_s:

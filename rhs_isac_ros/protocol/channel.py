@@ -310,6 +310,6 @@ class Channel(Role):
 
 
 def _is_from_other_instance(event: m.Pilot | m.Data, truth: m.GroundTruth) -> bool:
-    """Return whether another node than the one at the true position transmits."""
+    """Return whether a node other than the one at the true position transmits."""
     is_downlink = isinstance(event, m.Data) and event.direction is m.Direction.DOWNLINK
     return not is_downlink and not m.same_instance(event.sender, truth.sender)

@@ -178,7 +178,7 @@ def _deviation(prefix: str, monitor: InnovationTest) -> str:
 
 
 class _Loss(enum.Enum):
-    """Why the signals of a user yield no position, with the text when they do so again."""
+    """Why the signals of a user yield no position, and the text for when they do again."""
 
     NO_FIX = 'has a position again'
     BLOCKED = 'is in sight again'

@@ -15,7 +15,7 @@ _MAX_OTHERS = 64
 _MAX_LOGGED = 16
 # Maximum length of the listed differences in the log.
 _MAX_LENGTH = 500
-# Maximum deviation of the clocks of two hosts; an instance that starts later is a forgery [ns].
+# Maximum difference between the clocks of two hosts [ns]; instances with later starts are ignored.
 _MAX_AHEAD_NS = 3600 * 10**9
 
 
@@ -85,8 +85,8 @@ class Presences:
     def gone(self, announcing: Mapping[str, int]) -> set[str]:
         """Return the names of nodes in conflict that have gone.
 
-        If several nodes have the name, it is unknown which of them has gone. All are to be
-        forgotten; those that are present announce themselves again.
+        If several nodes share a name, it is unknown which of them has gone. The caller forgets all
+        of them; those that are still present announce themselves again.
 
         Parameters
         ----------

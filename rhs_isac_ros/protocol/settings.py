@@ -139,7 +139,7 @@ def _of_scenario(name: str) -> Any:
 class Impairments:
     """Impairments of the air interface, and deviations from the model of the signals.
 
-    The network does not learn of deviations that replace those of the scenario.
+    Deviations that replace those of the scenario are unknown to the other roles.
     """
 
     loss_probability: float = setting(

@@ -71,7 +71,7 @@ def refusals(node: Node) -> dict[str, str]:
 
 
 def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> _CreatedT | None:
-    """Return what `create` returns; None, with one log line, if the middleware refuses it."""
+    """Return what `create` returns, or log its refusal by the middleware once and return None."""
     try:
         return create()
     # Of an action, rclpy raises a ValueError.

@@ -297,10 +297,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         return self._stands_by
 
     def stand_by(self) -> None:
-        """Handle that a newer node has the role; nodes with more than a role override this."""
+        """React to a newer node in the same role; a node with further tasks overrides this."""
 
     def resume(self) -> None:
-        """Handle that the node serves again."""
+        """React when the node serves again."""
 
     def _on_missing(self, missing: dict[str, str]) -> None:
         if self._stands_by:
@@ -319,7 +319,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 f'{self._codebook_client.codebook_id or "none"}')
 
     def set_lacking(self, text: str) -> None:
-        """Set what the role lacks besides other roles; empty: nothing."""
+        """Describe what the role lacks besides other roles; an empty text means nothing."""
         if text != self._lacking:
             self._lacking = text
             # What is missing is not known before discovery.
