@@ -31,10 +31,11 @@ class AppliedBeams(NamedTuple):
     digital: np.ndarray
 
 
-def element_signals(los: np.ndarray, multipath: np.ndarray, symbol: complex) -> np.ndarray:
+def element_signals(
+        los: np.ndarray, multipath: np.ndarray, symbol: complex | np.ndarray) -> np.ndarray:
     """Implements Eq. (1). Element signals tau for line-of-sight and multipath gains.
 
-    Returns complex128 [..., N_E] for gains of the same shape.
+    Returns complex128 [..., N_E] for gains of this shape, or shapes that broadcast to it.
     """
     return (los + multipath) * symbol
 

@@ -219,9 +219,9 @@ class VisualizerNode(Node):
     def _show_paths(self, user: UserState, stamp: Time) -> None:
         paths = user.estimated_path, user.true_path
         # Without publishers, the zip is empty.
-        for publisher, path in zip(self._paths.publishers(user.user), paths, strict=False):
-            if path and publisher.get_subscription_count():
-                publisher.publish(path(path, stamp, self._frame))
+        for publisher, places in zip(self._paths.publishers(user.user), paths, strict=False):
+            if places and publisher.get_subscription_count():
+                publisher.publish(path(places, stamp, self._frame))
 
     def _show_markers(self, stamp: Time) -> None:
         state = self._scene

@@ -297,8 +297,10 @@ class Channel(Role):
     def _rate_bps(self, cycle: _Cycle) -> float | None:
         """Return the capacity of the true channel, once the beam and its configuration arrived."""
         beam = self._beams.get((cycle.truth.cycle_id, cycle.truth.user))
-        applied = beam and self._applied(cycle, m.Mode.TRANSMISSION, beam.band)
-        if beam is None or applied is None:
+        if beam is None:
+            return None
+        applied = self._applied(cycle, m.Mode.TRANSMISSION, beam.band)
+        if applied is None:
             return None
         digital = beam.digital
         if cycle.factors is not None:
