@@ -165,13 +165,7 @@ def mode_axes() -> tuple[Lines, Points]:
 
 
 def mode_bars(user: int, found: WeightedModes, origin: np.ndarray) -> Lines:
-    """Return the modes as bars in the colour of a user, at the errors of their ranges.
-
-    Parameters
-    ----------
-    origin
-        Position whose range is the origin, float64 [3] [m].
-    """
+    """Return the modes as bars in the colour of a user, at their ranges minus the origin's."""
     errors = np.linalg.norm(found.positions, axis=1) - np.linalg.norm(origin)
     return Lines(tuple(_line(error, HEIGHT_M * probability) for error, probability in zip(
         errors.tolist(), found.probabilities.tolist(), strict=True)),

@@ -71,15 +71,7 @@ class RoleStatistics:
     def record(
             self, event: Event, actions: Sequence[Action], now_s: float,
             handling_s: float) -> None:
-        """Record an event and the actions with which the role responded.
-
-        Parameters
-        ----------
-        now_s
-            Time of the event, on the clock of the role [s].
-        handling_s
-            Time that the role took [s].
-        """
+        """Record an event at `now_s` [s], the actions that it caused, and the time taken [s]."""
         if isinstance(event, CodebookOffered):
             self._codebook_id = event.codebook.id
         self._durations_s['handling_ms'].append(handling_s)
@@ -104,16 +96,8 @@ class RoleStatistics:
             status: Mapping[str, str] = types.MappingProxyType({})) -> Report:
         """Create a report; new faults are those since the previous call.
 
-        Parameters
-        ----------
-        phase
-            State of the role; empty if it has none.
-        counters
-            Counters of the role by reason.
-        blocked
-            Whether the role lacks something that it needs in this state.
-        status
-            Settings in use and pending, and lasting faults, by name.
+        A role is `blocked` if its state, the `phase`, shows that something is missing. The
+        `counters` are by reason; `status` is that of the role.
         """
         values = {'phase': phase} if phase else {}
         values |= self._codebook_ids(status.get('codebook_id', ''))

@@ -144,29 +144,15 @@ def user_colour(user: int) -> Colour:
 
 
 def distance_95(n: int) -> float:
-    """Return the distance, in standard deviations, that contains 95 % of a Gaussian.
-
-    Parameters
-    ----------
-    n
-        Number of dimensions.
-    """
+    """Return the distance, in standard deviations, within which 95 % of an n-D Gaussian lie."""
     return math.sqrt(chdtri(n, 0.05))
 
 
 def axes_95(covariance_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of the ellipse or ellipsoid that contains 95 % of a Gaussian.
 
-    Parameters
-    ----------
-    covariance_m2
-        Covariance of the Gaussian, float64 [n, n] [m^2].
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Half the lengths of the axes, float64 [n] [m], and a rotation, float64 [n, n], whose
-        columns are their directions.
+    For a covariance [n, n] [m^2], these are half their lengths, float64 [n] [m], and a rotation,
+    float64 [n, n], whose columns are their directions.
     """
     variances_m2, axes = np.linalg.eigh(covariance_m2)
     # The eigenvectors may form a reflection.
@@ -261,12 +247,7 @@ def track(
         covariance_m2: np.ndarray) -> tuple[Lines, Ellipsoids]:
     """Return a track, the distance covered in the next second, and its 95 % ellipsoid.
 
-    Parameters
-    ----------
-    positions
-        Tracked positions, float64 [3] [m] each, the latest last.
-    velocity
-        Float64 [3] [m/s].
+    The latest position, float64 [3] [m], comes last.
     """
     places = np.array(list(positions))
     colour = user_colour(user)

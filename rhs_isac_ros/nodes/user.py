@@ -37,12 +37,7 @@ _MAX_AGE_S = 5.0
 class RobotMobility:
     """Mobility of a robot: the latest position, extrapolated with its velocity.
 
-    Parameters
-    ----------
-    source
-        Description of where the positions come from.
-    timeout_s
-        Time without a position after which there is none [s].
+    The `source` describes where the positions come from; they are valid for `timeout_s`.
     """
 
     def __init__(self, node: Node, frame: Frame, source: str, timeout_s: float) -> None:

@@ -50,11 +50,6 @@ class Presences:
     Of the nodes with the same role and scenario, the one that started last serves, as with the
     fencing tokens of leases: a restarted node serves at once, and the older node resumes when the
     newer one has gone. Nodes of another scenario are reported and otherwise ignored.
-
-    Parameters
-    ----------
-    own
-        Announcement of the node itself.
     """
 
     def __init__(self, own: Presence) -> None:
@@ -86,13 +81,8 @@ class Presences:
         """Return the names of nodes in conflict that have gone.
 
         If several nodes share a name, it is unknown which of them has gone. The caller forgets all
-        of them; those that are still present announce themselves again.
-
-        Parameters
-        ----------
-        announcing
-            Number of nodes that announce themselves, by fully qualified name; by an empty name
-            those whose name is unknown.
+        of them; those that are still present announce themselves again. `announcing` counts the
+        nodes that announce themselves by fully qualified name, which is empty if it is unknown.
         """
         known = collections.Counter(other.node for other in self._others.values())
         return {name for name, count in known.items()

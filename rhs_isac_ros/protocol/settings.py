@@ -21,14 +21,9 @@ REGION, TRACK = PRIORS = ('region', 'track')
 def setting(
         default: bool | int | float | str, text: str, *, dynamic: bool = True, **declared: Any
 ) -> Any:
-    """Return a dataclass field with the declaration of its parameter as metadata.
+    """Declare a setting and its parameter, with further attributes of `Field`.
 
-    Parameters
-    ----------
-    dynamic
-        Whether the parameter may change while the node runs.
-    **declared
-        Further attributes of `Field`.
+    Only a `dynamic` parameter may change while the node runs.
     """
     return dataclasses.field(default=default, metadata={
         'declared': Field(type(default), text, **declared), 'dynamic': dynamic})
@@ -175,15 +170,7 @@ SettingsT = TypeVar('SettingsT', bound=Any)
 
 
 class PendingSettings(Generic[SettingsT]):
-    """Holds new settings back until the role may apply them.
-
-    Attributes
-    ----------
-    in_use
-        The settings in use.
-    latest
-        The settings received last.
-    """
+    """Holds the `latest` settings back until the role may use them instead of those `in_use`."""
 
     def __init__(self, settings: SettingsT) -> None:
         self.in_use = settings

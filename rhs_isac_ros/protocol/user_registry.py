@@ -128,13 +128,8 @@ class UserRegistry:
 
         A user that was invited to this cycle and has not answered in time loses its turn.
         Otherwise, the range of a user that is always late would be invited in every cycle, and
-        the users of the other ranges never.
-
-        Returns
-        -------
-        str
-            A warning at the first ack of the owner after one of another instance was rejected,
-            otherwise empty.
+        the users of the other ranges never. The result is a warning at the first ack of the owner
+        after one of another instance was rejected, and otherwise empty.
         """
         user = self._users.get(number)
         # A new user comes after all that wait and before the one served last, so that users that

@@ -60,13 +60,7 @@ class Frame:
 
     @classmethod
     def of(cls, node: Node, values: types.SimpleNamespace) -> 'Frame':
-        """Return the frame of the parameters ``frame_id`` and ``surface_pose``.
-
-        Raises
-        ------
-        ParameterError
-            If the frame has no name or the pose has another number of elements.
-        """
+        """Check the parameters ``frame_id`` and ``surface_pose``, and return their frame."""
         pose = values.surface_pose or [0.0] * 6
         if len(pose) != 6:
             raise ParameterError(f'surface_pose: {len(pose)} numbers, expected six, x, y, z [m], '

@@ -185,22 +185,10 @@ class Recorder:
 def read(
         path: str | Path, names: Collection[str] | None = None
 ) -> Iterator[tuple[str, Any, float]]:
-    """Yield the messages of a recording in the order in which they were written.
+    """Yield topic, ROS message and time [s] of what a recording contains, in the order of writing.
 
-    Parameters
-    ----------
-    names
-        Full names of the topics to read; None: all.
-
-    Yields
-    ------
-    tuple
-        Full name of the topic, ROS message and time of recording [s].
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, or a message had other fields when it was recorded.
+    Topics have full names; those to read are `names`, or all if None. Raises RecordingError if the
+    file cannot be read, or a message had other fields when it was recorded.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     checked: set[int] = set()
@@ -232,12 +220,7 @@ def _fields(text: str) -> list[str]:
 def read_scenario(path: str | Path) -> Scenario | None:
     """Return the scenario of a recording; None if there is none, as when ``ros2 bag`` made it.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read.
-    ScenarioError
-        If the scenario is invalid.
+    Raises RecordingError if the file cannot be read, ScenarioError if the scenario is invalid.
     """
     with _opened(path) as reader:
         for metadata in reader.iter_metadata():
