@@ -118,10 +118,7 @@ class CycleRecord(CycleTimes):
 class CycleLog:
     """Collects the cycles of one network, also across restarts of its base station.
 
-    Attributes
-    ----------
-    complete, ended
-        Cycles that were served and received completely, and all that have ended, in order.
+    All that have `ended` are in order, and those that were served and received completely as well.
     """
 
     def __init__(self) -> None:

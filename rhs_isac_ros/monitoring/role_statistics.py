@@ -44,15 +44,10 @@ class Report:
 
 
 class RoleStatistics:
-    """Collects the statistics of a role from its events and the resulting actions.
-
-    Attributes
-    ----------
-    missing
-        Descriptions of the roles that are missing.
-    """
+    """Collects the statistics of a role from its events and the resulting actions."""
 
     def __init__(self) -> None:
+        # Descriptions of the roles that are missing.
         self.missing: tuple[str, ...] = ()
         # Messages by section of the report and type, and faults until the last report.
         self._messages: dict[str, collections.Counter[str]] = {

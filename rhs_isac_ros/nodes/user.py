@@ -109,10 +109,7 @@ def follow_odometry(node: Node, frame: Frame, topic: str, timeout_s: float) -> R
 def follow_frame(node: Node, frame: Frame, child: str, timeout_s: float) -> RobotMobility:
     """Return the mobility of a frame of tf2; its velocity is the difference of two transforms.
 
-    Raises
-    ------
-    ParameterError
-        If ``tf2_ros`` is not installed.
+    Raises ParameterError if ``tf2_ros`` is not installed.
     """
     try:
         import tf2_ros

@@ -74,16 +74,11 @@ class Fading:
 
 
 class Air:
-    """Loses, duplicates and delays messages at random.
-
-    Attributes
-    ----------
-    in_flight
-        Time of arrival [s], serial number as a tie-break, and message, as a heap.
-    """
+    """Loses, duplicates and delays messages at random."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._serial = rng, itertools.count()
+        # A heap of times of arrival [s], serial numbers as tie-breaks, and messages.
         self.in_flight: list[tuple[float, int, m.Message]] = []
 
     def send(self, message: m.Message, impairments: Impairments, now_s: float) -> str:

@@ -219,13 +219,7 @@ class StateMachine(Role):
         return self._deadline_s
 
     def react(self, event: Event) -> None:
-        """Take the first matching row.
-
-        Raises
-        ------
-        TypeError
-            If no row of the table names the class of the event.
-        """
+        """Take the first matching row; raise TypeError for an event that the table lacks."""
         kind = type(event)
         try:
             rows = self._rows[self.state, kind]

@@ -31,13 +31,7 @@ def setting(
 
 @dataclasses.dataclass(frozen=True)
 class BaseStationSettings:
-    """Settings of the base station.
-
-    Raises
-    ------
-    ValueError
-        If `parse_users` cannot parse ``allowed_users``.
-    """
+    """Settings of the base station; ValueError if `parse_users` rejects ``allowed_users``."""
 
     policy: str = setting(
         'round_robin', 'Policy that selects among the users that answer.', choices=POLICIES)
@@ -77,13 +71,7 @@ def _calibration_file() -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class PositionerSettings:
-    """Settings of the positioner.
-
-    Raises
-    ------
-    ValueError
-        If the estimator cannot use the prior.
-    """
+    """Settings of the positioner; ValueError if the estimator cannot use the prior."""
 
     estimator: str = setting(
         'bayes', 'Position estimator.', choices=tuple(ESTIMATORS), plugins=plugins.ESTIMATORS)

@@ -220,10 +220,7 @@ _RANGE = re.compile(r'\s*(\d+)\s*(?:-\s*(\d+)\s*)?')
 def parse_users(text: str) -> tuple[range, ...]:
     """Parse a list of user numbers from 1 and ranges, such as ``1, 4, 10-20``; may be empty.
 
-    Raises
-    ------
-    ValueError
-        If a part is neither a number nor an ascending range.
+    Raises ValueError if a part is neither a number nor an ascending range.
     """
     return tuple(_parse_range(part) for part in text.split(',')) if text.strip() else ()
 

@@ -173,10 +173,7 @@ class Codec:
             self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
         """Return the bytes of a message; the arguments replace its own values.
 
-        Raises
-        ------
-        MessageError
-            If a string has no UTF-8 encoding.
+        Raises MessageError if a string has no UTF-8 encoding.
         """
         items: list[Any] = [*divmod(stamp_ns, _NANOSECONDS), frame]
         for name, _, _, encode, _ in self._fields:

@@ -49,12 +49,8 @@ class CodebookClient:
     A message on the latched topic announces the codebook and triggers a request to the parameter
     service. Two optimizers have the same services, and either may answer. The announced codebook,
     whose id proves its content, therefore replaces a response with another codebook or a missing
-    response. The optimizers agree on which of them announces; see `Presences`.
-
-    Attributes
-    ----------
-    codebook_id
-        Id of the latest codebook; empty before the first.
+    response. The optimizers agree on which of them announces; see `Presences`. The `codebook_id`
+    is that of the latest codebook, and empty before the first.
     """
 
     def __init__(
@@ -196,19 +192,9 @@ class Clocks:
 class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """A node that passes messages to a role and performs the actions that it returns.
 
-    A subclass makes its `role` from the parameters and passes it to `start`.
-
-    Attributes
-    ----------
-    scenario
-        Scenario of the parameter ``scenario_file``.
-    instance
-        Instance of the node; see `Message.sender`.
-
-    Raises
-    ------
-    ParameterError, ScenarioError
-        If a parameter or the scenario file is invalid.
+    A subclass makes its `role` from the parameters and the `scenario` and passes it to `start`.
+    `Message.sender` describes the `instance`. Raises ParameterError or ScenarioError if a parameter
+    or the scenario file is invalid.
     """
 
     role: _RoleT
@@ -240,12 +226,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self, role: _RoleT, *, subscribe: bool = True, needs_codebook: bool = False) -> None:
         """Connect the role to its topics and publish its diagnostics.
 
-        Parameters
-        ----------
-        subscribe
-            Whether to subscribe now; a role that is not ready yet calls `subscribe` later.
-        needs_codebook
-            Whether to advertise and to subscribe when the first codebook arrives.
+        A role that is not ready yet calls `subscribe` later; one that needs a codebook advertises
+        and subscribes when the first one arrives.
         """
         self.role, self._needs_codebook = role, needs_codebook
         if not needs_codebook:
