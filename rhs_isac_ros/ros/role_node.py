@@ -193,8 +193,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     """A node that passes messages to a role and performs the actions that it returns.
 
     A subclass makes its `role` from the parameters and the `scenario` and passes it to `start`.
-    `Message.sender` describes the `instance`. Raises ParameterError or ScenarioError if a parameter
-    or the scenario file is invalid.
+    `Message.sender` describes the `instance`. Raises ParameterError or ScenarioError if a
+    parameter or the scenario file is invalid.
     """
 
     role: _RoleT
