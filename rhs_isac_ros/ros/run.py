@@ -15,7 +15,6 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.task import Future
 from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
@@ -208,8 +207,9 @@ def run(make: Callable[[], Sequence[Node]], args: Sequence[str] | None = None,
         gc.collect()
         gc.freeze()
         while ok() and not signals and not done():
-            # Returns after this time, and not after each message, as `spin_once` does.
-            executor.spin_until_future_complete(Future(), timeout_sec=_POLL_S)
+            # Returns after each message. Other ways of spinning never return while the queue is
+            # not empty, so that a busy node would not see signals.
+            executor.spin_once(timeout_sec=_POLL_S)
     except ExternalShutdownException:
         pass
     except (ParameterError, ParameterException, ScenarioError, CodebookError,
