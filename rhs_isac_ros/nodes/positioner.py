@@ -112,7 +112,7 @@ class PositionerNode(RoleNode[Positioner]):
                 super().execute(action)
 
     def _publish_track(self, track: events.PublishTrack) -> None:
-        if self.is_standing_by:
+        if self.stands_by:
             return
         odometry = convert.odometry(
             track.user, track.estimate, convert.stamp_of(track, self), self._frame)

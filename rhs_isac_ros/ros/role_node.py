@@ -23,7 +23,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import started
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.ros.diagnostics import Diagnostics, LogOnce
+from rhs_isac_ros.ros.diagnostics import Diagnostics
 from rhs_isac_ros.ros.endpoints import (
     LATCHED,
     create_or_refuse,
@@ -66,7 +66,8 @@ class CodebookClient:
         self._announced, self._requested, self._fetched = 0, 0, 0
         self._announced_s = math.inf
         self._announcement: Codebook | None = None
-        self._log_once = LogOnce(node)
+        # Why the latest codebook was rejected.
+        self._problem = ''
         self.codebook_id = ''
         subscribe(
             node, ros.Codebook, topics.CODEBOOK, self._on_announcement, LATCHED, raw=True)
@@ -90,19 +91,18 @@ class CodebookClient:
         self._request()
 
     def _fits(self, message: convert.CodebookMessage, codebook: Codebook) -> bool:
-        """Return whether a codebook fits the scenario, or log that it does not."""
+        """Return whether a codebook fits the scenario, or log once that it does not."""
+        before, self._problem = self._problem, ''
         try:
             codebook.check(self._scenario)
             if message.scenario_id not in ('', self._scenario.id):
                 raise CodebookError(
                     f'scenario {message.scenario_id}, expected {self._scenario.id}')
         except CodebookError as error:
-            self._log_once.error(
-                'codebook', f'codebook of the optimizer rejected: {error}',
-                repeat_if_changed=True)
-            return False
-        self._log_once.clear('codebook')
-        return True
+            self._problem = f'codebook of the optimizer rejected: {error}'
+            if self._problem != before:
+                self._node.get_logger().error(self._problem)
+        return not self._problem
 
     def _request(self) -> None:
         if self._fetched == self._announced:
@@ -210,11 +210,14 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         self._missing: dict[str, str] | None = None
         self._lacking = ''
         self._foreign: set[int] = set()
-        self._is_advertised = self._stands_by = False
+        self._is_advertised = False
+        # Whether a newer node has the role.
+        self.stands_by = False
         self._has_optimizer = True
         self._sending: dict[type[m.Message], Publisher] = {}
         self._receiving: set[type[m.Message]] = set()
-        self._log_once = LogOnce(self)
+        # Errors that were logged, so that a faulty sender cannot fill the disk.
+        self._logged: set[str] = set()
         self._statistics = RoleStatistics()
         # One timer serves all deadlines. It is set again only if it would expire too late, or
         # when it has expired too early.
@@ -247,7 +250,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         A node that stands by creates them when it resumes.
         """
         self._is_advertised = True
-        for kind in () if self._stands_by else self.role.SENDS:
+        for kind in () if self.stands_by else self.role.SENDS:
             if kind not in self._sending:
                 self._sending[kind] = create_publisher(
                     self, convert.ros_type(kind), topics.NAMES[kind], profile_for(kind))
@@ -273,11 +276,6 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         return dataclasses.replace(
             report, fault=True, summary='; '.join(conflicts), values=values)
 
-    @property
-    def is_standing_by(self) -> bool:
-        """Whether a newer node has the role."""
-        return self._stands_by
-
     def stand_by(self) -> None:
         """React to a newer node in the same role; a node with further tasks overrides this."""
 
@@ -285,7 +283,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         """React when the node serves again."""
 
     def _on_missing(self, missing: dict[str, str]) -> None:
-        if self._stands_by:
+        if self.stands_by:
             return
         self._missing = missing
         self._report_missing(missing)
@@ -317,9 +315,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 *lacking)))
 
     def _on_rival(self, stands_by: bool) -> None:
-        if stands_by == self._stands_by:
+        if stands_by == self.stands_by:
             return
-        self._stands_by = stands_by
+        self.stands_by = stands_by
         if stands_by:
             self.stand_by()
             # Subscriptions remain: the executor may hold messages for them. They are ignored.
@@ -365,7 +363,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
         A node that stands by publishes nothing.
         """
-        if self._stands_by:
+        if self.stands_by:
             return False
         stamp_ns = message.stamp_ns or self.get_clock().now().nanoseconds
         try:
@@ -383,7 +381,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         raise TypeError(f'{type(action).__name__} is not an action of {self.get_name()}')
 
     def _on_message(self, message: m.Message) -> None:
-        if not self._stands_by:
+        if not self.stands_by:
             self.dispatch(message)
 
     def _on_malformed(self, error: m.MessageError) -> None:
@@ -421,8 +419,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
 
     def _log_error(self, consequence: str, error: m.MessageError) -> None:
         """Log an error once for each field, whose name comes first in the text of the error."""
-        field = str(error).partition(':')[0]
-        self._log_once.error(f'{consequence} {field}', f'{consequence}: {error}')
+        subject = f'{consequence} {str(error).partition(":")[0]}'
+        if subject not in self._logged:
+            self._logged.add(subject)
+            self.get_logger().error(  # type: ignore[no-untyped-call]
+                f'{consequence}: {error}')
 
     def _set_timer(self, delay_s: float, due_s: float) -> None:
         # The timer is steady, and the pace of a simulation is unknown.

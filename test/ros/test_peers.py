@@ -421,7 +421,7 @@ def test_of_three_nodes_with_the_same_name_the_newest_serves_until_it_has_gone(b
     topic = f'/{topics.NAMES[m.FeedSignals]}'
 
     def serving():
-        return [node.is_standing_by for node in nodes] == [True] * (len(nodes) - 1) + [False] and (
+        return [node.stands_by for node in nodes] == [True] * (len(nodes) - 1) + [False] and (
             len(probe.get_publishers_info_by_topic(topic)) == 1)
     while nodes:
         bench.until(serving, 'the newest node')
