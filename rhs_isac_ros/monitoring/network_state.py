@@ -165,15 +165,10 @@ class UserState:
 
 
 class SceneState:
-    """The surface, its beam, and the users.
+    """What the surface applies, the latest beam of a transmission, and the users by id.
 
-    Attributes
-    ----------
-    configuration, beam
-        What the surface applies, and the latest beam of a transmission; None before the first.
-    users
-        Users by id, at most `MAX_USERS`, because the ids come from messages. Further users are
-        ignored until others are discarded.
+    There are at most `MAX_USERS`, because the ids come from messages. Further users are ignored
+    until others are discarded.
     """
 
     def __init__(self) -> None:

@@ -21,23 +21,13 @@ _MAX_AHEAD_NS = 3600 * 10**9
 
 @dataclasses.dataclass(frozen=True)
 class Presence:
-    """The announcement of a node.
+    """The announcement of a node."""
 
-    Attributes
-    ----------
-    sender
-        Instance of the node: its start in nanoseconds since 1970.
-    node
-        Fully qualified name.
-    scenario
-        Fields of the scenario, as `Scenario.fields` returns them.
-    """
-
-    sender: int
+    sender: int  # instance of the node: its start [ns since 1970]
     scenario_id: str
     role: str
-    node: str
-    scenario: Mapping[str, Any]
+    node: str  # fully qualified name
+    scenario: Mapping[str, Any]  # as `Scenario.fields` returns it
 
     def __str__(self) -> str:
         """Return name and start of the node, for log messages."""

@@ -101,19 +101,7 @@ class Recorder:
     """Writes the messages of a network, and its scenario, to a file.
 
     The file is ``<name>.part`` until it is closed, so that an interrupted run does not lose its
-    messages.
-
-    Attributes
-    ----------
-    count
-        Number of messages written.
-    failure
-        Why the rest is not recorded, as when the disk is full; empty if nothing failed.
-
-    Raises
-    ------
-    RecordingError
-        If mcap is not installed, or the file cannot be written.
+    messages. Raises RecordingError if mcap is not installed, or the file cannot be written.
     """
 
     def __init__(self, path: str | Path, scenario: Scenario) -> None:
@@ -131,6 +119,7 @@ class Recorder:
         self._writer = Writer(self._stream)
         self._writer.start(profile='ros2', library='rhs_isac_ros')
         self._writer.add_metadata(_SCENARIO, {'yaml': yaml.safe_dump(scenario.changes())})
+        # Number of messages written, and why the rest is not recorded, as when the disk is full.
         self.count, self.failure = 0, ''
 
     def record_topics(
