@@ -1,7 +1,6 @@
 """The adapter between a role of the protocol and ROS 2."""
 
 import contextlib
-import dataclasses
 import functools
 import math
 import time
@@ -266,15 +265,10 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def report(self) -> Report:
         """Return the diagnostics of the role, which count the faults since the last report."""
         state = self.role.state
-        report = self._statistics.report(
+        return self._statistics.report(
             '' if state is None else state.value, self.role.counters,
-            state in self.role.BLOCKED_STATES, self.role.status())
-        values = {**report.values, **self._peers.conflicts()}
-        conflicts = [text for key, text in values.items() if key.startswith('conflict.')]
-        if not conflicts:
-            return report
-        return dataclasses.replace(
-            report, fault=True, summary='; '.join(conflicts), values=values)
+            state in self.role.BLOCKED_STATES,
+            {**self.role.status(), **self._peers.conflicts()})
 
     def stand_by(self) -> None:
         """React to a newer node in the same role; a node with further tasks overrides this."""
@@ -400,7 +394,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def _handle(self, event: events.Event, now_s: float) -> None:
         start_s = time.perf_counter()
         actions = self.role.handle(event, now_s)
-        self._statistics.record(event, actions, now_s, time.perf_counter() - start_s)
+        self._statistics.record(event, actions, time.perf_counter() - start_s)
         for action in actions:
             self._perform(action)
 
