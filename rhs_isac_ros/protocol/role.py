@@ -15,15 +15,6 @@ class Role:
     """A role of the protocol. It maps events to actions and does not read a clock.
 
     A subclass defines `react`, which appends actions with `send`, `log` and `act`.
-
-    Attributes
-    ----------
-    counters
-        Number of occurrences of each outcome and of each kind of unexpected event.
-    now_s
-        Time of the latest event [s].
-    state
-        Current state; None if the role has no state machine.
     """
 
     # Messages that the role sends, and those that it handles.
@@ -35,8 +26,11 @@ class Role:
     WORLD_STATES: ClassVar[frozenset[enum.Enum]] = frozenset()
 
     def __init__(self) -> None:
+        # Number of occurrences of each outcome and of each kind of unexpected event.
         self.counters: collections.Counter[str] = collections.Counter()
+        # Time of the latest event [s].
         self.now_s = 0.0
+        # None if the role has no state machine.
         self.state: enum.Enum | None = None
         self._actions: list[Action] = []
 

@@ -43,21 +43,8 @@ class _User:
 class UserRegistry:
     """Registers the users that answer beacons and selects the next one to serve.
 
-    Each number belongs to one node: the first to answer, until it is silent.
-
-    Parameters
-    ----------
-    policy
-        ``round_robin``: the user served longest ago; ``first``: the first to answer; ``random``.
-    rng
-        Source of randomness, for ``random``.
-
-    Attributes
-    ----------
-    all_invited
-        Whether the latest beacon invited all users.
-    answered
-        Users that answered in this cycle, in order; the values have no meaning.
+    Each number belongs to one node: the first to answer, until it is silent. The policy selects
+    the user served longest ago (``round_robin``), the ``first`` to answer, or one at ``random``.
     """
 
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
@@ -72,7 +59,9 @@ class UserRegistry:
         # Users that are served before others once, in the order of the requests.
         self._requested: dict[int, None] = {}
         self._turn = 0
+        # Whether the latest beacon invited all users.
         self.all_invited = True
+        # Users that answered in this cycle, in order; the values have no meaning.
         self.answered: dict[int, None] = {}
 
     def __len__(self) -> int:
