@@ -88,9 +88,9 @@ class _Fork:
     It has the part of the interface of `subprocess.Popen` that `Processes` needs.
     """
 
-    def __init__(self, command: Sequence[str], log: int, environment: Mapping[str, str]) -> None:
-        executable = Path(command[0]).name
-        for module in (f'rhs_isac_ros.nodes.{executable}', *_LATE_MODULES):
+    def __init__(
+            self, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
+        for module in (f'rhs_isac_ros.nodes.{Path(command[0]).name}', *_LATE_MODULES):
             importlib.import_module(module)
         # The garbage collection of the node then ignores what it shares with this process.
         gc.freeze()
@@ -101,7 +101,7 @@ class _Fork:
             warnings.simplefilter('ignore', DeprecationWarning)
             self.pid = os.fork()
         if not self.pid:
-            _become(executable, command, log, environment)
+            run_executable(command, log, environment)
 
     def poll(self) -> int | None:
         """Return the exit code, the negative number of a signal, or None while running."""
@@ -117,21 +117,25 @@ class _Fork:
             os.kill(self.pid, number)
 
 
-def _become(executable: str, command: Sequence[str], log: int,
-            environment: Mapping[str, str]) -> NoReturn:
-    """Run an executable in a new child as if its command had been executed, and exit."""
+def run_executable(
+        command: Sequence[str], log: Path, environment: Mapping[str, str]) -> NoReturn:
+    """Run the executable of a command in this process, a new copy of another one, and exit.
+
+    Output is appended to `log`, an existing file.
+    """
     code: Any = 1
     try:
         os.setsid()
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        os.dup2(log, 1)
-        os.dup2(log, 2)
+        os.dup2(os.open(log, os.O_WRONLY | os.O_APPEND), 1)
+        os.dup2(1, 2)
         os.environ.clear()
         os.environ.update(environment)
-        # The name that `ps` and `top` show.
-        Path('/proc/self/comm').write_text(executable, encoding='ascii')
         sys.argv = list(command)
-        code = getattr(executables, executable)()
+        name = Path(command[0]).name
+        # The name that `ps` and `top` show.
+        Path('/proc/self/comm').write_text(name, encoding='ascii')
+        code = getattr(executables, name)()
     except SystemExit as error:
         code = error.code
     except KeyboardInterrupt:
@@ -183,11 +187,14 @@ class Processes:
         self._spawn(name)
 
     def _spawn(self, name: str) -> None:
-        command = self._commands[name]
-        with open(self._logs / f'{name}.log', 'ab') as log:
-            self._running[name] = _Fork(
-                command, log.fileno(), self._environment) if self._fork else subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+        command, log = self._commands[name], self._logs / f'{name}.log'
+        log.touch()
+        if self._fork:
+            self._running[name] = _Fork(command, log, self._environment)
+            return
+        with open(log, 'ab') as stream:
+            self._running[name] = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
                 env=self._environment, start_new_session=True)
 
     @property
