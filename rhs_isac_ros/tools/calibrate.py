@@ -244,18 +244,13 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('file', type=input_file, nargs='?',
         help='recording made with record, or .npz file with the arrays positions [N, 3] (m) and '
-        'received [N, N_B, N_SB F]')
+        'received [N, N_B, N_SB F], by default received with the default codebook')
     add('--multipath', action='store_true',
-        help='estimate the multipath of the hall instead of the surface')
-    add('--calibration', type=input_file, metavar='FILE',
-        help='calibrated surface to assume with --multipath')
+        help='estimate the multipath of the hall instead of the surface, which --calibration '
+        'describes')
     add('--output', type=output_file, default=Path('calibration.npz'), metavar='FILE',
         help='calibration or multipath to write (default: calibration.npz)')
-    add('--config', type=input_file, metavar='FILE',
-        help="scenario file; by default the recorded scenario, or the paper's Table I")
-    add('--codebook', type=input_file, metavar='FILE',
-        help='codebook to assume if the recording contains none; of arrays, by default the '
-        'default one')
+    command.add_files(parser, 'config', 'codebook', 'calibration')
     add('--user', type=integer(0), default=0, metavar='ID',
         help='use only the signals of this user (default: of all users)')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
