@@ -57,7 +57,7 @@ _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects received signals of one user or, if 0, all, their true positions, and codebooks.
+    """Collects the signals, true positions and codebooks of one user, or of all users for 0.
 
     Unlike in a `CycleLog`, cycles without a fix count: before a calibration, there may be no
     others.
@@ -80,7 +80,7 @@ class PilotLog:
                 self._signals.setdefault(found.cycle_id, found)
 
     def has_pilots(self, n: int) -> bool:
-        """Return whether position and codebook of a number of pilots are known."""
+        """Return whether the positions and codebooks of `n` pilots are known."""
         # There are at most as many as signals, which are quicker to count.
         return len(self._signals) >= n and self.n_pilots >= n
 

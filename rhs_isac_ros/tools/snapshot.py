@@ -59,8 +59,8 @@ class SnapshotNode(Node):
     def is_ready(self, wait_s: float) -> bool:
         """Return whether to draw the scene.
 
-        Every user has had time to report, and the scene is complete or has been incomplete for
-        longer than the given time [s].
+        This is the case when every user has had time to report and the scene is complete, or has
+        been incomplete for longer than `wait_s` [s].
         """
         now_s, scene = time.monotonic(), self.scene
         return now_s > self._began_s + _REPORT_PERIOD_S and (
