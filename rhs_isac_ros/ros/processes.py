@@ -9,11 +9,11 @@ import socket
 import subprocess
 import sys
 import time
-import traceback
 import warnings
 from collections.abc import Mapping, Sequence
+from multiprocessing.context import ForkProcess
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from ament_index_python.packages import get_package_prefix
 
@@ -82,64 +82,45 @@ def max_processes() -> int:
     return min(limits)
 
 
-class _Fork:
+class _Fork(ForkProcess):
     """A copy of this process that runs a node, with the modules that are already imported.
 
-    It has the part of the interface of `subprocess.Popen` that `Processes` needs.
+    `Processes` uses it like a `subprocess.Popen`.
     """
 
-    def __init__(self, command: Sequence[str], log: int, environment: Mapping[str, str]) -> None:
-        executable = Path(command[0]).name
-        for module in (f'rhs_isac_ros.nodes.{executable}', *_LATE_MODULES):
+    def __init__(
+            self, command: Sequence[str], log: int, environment: Mapping[str, str]) -> None:
+        super().__init__(name=Path(command[0]).name)
+        self._command, self._log, self._environment = command, log, environment
+        for module in (f'rhs_isac_ros.nodes.{self.name}', *_LATE_MODULES):
             importlib.import_module(module)
         # The garbage collection of the node then ignores what it shares with this process.
         gc.freeze()
-        sys.stdout.flush()
-        self._code: int | None = None
         with warnings.catch_warnings():
             # The tracing library of ROS has two threads, which wait and hold no lock.
             warnings.simplefilter('ignore', DeprecationWarning)
-            self.pid = os.fork()
-        if not self.pid:
-            _become(executable, command, log, environment)
+            self.start()
+
+    def run(self) -> None:
+        """Run the executable, in the new process, as its command would."""
+        os.setsid()
+        os.dup2(self._log, 1)
+        os.dup2(self._log, 2)
+        os.environ.clear()
+        os.environ.update(self._environment)
+        # The name that `ps` and `top` show.
+        Path('/proc/self/comm').write_text(self.name, encoding='ascii')
+        sys.argv = list(self._command)
+        sys.exit(getattr(executables, self.name)())
 
     def poll(self) -> int | None:
         """Return the exit code, the negative number of a signal, or None while running."""
-        if self._code is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            if pid:
-                self._code = os.waitstatus_to_exitcode(status)
-        return self._code
+        return self.exitcode
 
     def send_signal(self, number: int) -> None:
         """Send a signal unless the process has ended."""
-        if self.poll() is None:
+        if self.pid and self.poll() is None:
             os.kill(self.pid, number)
-
-
-def _become(executable: str, command: Sequence[str], log: int,
-            environment: Mapping[str, str]) -> NoReturn:
-    """Run an executable in a new child as if its command had been executed, and exit."""
-    code: Any = 1
-    try:
-        os.setsid()
-        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        os.dup2(log, 1)
-        os.dup2(log, 2)
-        os.environ.clear()
-        os.environ.update(environment)
-        # The name that `ps` and `top` show.
-        Path('/proc/self/comm').write_text(executable, encoding='ascii')
-        sys.argv = list(command)
-        code = getattr(executables, executable)()
-    except SystemExit as error:
-        code = error.code
-    except KeyboardInterrupt:
-        code = 0
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        os._exit(code)
 
 
 class Processes:
