@@ -315,22 +315,10 @@ def lobe(shown: BeamPattern, user: int) -> Mesh:
 
 def _ellipsoids(
         centres: np.ndarray, covariances_m2: np.ndarray, colours: np.ndarray) -> Ellipsoids:
+    # The import takes as long as that of the rest of a program, which may never need it.
+    from scipy.spatial.transform import Rotation
+
     shapes = [axes_95(covariance) for covariance in covariances_m2]
     return Ellipsoids(
         centres, np.maximum([half_m for half_m, _ in shapes], _MIN_HALF_SIZE_M),
-        np.array([_quaternion(axes) for _, axes in shapes]), colours)
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion x, y, z, w of a rotation, float64 [3, 3].
-
-    It is an eigenvector for the greatest eigenvalue of a symmetric matrix (Bar-Itzhack, 2000).
-    SciPy's function would take as long to import as the rest of the program.
-    """
-    trace = np.trace(rotation)
-    matrix = np.zeros((4, 4))
-    matrix[:3, :3] = rotation + rotation.T - trace * np.eye(3)
-    matrix[3, :3] = matrix[:3, 3] = [rotation[k, j] - rotation[j, k]
-                                     for j, k in ((1, 2), (2, 0), (0, 1))]
-    matrix[3, 3] = trace
-    return np.linalg.eigh(matrix)[1][:, -1]
+        np.array([Rotation.from_matrix(axes).as_quat() for _, axes in shapes]), colours)

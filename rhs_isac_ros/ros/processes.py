@@ -9,11 +9,11 @@ import socket
 import subprocess
 import sys
 import time
-import traceback
 import warnings
 from collections.abc import Mapping, Sequence
+from multiprocessing.context import ForkProcess
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from ament_index_python.packages import get_package_prefix
 
@@ -82,68 +82,51 @@ def max_processes() -> int:
     return min(limits)
 
 
-class _Fork:
+def run_executable(
+        command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
+    """Run an executable in this process, a new copy of another one, as its command would.
+
+    Output is appended to `log`.
+    """
+    os.setsid()
+    os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666), 1)
+    os.dup2(1, 2)
+    os.environ.clear()
+    os.environ.update(environment)
+    name = Path(command[0]).name
+    # The name that `ps` and `top` show.
+    Path('/proc/self/comm').write_text(name, encoding='ascii')
+    sys.argv = list(command)
+    sys.exit(getattr(executables, name)())
+
+
+class _Fork(ForkProcess):
     """A copy of this process that runs a node, with the modules that are already imported.
 
-    It has the part of the interface of `subprocess.Popen` that `Processes` needs.
+    `Processes` uses it like a `subprocess.Popen`.
     """
 
     def __init__(
             self, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
-        for module in (f'rhs_isac_ros.nodes.{Path(command[0]).name}', *_LATE_MODULES):
+        super().__init__(name=Path(command[0]).name, target=run_executable,
+                         args=(command, log, environment))
+        for module in (f'rhs_isac_ros.nodes.{self.name}', *_LATE_MODULES):
             importlib.import_module(module)
         # The garbage collection of the node then ignores what it shares with this process.
         gc.freeze()
-        sys.stdout.flush()
-        self._code: int | None = None
         with warnings.catch_warnings():
             # The tracing library of ROS has two threads, which wait and hold no lock.
             warnings.simplefilter('ignore', DeprecationWarning)
-            self.pid = os.fork()
-        if not self.pid:
-            run_executable(command, log, environment)
+            self.start()
 
     def poll(self) -> int | None:
         """Return the exit code, the negative number of a signal, or None while running."""
-        if self._code is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            if pid:
-                self._code = os.waitstatus_to_exitcode(status)
-        return self._code
+        return self.exitcode
 
     def send_signal(self, number: int) -> None:
         """Send a signal unless the process has ended."""
-        if self.poll() is None:
+        if self.pid and self.poll() is None:
             os.kill(self.pid, number)
-
-
-def run_executable(
-        command: Sequence[str], log: Path, environment: Mapping[str, str]) -> NoReturn:
-    """Run the executable of a command in this process, a new copy of another one, and exit.
-
-    Output is appended to `log`, an existing file.
-    """
-    code: Any = 1
-    try:
-        os.setsid()
-        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        os.dup2(os.open(log, os.O_WRONLY | os.O_APPEND), 1)
-        os.dup2(1, 2)
-        os.environ.clear()
-        os.environ.update(environment)
-        sys.argv = list(command)
-        name = Path(command[0]).name
-        # The name that `ps` and `top` show.
-        Path('/proc/self/comm').write_text(name, encoding='ascii')
-        code = getattr(executables, name)()
-    except SystemExit as error:
-        code = error.code
-    except KeyboardInterrupt:
-        code = 0
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        os._exit(code)
 
 
 class Processes:
@@ -188,6 +171,7 @@ class Processes:
 
     def _spawn(self, name: str) -> None:
         command, log = self._commands[name], self._logs / f'{name}.log'
+        # The log of a process exists as soon as it is started.
         log.touch()
         if self._fork:
             self._running[name] = _Fork(command, log, self._environment)

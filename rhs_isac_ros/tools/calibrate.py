@@ -57,7 +57,7 @@ _N_COMPARED = 200
 
 
 class PilotLog:
-    """Collects received signals of one user or, if 0, all, their true positions, and codebooks.
+    """Collects the signals, true positions and codebooks of one user, or of all users for 0.
 
     Unlike in a `CycleLog`, cycles without a fix count: before a calibration, there may be no
     others.
@@ -80,7 +80,7 @@ class PilotLog:
                 self._signals.setdefault(found.cycle_id, found)
 
     def has_pilots(self, n: int) -> bool:
-        """Return whether position and codebook of a number of pilots are known."""
+        """Return whether the positions and codebooks of `n` pilots are known."""
         # There are at most as many as signals, which are quicker to count.
         return len(self._signals) >= n and self.n_pilots >= n
 
@@ -244,18 +244,13 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('file', type=input_file, nargs='?',
         help='recording made with record, or .npz file with the arrays positions [N, 3] (m) and '
-        'received [N, N_B, N_SB F]')
+        'received [N, N_B, N_SB F], by default received with the default codebook')
     add('--multipath', action='store_true',
-        help='estimate the multipath of the hall instead of the surface')
-    add('--calibration', type=input_file, metavar='FILE',
-        help='calibrated surface to assume with --multipath')
+        help='estimate the multipath of the hall instead of the surface, which --calibration '
+        'describes')
     add('--output', type=output_file, default=Path('calibration.npz'), metavar='FILE',
         help='calibration or multipath to write (default: calibration.npz)')
-    add('--config', type=input_file, metavar='FILE',
-        help="scenario file; by default the recorded scenario, or the paper's Table I")
-    add('--codebook', type=input_file, metavar='FILE',
-        help='codebook to assume if the recording contains none; of arrays, by default the '
-        'default one')
+    command.add_files(parser, 'config', 'codebook', 'calibration')
     add('--user', type=integer(0), default=0, metavar='ID',
         help='use only the signals of this user (default: of all users)')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')

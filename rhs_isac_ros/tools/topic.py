@@ -128,7 +128,7 @@ def echo(session: Session, options: argparse.Namespace) -> None:
 
 
 def _select(message: Any, field: str) -> Any:
-    """Return a field of a message; dots select nested fields, and '' the message itself."""
+    """Return a field of a message, possibly nested as in ``a.b``; for '', the message itself."""
     for part in filter(None, field.split('.')):
         try:
             message = getattr(message, part)
