@@ -167,7 +167,13 @@ def _collected(
                 options.file, options.namespace, scenario, [*RECEIVES, Codebook]):
             log.add(found)
     else:
-        _listen(options, scenario, log, arguments)
+        end_s = time.monotonic() + options.timeout
+        command.observe(
+            lambda: CalibratorNode(log, scenario), arguments,
+            lambda _: log.has_pilots(options.cycles) or time.monotonic() > end_s)
+        if not log.has_pilots(options.cycles):
+            raise command.none_within(
+                f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
     if options.codebook:
         codebook = Codebook.load(options.codebook)
         codebook.check(scenario)
@@ -181,17 +187,6 @@ def _collected(
             f'{source}: no received signals with a true position, expected at least one in the '
             f'namespace {options.namespace}')
     return pilots
-
-
-def _listen(options: argparse.Namespace, scenario: Scenario, log: PilotLog,
-            arguments: Sequence[str]) -> None:
-    """Collect pilots of a running network, or raise ToolError if there are not enough in time."""
-    end_s = time.monotonic() + options.timeout
-    command.observe(
-        lambda: CalibratorNode(log, scenario), arguments,
-        lambda _: log.has_pilots(options.cycles) or time.monotonic() > end_s)
-    if not log.has_pilots(options.cycles):
-        raise command.none_within(f'{log.n_pilots} of {options.cycles} pilots', options.timeout)
 
 
 def _survey(scenario: Scenario, pilots: Sequence[Pilots], options: argparse.Namespace) -> None:
