@@ -1,6 +1,7 @@
 """The executable ``visualizer``: shows a network in RViz and Foxglove."""
 
 import copy
+import itertools
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -39,13 +40,15 @@ from rhs_isac_ros.ros.topics import RHS_FRAME, TF, TF_STATIC
 
 # Opacity of bodies through which others remain visible.
 _ELLIPSOID, _OUTLINE, _MESH = 0.35, 0.15, 0.25
+# Width of a line for a point of the screen [m].
+_LINE_M = 0.02
 
 
 def marker(
         namespace: str, number: int,
-        shape: shapes.Points | shapes.Ellipsoids | shapes.Boxes | shapes.Mesh, stamp: Time
-) -> Marker:
-    """Return a ball, an ellipsoid, cuboids or a mesh as a marker.
+        shape: shapes.Points | shapes.Ellipsoids | shapes.Boxes | shapes.Lines | shapes.Mesh,
+        stamp: Time) -> Marker:
+    """Return a ball, an ellipsoid, cuboids, lines or a mesh as a marker.
 
     Rerun draws an ellipsoid and a box that is not solid as outlines; here they are translucent.
     """
@@ -69,6 +72,12 @@ def marker(
             found.points = [to_ros(Point, centre) for centre in shape.centres]
             found.colors = [_colour(colour, 1.0 if shape.solid else _OUTLINE)
                             for colour in shape.colours]
+        case shapes.Lines():
+            found = _marker(namespace, number, Marker.LINE_LIST, stamp)
+            found.scale.x = _LINE_M * shape.width
+            found.points = [to_ros(Point, end) for strip in shape.strips
+                            for pair in itertools.pairwise(strip) for end in pair]
+            found.color = _colour(shape.colour, 1.0)
         case shapes.Mesh():
             found = _marker(namespace, number, Marker.TRIANGLE_LIST, stamp)
             found.scale = Vector3(x=1.0, y=1.0, z=1.0)
@@ -225,13 +234,16 @@ class VisualizerNode(Node):
 
     def _show_markers(self, stamp: Time) -> None:
         state = self._scene
-        bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes] = {
+        bodies: dict[tuple[str, int], shapes.Points | shapes.Ellipsoids | shapes.Boxes
+                     | shapes.Lines] = {
             ('region', 0): shapes.region(self._scenario),
             ('board', 0): shapes.board(
                 self._scenario, state.configuration.analog if state.configuration else None)}
         for number, user in state.users.items():
             if user.truth:
                 bodies['truth', number], _ = shapes.truth(user.truth)
+                if self._scenario.channel:
+                    bodies['traced', number] = shapes.traced(self._scenario, user.truth)
             if user.estimate:
                 _, bodies['estimate', number] = shapes.estimate(user.estimate)
         array = [marker(*key, body, stamp) for key, body in bodies.items()]
