@@ -63,7 +63,7 @@ def test_users_keep_their_rows(network_class, scenario, codebooks, places):
     assert all(row == sorted(row) for row in rows)
 
 
-def test_the_view_shows_doubts_within_80_columns(network_class, scenario, codebooks, places):
+def test_probabilities_fit_into_80_columns(network_class, scenario, codebooks, places):
     net = network_class(scenario, codebooks[0], {1: places[0]})
     net.run_cycles(1)
     overview = Overview()
@@ -76,7 +76,7 @@ def test_the_view_shows_doubts_within_80_columns(network_class, scenario, codebo
         cycle, estimate=dataclasses.replace(cycle.estimate, **far))
     text = text_of(overview, cycle.ended_s)
     assert re.search(r'^ +12 +-10.34 -12.20   1.10 +[.\d]+ +[.\d]+ +12/0 ', text, re.MULTILINE)
-    assert 'doubt: outside of the region/without a direct path' in text
+    assert 'out/blk: probability of being outside of the region/blocked' in text
     assert '…' not in text
 
 
