@@ -5,6 +5,7 @@ Gaussian, so that the marginal of the position has the Schur complement of the i
 mass contains the determinant of the parameters' information: Laplace's method.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from rhs_isac_ros.model.gaussian import Marginal, marginalise
 from rhs_isac_ros.positioning.coordinates import likelihood_loss, offset_to_roi
 from rhs_isac_ros.positioning.grid import (
+    Query,
     Starts,
     TemplateTable,
     first_of_each,
@@ -81,10 +83,17 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
     that the signals alone reveal, float64 [N, Q], 0 for the others. Modes may be less likely than
     the best by the `extra_margin` more than usual.
     """
-    starts = grid.starts(
-        likelihood.whitened(aligned, signals), likelihood.nuisance, GRID_MARGIN + extra_margin)
-    starts = starts._replace(values=starts.values + aligned[starts.phases])
+    starts = find_starts(likelihood, grid, signals, aligned, extra_margin)
     return ascend(likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra_margin)
+
+
+def find_starts(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
+                aligned: np.ndarray, extra_margin: float = 0.0,
+                draw: Callable[[Query, int], bool] | None = None) -> Starts:
+    """Find the points from which `find_modes` ascends; for `draw`, see `TemplateTable.starts`."""
+    starts = grid.starts(likelihood.whitened(aligned, signals), likelihood.nuisance,
+                         GRID_MARGIN + extra_margin, draw)
+    return starts._replace(values=starts.values + aligned[starts.phases])
 
 
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
