@@ -2,7 +2,7 @@
 
 import abc
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +30,12 @@ from rhs_isac_ros.positioning.estimate import (
     estimate_each,
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.grid import Query, TemplateTable, standard_normal
+from rhs_isac_ros.positioning.grid import (
+    Query,
+    TemplateTable,
+    first_of_each,
+    standard_normal,
+)
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
@@ -88,6 +93,8 @@ class SearchEstimator(abc.ABC):
         probability, while position and covariance remain those of a user inside.
     surface
         What is known of the surface, as in `MeasurementModel`; for example a calibration.
+    progress
+        Called with the share of the table that is computed, from any thread; not if it is loaded.
     """
 
     averages = True  # Whether positions are averages over the posterior.
@@ -96,10 +103,11 @@ class SearchEstimator(abc.ABC):
     def __init__(
             self, scenario: Scenario, codebook: Codebook,
             table_folder: Path | None = None, *, reject_outside: bool = False,
-            surface: Surface | None = None) -> None:
+            surface: Surface | None = None,
+            progress: Callable[[float], None] | None = None) -> None:
         self.scenario, self.surface = scenario, surface
         self._likelihood = likelihood = Likelihood(scenario, codebook, surface)
-        arrays = load_table(likelihood.model, codebook.id, table_folder)
+        arrays = load_table(likelihood.model, codebook.id, table_folder, progress)
         self._grid = TemplateTable(scenario, arrays)
         self._alternatives: list[Alternative] = []
         if reject_outside:
@@ -195,7 +203,7 @@ class SearchEstimator(abc.ABC):
         if len(starts.phases):
             modes = ascend(
                 likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra)
-            rows = np.unique(modes.phases).tolist()
+            rows = modes.phases[first_of_each(modes.phases)].tolist()
             fits.update(zip(rows, self._fit(modes, signals, rows), strict=True))
         return [fits[phase] for phase in range(len(aligned))]
 

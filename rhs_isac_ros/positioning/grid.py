@@ -63,7 +63,8 @@ _TABLE_ERROR = 0.015
 _STEP_ERROR = 0.5
 
 
-def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
+def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None = None
+             ) -> dict[str, np.ndarray]:
     """Compute the arrays of a `TemplateTable`, for G templates and C pairs with a range cell.
 
     They are ``filters``, the conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``,
@@ -110,7 +111,7 @@ def tabulate(model: MeasurementModel) -> dict[str, np.ndarray]:
             table['curvature'][part] = form[:, 1:, 1:]
         return spread
 
-    blocks = map_blocks(fill, range(0, len(grid.nodes), _BLOCK))
+    blocks = map_blocks(fill, range(0, len(grid.nodes), _BLOCK), progress)
     table['spread'] = np.sum(blocks, axis=0) / n_cells
     return table
 
@@ -261,10 +262,11 @@ class TemplateTable:
         likely = bound + self._loss >= limit[:, None]
         likely[rows, first.ravel()] = False
         if draw:
-            drawn = [row for row in np.flatnonzero(likely.sum(axis=1) > _MAX_CELLS).tolist()
-                     if draw(query, row)]
-            likely[drawn] = False
-            peaks = peaks.select(~np.isin(peaks.phases, drawn))
+            many = np.count_nonzero(likely, axis=1) > _MAX_CELLS
+            drawn = [row for row in np.flatnonzero(many).tolist() if draw(query, row)]
+            if drawn:
+                likely[drawn] = False
+                peaks = peaks.select(~np.isin(peaks.phases, drawn))
         rows, others = np.nonzero(likely)
         if len(rows):
             peaks = concatenate(peaks, self._peaks_of(rows, others, query))

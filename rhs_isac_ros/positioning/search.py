@@ -24,8 +24,8 @@ from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Local, 
 
 # Negative logarithms of the share of the posterior that modes may leave out: on the grid, which is
 # accurate to one Gauss-Newton step, and after exact steps.
-GRID_MARGIN = 10.0
-EXACT_MARGIN = 8.0
+GRID_MARGIN = 8.0
+EXACT_MARGIN = 7.0
 # A mode has converged when its last step gained less log-likelihood than this.
 _MIN_GAIN = 0.05
 # Maximum number of exact steps. Few modes need more than two, unless signals are strong.
