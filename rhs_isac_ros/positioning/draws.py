@@ -65,10 +65,15 @@ class DrawnPosterior:
         self._table, resolution = table, Resolution.of(scenario)
         self._wavelength_m, self._bounds = resolution.wavelength_m, resolution.bounds_m
         self._wavenumbers = carrier_wavenumbers(scenario)
-        self._steps = 2 * PHASE_ERROR * resolution.direction
         grid, points = table.grid, table.grid.points
+        # Directions of each cell: lowest (u, v) and extent, float64 [C, 2].
+        self._low, high = (np.clip(points[:, 1:] + sign * PHASE_ERROR * resolution.direction,
+                                   *resolution.directions.T) for sign in (-1, 1))
+        self._extent = high - self._low
+        with np.errstate(divide='ignore'):
+            self._log_area = np.log(self._extent).sum(axis=1)
         volume = points[:, 0]**2 * grid.widths_m[grid.cell] / _boresight(points[:, 1:])
-        self._log_volume = np.log(volume).astype(np.float32)
+        self._log_volume = np.log(volume) + self._log_area
 
     def of(self, query: Query, phase: int) -> Draws | None:
         """Draw positions of a phase of a query; None if too few of them are effective."""
@@ -81,7 +86,7 @@ class DrawnPosterior:
                 np.cumsum(probability), (np.arange(_N_DRAWS) + 0.5) / _N_DRAWS)
             drawn = np.minimum(drawn, len(bounds) - 1)
             places = (len(cells) + np.arange(_N_DRAWS))[:, None] * _SEQUENCE
-            rays = self._rays(query, phase, drawn, (places % 1 - 0.5) * self._steps)
+            rays = self._rays(query, phase, drawn, places % 1)
             parts.append(rays._replace(draw=rays.draw + len(cells)))
             cells, rays = np.append(cells, drawn), concatenate(*parts)
             log_weights = rays.log_mass - np.log(expected[cells[rays.draw]])
@@ -106,7 +111,7 @@ class DrawnPosterior:
                       + (along[:, None] * rays.direction).T @ rays.direction)
         return Draws(
             mean, covariance * (1 + variance),
-            float(highest + np.log(total * np.prod(self._steps))),
+            float(highest + np.log(total)),
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
@@ -118,9 +123,12 @@ class DrawnPosterior:
         shares: np.ndarray = np.exp(value - value.max(), dtype=float)
         return shares / shares.sum()
 
-    def _rays(self, query: Query, phase: int, cells: np.ndarray, offset: np.ndarray) -> _Rays:
-        """Integrate along the directions at offsets of (u, v), [K, 2], in cells [K]."""
-        grid, windows = self._table.grid, self._table.windows(query, phase, cells, offset)
+    def _rays(self, query: Query, phase: int, cells: np.ndarray, places: np.ndarray) -> _Rays:
+        """Integrate along directions at places in the unit square, [K, 2], of cells [K]."""
+        directions = np.empty((len(cells), 3))
+        directions[:, 1:] = self._low[cells] + places * self._extent[cells]
+        directions[:, 0] = _boresight(directions[:, 1:])
+        windows = self._table.windows(query, phase, cells, directions[:, 1:])
         amplitude = np.abs(windows.outputs).sum(axis=0)
         bound = 2 * amplitude - windows.energy
         best = int(np.argmax(bound))
@@ -128,15 +136,12 @@ class DrawnPosterior:
         windows = windows.select(np.flatnonzero(bound >= limit))
         per_wavelength = max(_MIN_STEPS, np.pi * np.sqrt(2 * amplitude[best]))
         n_steps = int(np.ceil(self._table.window_m / self._wavelength_m * per_wavelength))
-        directions = np.empty((len(cells), 3))
-        directions[:, 1:] = grid.nodes[grid.node[cells], 1:] + offset
-        directions[:, 0] = _boresight(directions[:, 1:])
         low, high = self._inside(directions)
         rows, n = windows.pair, max(_BLOCK // n_steps, 1)
         parts = [self._integrate(windows.select(slice(k, k + n)), low, high, n_steps)
                  for k in range(0, len(rows), n)]
         log_mass, *moments = (np.concatenate(fields) for fields in zip(*parts, strict=True))
-        log_mass -= np.log(directions[rows, 0])
+        log_mass += (self._log_area[cells] - np.log(directions[:, 0]))[rows]
         return _Rays(rows, directions[rows], log_mass, *moments)
 
     def _integrate(self, windows: Windows, low: np.ndarray, high: np.ndarray, n_steps: int
@@ -155,10 +160,10 @@ class DrawnPosterior:
         highest = value.max(axis=1)
         value -= highest[:, None]
         density = np.exp(value)
-        nearest, farthest = ((ends[windows.pair] - range_m)[:, None].astype(np.float32)
-                             for ends in (low, high))
-        if nearest.max() > offsets_m[0] or farthest.min() < offsets_m[-1]:
-            density *= (offsets_m >= nearest) & (offsets_m <= farthest)
+        nearest = np.maximum(low[windows.pair] - range_m, -windows.width_m / 2)
+        farthest = np.minimum(high[windows.pair] - range_m, windows.width_m / 2)
+        density *= offsets_m >= nearest.astype(np.float32)[:, None]
+        density *= offsets_m <= farthest.astype(np.float32)[:, None]
         moments = (density @ np.stack([np.ones_like(offsets_m), offsets_m, offsets_m**2], axis=1)
                    ).astype(float)
         mass = np.maximum(moments[:, 0], np.finfo(np.float32).tiny)

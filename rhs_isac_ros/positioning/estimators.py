@@ -30,12 +30,7 @@ from rhs_isac_ros.positioning.estimate import (
     estimate_each,
 )
 from rhs_isac_ros.positioning.failures import FailedElements, can_enumerate
-from rhs_isac_ros.positioning.grid import (
-    Query,
-    TemplateTable,
-    first_of_each,
-    standard_normal,
-)
+from rhs_isac_ros.positioning.grid import Query, TemplateTable, standard_normal
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import (
     Alignment,
@@ -51,7 +46,7 @@ from rhs_isac_ros.positioning.posterior import (
     draw_broad_samples,
     draw_samples,
 )
-from rhs_isac_ros.positioning.search import EXACT_MARGIN, MAX_STEPS, Modes, ascend, find_starts
+from rhs_isac_ros.positioning.search import Modes, ascend, find_modes
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 
@@ -198,17 +193,15 @@ class SearchEstimator(abc.ABC):
                     0.0)
             return found is not None
 
-        starts = find_starts(
+        modes = find_modes(
             likelihood, self._grid, signals, aligned, extra, draw if draws else None)
-        if len(starts.phases):
-            modes = ascend(
-                likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra)
-            rows = modes.phases[first_of_each(modes.phases)].tolist()
+        if modes:
+            rows = [phase for phase in range(len(aligned)) if phase not in fits]
             fits.update(zip(rows, self._fit(modes, signals, rows), strict=True))
         return [fits[phase] for phase in range(len(aligned))]
 
     def _fit(self, modes: Modes, signals: Signals, rows: list[int]) -> Iterator[_Fit]:
-        """Yield the posterior of each phase in ascending `rows` from its modes."""
+        """Yield the posterior of each phase in `rows`, ascending, from its modes."""
         likelihood = self._likelihood
         conditionals: dict[int, Sequence[Conditional]] = dict.fromkeys(rows, [likelihood])
         if self._dispersed:

@@ -157,7 +157,7 @@ class TemplateTable:
         place = np.arange(counts.sum()) - np.repeat(self._first_window, counts)
         width_m = np.repeat(grid.widths_m / counts, counts)
         low_m = np.repeat(grid.ranges_m - grid.widths_m / 2, counts)
-        self._window_ranges_m = low_m + (place + 0.5) * width_m
+        self._window_ranges_m, self._window_widths_m = low_m + (place + 0.5) * width_m, width_m
         self._window_turns = self._turns(self._window_ranges_m).astype(np.complex64)
         n_fine = int(np.ceil(width_m.max() / wavelength_m * _STEPS_PER_WAVELENGTH))
         self.window_m = width_m.max()
@@ -181,16 +181,19 @@ class TemplateTable:
         may leave out. The points of a phase do not depend on the other phases. A phase in which
         very many cells matter has none if `draw`, called with its row in a query, returns True.
         """
-        weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
-        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
         n = max(1, _N_OUTPUTS // (len(self._energy) * len(self._wavenumbers)))
         parts = []
         for first in range(0, len(whitened), n):
-            block = slice(first, first + n)
-            query = self._query(weighted[block], energies[block], prior, margin, self._energy)
-            part = self._starts(query._replace(first=first), draw=draw)
+            query = self.query(whitened[first:first + n], prior, margin)._replace(first=first)
+            part = self._starts(query, draw=draw)
             parts.append(part._replace(phases=part.phases + first))
         return concatenate(*parts)
+
+    def query(self, whitened: np.ndarray, prior: NuisancePrior, margin: float) -> 'Query':
+        """Filter the whitened signals of a few phases, complex128 [N, N_B, N_SB F]."""
+        weighted = np.swapaxes(np.matmul(np.swapaxes(whitened, 0, 1), self._whitener.conj()), 0, 1)
+        energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
+        return self._query(weighted, energies, prior, margin, self._energy)
 
     def starts_under(self, whitened: np.ndarray, prior: NuisancePrior, factor: np.ndarray,
                      margin: float) -> 'Starts':
@@ -357,16 +360,15 @@ class TemplateTable:
         place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
         return pair, self._first_window[ranges][pair] + place
 
-    def windows(self, query: 'Query', phase: int, cells: np.ndarray, offset: np.ndarray
+    def windows(self, query: 'Query', phase: int, cells: np.ndarray, directions: np.ndarray
                 ) -> 'Windows':
-        """Evaluate windows of range at directions beside the centres of pairs [K] of the grid.
+        """Evaluate windows of range at directions (u, v), [K, 2], in pairs [K] of the grid.
 
-        Takes the offsets of (u, v), float64 [K, 2]. Means are linear in them, and energies
-        quadratic.
+        Means are linear in the distance from the template's direction, and energies quadratic.
         """
         grid, curvature = self.grid, self._curvature[cells][:, 1:, 1:]
         node, slope, cell_m = grid.node[cells], self._energy_slope[cells], self._cell_ranges(cells)
-        node_m = grid.nodes[node, 0]
+        node_m, offset = grid.nodes[node, 0], directions - grid.nodes[node, 1:]
         change = np.column_stack([node_m * (1 - node_m / cell_m), offset]).astype(np.float32)
         by_subband = np.moveaxis(query.outputs[phase][:, :, node], 2, 0) + np.einsum(
             'iskqf,isf,kq->kis', self._slope_filters[:, :, node], query.signals[phase], change,
@@ -378,7 +380,8 @@ class TemplateTable:
         range_m = self._window_ranges_m[window]
         along = (slope[:, 0] + 2 * self._energy[cells] / cell_m)[pair]
         energy = (cell_m[pair] / range_m)**2 * (energy[pair] + along * (range_m - cell_m[pair]))
-        return Windows(pair, range_m, outputs, energy.astype(np.float32))
+        return Windows(
+            pair, range_m, self._window_widths_m[window], outputs, energy.astype(np.float32))
 
     def _step(self, query: 'Query', peaks: '_Peaks', points: np.ndarray, values: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
@@ -461,17 +464,18 @@ class Query(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """W windows of range of one width, in which only the phases of the carriers change."""
+    """W windows of range, in which only the phases of the carriers change."""
 
     pair: np.ndarray  # Index of the pair to which it belongs, int [W], ascending.
     range_m: np.ndarray  # Centre, float64 [W] [m].
+    width_m: np.ndarray  # Float64 [W] [m].
     outputs: np.ndarray  # Of the bands' matched filters at the centre, complex64 [N_B, W].
     energy: np.ndarray  # Of the whitened mean, float32 [W].
 
     def select(self, chosen: np.ndarray | slice) -> 'Windows':
         """Return the windows with the given indices."""
-        return Windows(self.pair[chosen], self.range_m[chosen], self.outputs[:, chosen],
-                       self.energy[chosen])
+        return Windows(self.pair[chosen], self.range_m[chosen], self.width_m[chosen],
+                       self.outputs[:, chosen], self.energy[chosen])
 
 
 class _Peaks(NamedTuple):

@@ -76,24 +76,21 @@ class Modes(NamedTuple):
 
 
 def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
-               aligned: np.ndarray, extra_margin: float = 0.0) -> Modes:
+               aligned: np.ndarray, extra_margin: float = 0.0,
+               draw: Callable[[Query, int], bool] | None = None) -> Modes | None:
     """Find the modes of each of N phases with a substantial weight in the posterior.
 
     Each phase has at least one mode, and its most likely one comes first. Takes the parameters
     that the signals alone reveal, float64 [N, Q], 0 for the others. Modes may be less likely than
-    the best by the `extra_margin` more than usual.
+    the best by the `extra_margin` more than usual. With `draw`, phases may have
+    none, as `TemplateTable.starts` describes; the result is None if no phase has any.
     """
-    starts = find_starts(likelihood, grid, signals, aligned, extra_margin)
-    return ascend(likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra_margin)
-
-
-def find_starts(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
-                aligned: np.ndarray, extra_margin: float = 0.0,
-                draw: Callable[[Query, int], bool] | None = None) -> Starts:
-    """Find the points from which `find_modes` ascends; for `draw`, see `TemplateTable.starts`."""
     starts = grid.starts(likelihood.whitened(aligned, signals), likelihood.nuisance,
                          GRID_MARGIN + extra_margin, draw)
-    return starts._replace(values=starts.values + aligned[starts.phases])
+    if not len(starts.phases):
+        return None
+    starts = starts._replace(values=starts.values + aligned[starts.phases])
+    return ascend(likelihood, likelihood, starts, signals, MAX_STEPS, EXACT_MARGIN + extra_margin)
 
 
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
