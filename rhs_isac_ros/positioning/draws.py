@@ -33,6 +33,7 @@ _BLOCK = 1 << 20
 # Multiples of these numbers modulo 1 cover the unit square evenly: powers of the inverse root of
 # x^3 = x + 1.
 _SEQUENCE = 1.324717957244746**-np.array([1.0, 2.0])
+# Components of directions below it count as positive, so that they have a finite inverse.
 _TINY = 1e-12
 
 
@@ -84,7 +85,6 @@ class DrawnPosterior:
             expected += _N_DRAWS * probability
             drawn = np.searchsorted(
                 np.cumsum(probability), (np.arange(_N_DRAWS) + 0.5) / _N_DRAWS)
-            drawn = np.minimum(drawn, len(bounds) - 1)
             places = (len(cells) + np.arange(_N_DRAWS))[:, None] * _SEQUENCE
             rays = self._rays(query, phase, drawn, places % 1)
             parts.append(rays._replace(draw=rays.draw + len(cells)))
@@ -110,8 +110,7 @@ class DrawnPosterior:
         covariance = ((weights[:, None] * offsets).T @ offsets
                       + (along[:, None] * rays.direction).T @ rays.direction)
         return Draws(
-            mean, covariance * (1 + variance),
-            float(highest + np.log(total)),
+            mean, covariance * (1 + variance), float(highest + np.log(total)),
             float(rays.highest[weights > 0].max()), float(weights @ rays.average))
 
     def _probabilities(self, query: Query, phase: int) -> np.ndarray:
@@ -175,7 +174,6 @@ class DrawnPosterior:
 
     def _inside(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Range at which directions [K, 3] enter and leave the region, float64 [K] [m]."""
-        # The smallest number keeps the sign of infinite quotients.
         directions = np.where(np.abs(directions) < _TINY, _TINY, directions)
         ends = np.sort(self._bounds[:, None] / directions, axis=0)
         return ends[0].max(axis=1), ends[1].min(axis=1)
