@@ -322,10 +322,11 @@ class MeasurementModel:
 
     def fast_mean(self, positions: np.ndarray) -> np.ndarray:
         """Compute `mean` with the rounding of `mean_and_jacobian`, in a third of the time."""
-        positions = checked_positions(positions)
-        return np.concatenate([
-            np.swapaxes(self._weights.terms(positions[block], slopes=False)[:, :, 0], 0, 1)
-            for block in blocks(len(positions), self._weights.block)])
+        positions, weights = checked_positions(positions), self._weights
+        mean = np.empty((len(positions), *self.shape), complex)
+        for block in blocks(len(positions), weights.block):
+            mean[block] = np.swapaxes(weights.terms(positions[block], slopes=False)[:, :, 0], 0, 1)
+        return mean
 
     @one_blas_thread
     def sample(self, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
