@@ -17,7 +17,7 @@ from rhs_isac_ros.model.measurement import receive_feeds, received_signal
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.model.surface import radiation_matrix
 
-POSITION_METHODS = ('mean', 'jacobian', 'mean_and_jacobian')
+POSITION_METHODS = ('mean', 'fast_mean', 'jacobian', 'mean_and_jacobian')
 N_PHASES = 20_000
 
 
@@ -132,6 +132,7 @@ def test_fast_mean_and_jacobian_equal_the_exact_ones(faded, gains, n):
     model = MeasurementModel(scenario, faded[1])
     positions = scenario.sample_positions(n, np.random.default_rng(3))
     mean, jacobian = model.mean_and_jacobian(positions)
+    np.testing.assert_array_equal(model.fast_mean(positions), mean)
     for actual, expected in ((mean, model.mean(positions)), (jacobian, model.jacobian(positions))):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
